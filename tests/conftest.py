@@ -1,0 +1,35 @@
+"""Paths to data that never enters the repository: measured arms and recorded gap cases."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+_SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _folder(variable: str, beside: Path) -> Path | None:
+    """The folder an environment variable names, else the one beside the checkout, else None."""
+    named = os.environ.get(variable)
+    folder = Path(named) if named else beside
+    return folder if folder.is_dir() else None
+
+
+@pytest.fixture(scope="session")
+def flexlink_data() -> Path:
+    """Folder of measured arms (slfr_krauss_2009, daisy_robot_arm, ...)."""
+    folder = _folder("FLEXLINK_DATA", _SHARED / "data")
+    if folder is None:
+        pytest.skip("measured data not found: set FLEXLINK_DATA to the folder that holds slfr_krauss_2009")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def gap_cases() -> Path:
+    """Folder of recorded gap cases (labelled/<case>/rig.toml ...)."""
+    folder = _folder("FLEXLINK_GAP", _SHARED / "gap")
+    if folder is None:
+        pytest.skip("gap cases not found: set FLEXLINK_GAP to the folder that holds labelled/")
+    return folder
