@@ -1,0 +1,61 @@
+"""Errors that reach the person at the keyboard, each one line long, each with its exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+EXIT_OK = 0
+EXIT_INTERNAL = 1
+EXIT_BAD_INPUT = 2
+EXIT_NOT_CERTIFIED = 3
+
+
+def one_line(text: object) -> str:
+    """The text without line breaks or runs of blanks, for a message that must stay on one line."""
+    return " ".join(str(text).split())
+
+
+class InputError(ValueError):
+    """Something the user gave (file, key, path, column) cannot be used; the message is one line."""
+
+    exit_code = EXIT_BAD_INPUT
+
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(message))
+
+
+class StageError(RuntimeError):
+    """A library failed in the middle of a stage although its input was accepted; one line."""
+
+    exit_code = EXIT_INTERNAL
+
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(message))
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """Turn a library's complaint about user input into an `InputError` that says where it arose.
+
+    The rooms raise `ValueError` for what the user gave. `LinAlgError` is a `ValueError` too, but it is the
+    computation that failed there and not the input, so it becomes a `StageError`.
+    """
+    try:
+        yield
+    except (InputError, StageError):
+        raise
+    except np.linalg.LinAlgError as error:
+        raise StageError(f"{where}: linear algebra failed: {error}") from error
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from error
+    except OSError as error:
+        raise InputError(f"{where}: {describe_os_error(error)}") from error
+
+
+def describe_os_error(error: OSError) -> str:
+    """`path: reason` without the errno number."""
+    reason = error.strerror or str(error)
+    return f"{error.filename}: {reason}" if error.filename else reason
