@@ -1,0 +1,221 @@
+"""Generalised orthonormal basis functions as a lossless cascade (design 4.1, paper (5)).
+
+L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper. A conjugate pair gets
+the real two-column Kautz form after the all-pass of the poles before it: sg (z - beta)/D and sg sb/D with
+D = z^2 - beta (1 + gamma) z + gamma, gamma = |x|^2, beta = 2 Re x/(1 + |x|^2), sg = sqrt(1 - gamma^2),
+sb = sqrt(1 - beta^2). FIR (all poles 0), Laguerre (one repeated real pole) and two-parameter Kautz (one repeated
+pair) are nothing but particular poles here: one code path, four names.
+
+Order of the functions: real poles first, then two per pair.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from ident.arrays import ComplexArray, RealArray
+from ident.poles import Poles
+
+
+class LosslessCascade(NamedTuple):
+    """State space x(k+1) = A x + B u, w = C x + D u; the states x are the basis functions, w is the all-pass output.
+
+    A (B, B), B (B, 1), C (1, B), D (1, 1); the matrix [[A, B], [C, D]] is orthogonal, so A A^T + B B^T = I.
+    """
+
+    A: RealArray
+    B: RealArray
+    C: RealArray
+    D: RealArray
+
+
+def block_parameters(poles: Poles) -> RealArray:
+    """The numbers each block of the cascade needs, (R + P, 4): real [a, sqrt(1 - a^2), 0, 0], pair [gamma, beta, sg, sb].
+
+    Nothing here subtracts two numbers close to 1 after squaring: 1 - gamma is formed as (1 - |re|)(1 + |re|) - im^2
+    from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 = 1 and
+    gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
+    """
+    blocks = np.zeros((poles.real.size + poles.pairs.size, 4))
+    n_real = poles.real.size
+    blocks[:n_real, 0] = poles.real
+    blocks[:n_real, 1] = np.sqrt((1 - poles.real) * (1 + poles.real))
+    re, im = poles.pairs.real, poles.pairs.imag
+    gamma = re**2 + im**2
+    # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis function.
+    one_minus_gamma = np.maximum((1 - np.abs(re)) * (1 + np.abs(re)) - im**2, np.finfo(np.float64).eps / 4)
+    blocks[n_real:, 0] = gamma
+    blocks[n_real:, 1] = 2 * re / (1 + gamma)
+    blocks[n_real:, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
+    blocks[n_real:, 3] = np.sqrt(one_minus_gamma**2 + 4 * im**2) / (1 + gamma)
+    return blocks
+
+
+def basis_state_space(poles: Poles) -> LosslessCascade:
+    """Lossless cascade whose states are the basis functions (replaces inverting E in (24)).
+
+    Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B = [sg, 0],
+    C = [-beta sg, sb sg], D = gamma; each block is driven by the all-pass output of the one before.
+    """
+    n = poles.order
+    A, B = np.zeros((n, n)), np.zeros((n, 1))
+    C, D = np.zeros((1, n)), np.ones((1, 1))
+    at = 0
+    for i, (p0, p1, p2, p3) in enumerate(block_parameters(poles)):
+        if i < poles.real.size:
+            block_a, block_b, block_c, block_d = np.array([[p0]]), np.array([[p1]]), np.array([[p1]]), -p0
+        else:
+            gamma, beta, sg, sb = p0, p1, p2, p3
+            block_a = np.array([[gamma * beta, -gamma * sb], [sb, beta]])
+            block_b = np.array([[sg], [0.0]])
+            block_c = np.array([[-beta * sg, sb * sg]])
+            block_d = gamma
+        here = slice(at, at + block_a.shape[0])
+        A[here, :] = block_b @ C
+        A[here, here] = block_a
+        B[here] = block_b @ D
+        C = block_d * C
+        C[:, here] = block_c
+        D = block_d * D
+        at = here.stop
+    return LosslessCascade(A, B, C, D)
+
+
+def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
+    """Values (F, B) of the basis functions at the points z (F,); z must not be a pole."""
+    return _response_and_all_pass(poles, z)[0]
+
+
+def all_pass_response(poles: Poles, z: ComplexArray) -> ComplexArray:
+    """B(z) = prod (1 - conj(x) z)/(z - x) at the points z (F,); modulus 1 on the unit circle."""
+    return _response_and_all_pass(poles, z)[1]
+
+
+def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    z = np.asarray(z, dtype=np.complex128)
+    if z.ndim != 1:
+        raise ValueError(f"z must be a 1-d array; got shape {z.shape}")
+    columns = np.empty((z.size, poles.order), dtype=np.complex128)
+    all_pass = np.ones(z.size, dtype=np.complex128)
+    blocks = block_parameters(poles)
+    n_real = poles.real.size
+    for i, a in enumerate(poles.real):
+        columns[:, i] = blocks[i, 1] / (z - a) * all_pass
+        all_pass *= (1 - a * z) / (z - a)
+    for i, p in enumerate(poles.pairs):
+        _, beta, sg, sb = blocks[n_real + i]
+        # Factored, not expanded: z^2 - beta (1 + gamma) z + gamma cancels when z is near the pole.
+        driven = all_pass / ((z - p) * (z - p.conjugate()))
+        columns[:, n_real + 2 * i] = sg * (z - beta) * driven
+        columns[:, n_real + 2 * i + 1] = sg * sb * driven
+        all_pass = (1 - p.conjugate() * z) * (1 - p * z) * driven
+    return columns, all_pass
+
+
+def regressor(poles: Poles, u: RealArray) -> RealArray:
+    """Basis functions driven by u from rest: Phi (T, B) with Phi[k, i] = [L_i(q) u](k); Phi[0] = 0."""
+    u = np.ascontiguousarray(u, dtype=np.float64)
+    if u.ndim != 1:
+        raise ValueError(f"u must be (T,); got shape {u.shape}")
+    rows = np.empty((poles.order, u.size))
+    run_cascade(block_parameters(poles), poles.real.size, u.copy(), rows)
+    return rows.T
+
+
+def free_response(poles: Poles, n_samples: int) -> RealArray:
+    """Free responses of the cascade (T, B): column i is the basis impulse response h_i(k + 1), k = 0..T-1.
+
+    They span every output the poles can give without input, so they are the nuisance columns of an unknown initial
+    state.
+    """
+    rows = np.empty((poles.order, n_samples))
+    run_cascade_free(block_parameters(poles), poles.real.size, rows)
+    return rows.T
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any) -> None:
+    """Drive the cascade with w (T,) from rest; rows (B, T) receives the states, w is overwritten by the all-pass output.
+
+    One block after the other over the whole signal: the recursions of a block are short chains the processor overlaps,
+    and every row is written once, contiguously.
+    """
+    n_samples = w.size
+    row = 0
+    for i in range(blocks.shape[0]):
+        if i < n_real:
+            a, b = blocks[i, 0], blocks[i, 1]
+            x = 0.0
+            out = rows[row]
+            for k in range(n_samples):
+                v = w[k]
+                out[k] = x
+                w[k] = b * x - a * v
+                x = a * x + b * v
+            row += 1
+        else:
+            gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
+            gb, gs = gamma * beta, gamma * sb
+            c1, c2 = -beta * sg, sb * sg
+            x1 = 0.0
+            x2 = 0.0
+            out1, out2 = rows[row], rows[row + 1]
+            for k in range(n_samples):
+                v = w[k]
+                out1[k] = x1
+                out2[k] = x2
+                w[k] = c1 * x1 + c2 * x2 + gamma * v
+                x1_next = gb * x1 - gs * x2 + sg * v
+                x2 = sb * x1 + beta * x2
+                x1 = x1_next
+            row += 2
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def run_cascade_free(blocks: Any, n_real: int, rows: Any) -> None:
+    """Write the free responses A^k B of the whole cascade into rows (B, T): the states after a unit impulse at k = -1.
+
+    States below 1e-30 are set to zero, which is far below rounding and keeps denormal numbers (slow) away.
+    """
+    n_samples = rows.shape[1]
+    # All-pass response to the impulse: its value at k = -1 (the direct terms) and the signal from k = 0 on.
+    impulse = 1.0
+    w = np.zeros(n_samples)
+    row = 0
+    for i in range(blocks.shape[0]):
+        if i < n_real:
+            a, b = blocks[i, 0], blocks[i, 1]
+            x = b * impulse
+            impulse = -a * impulse
+            out = rows[row]
+            for k in range(n_samples):
+                v = w[k]
+                out[k] = x
+                w[k] = b * x - a * v
+                x = a * x + b * v
+                if abs(x) < 1e-30:
+                    x = 0.0
+            row += 1
+        else:
+            gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
+            gb, gs = gamma * beta, gamma * sb
+            c1, c2 = -beta * sg, sb * sg
+            x1 = sg * impulse
+            x2 = 0.0
+            impulse = gamma * impulse
+            out1, out2 = rows[row], rows[row + 1]
+            for k in range(n_samples):
+                v = w[k]
+                out1[k] = x1
+                out2[k] = x2
+                w[k] = c1 * x1 + c2 * x2 + gamma * v
+                x1_next = gb * x1 - gs * x2 + sg * v
+                x2 = sb * x1 + beta * x2
+                x1 = x1_next
+                if abs(x1) + abs(x2) < 1e-30:
+                    x1 = 0.0
+                    x2 = 0.0
+            row += 2
