@@ -1,0 +1,308 @@
+"""Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of kernel coefficients.
+
+Model y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), v ~ N(0, s2 I)
+(Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Ct = alpha B B^T, and everything
+that depends on the data is contained in a triangle of the size of the parameters, whatever the record length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr, solve_triangular, svd
+
+from ident.arrays import RealArray
+
+# Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
+_NUISANCE_RANK = 1e-10
+# A diagonal entry of R11 (columns of unit length) below this says that the input does not excite that direction.
+_EXCITATION = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class RegressionBlock:
+    """Rows of one record: nuisance (T,n), regressors F (T,p), kernel columns Psi (T,L), output y (T,)."""
+
+    nuisance: RealArray
+    regressors: RealArray
+    kernel: RealArray
+    output: RealArray
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedRegression:
+    """[F Psi y] after projecting the nuisance out and QR: the sufficient statistics.
+
+    r11 (p,p) upper triangular in units of the original columns, r12 (p,L), r1 (p,), r22 (L,L), z (L,),
+    rest = squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank.
+    """
+
+    r11: RealArray
+    r12: RealArray
+    r1: RealArray
+    r22: RealArray
+    z: RealArray
+    rest: float
+    n_rows: int
+
+    @property
+    def n_regressors(self) -> int:
+        return int(self.r1.size)
+
+    @property
+    def fir_length(self) -> int:
+        return int(self.z.size)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """nu = N - p, with the nuisance already taken off N."""
+        return self.n_rows - self.n_regressors
+
+
+@dataclass(frozen=True, eq=False)
+class KernelPosterior:
+    """Gaussian for (theta, eta): theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w), eta = mean + factor w'.
+
+    w, w' standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the classical
+    recipe) mean 0 and the prior factor. alpha and lam are those of largest weight; probability_no_remainder the
+    weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
+    """
+
+    kernel_mean: RealArray
+    kernel_factor: RealArray
+    noise_variance: float
+    alpha: float
+    lam: float
+    probability_no_remainder: float
+    log_evidence: float
+
+
+def nuisance_basis(nuisance: RealArray) -> RealArray:
+    """Orthonormal columns (T,r) spanning the nuisance columns (T,n), nearly dependent ones dropped."""
+    if nuisance.shape[1] == 0:
+        return nuisance
+    length = np.linalg.norm(nuisance, axis=0)
+    scaled = nuisance[:, length > 0] / length[length > 0]
+    if scaled.shape[1] == 0:
+        return scaled
+    q, r, _ = qr(scaled, mode="economic", pivoting=True)
+    rank = int(np.count_nonzero(np.abs(np.diag(r)) > _NUISANCE_RANK))
+    return np.asarray(q[:, :rank])
+
+
+def without_nuisance(columns: RealArray, basis: RealArray) -> RealArray:
+    """Columns minus their projection on an orthonormal basis, applied twice so that rounding is removed too."""
+    for _ in range(2):
+        columns = columns - basis @ (basis.T @ columns)
+    return np.asarray(columns)
+
+
+def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
+    """One QR for all records: each block's nuisance is projected out, its triangle stacked under the previous.
+
+    Cost O(N (p + L)^2), memory that of the largest block. Raises ValueError when rows do not exceed p + L or the
+    input does not excite a regressor.
+    """
+    triangle: RealArray | None = None
+    n_rows = 0
+    p = length = 0
+    for block in blocks:
+        p, length = block.regressors.shape[1], block.kernel.shape[1]
+        basis = nuisance_basis(block.nuisance)
+        columns = without_nuisance(np.column_stack([block.regressors, block.kernel, block.output]), basis)
+        n_rows += block.output.size - basis.shape[1]
+        stacked = columns if triangle is None else np.vstack([triangle, columns])
+        (upper,) = qr(stacked, mode="r", overwrite_a=True, check_finite=False)
+        triangle = np.asarray(upper[: p + length + 1], dtype=np.float64)
+    if triangle is None:
+        raise ValueError("need at least one record")
+    if n_rows <= p + length + 1:
+        raise ValueError(
+            f"{n_rows} usable samples do not determine {p} regressors and {length} kernel coefficients: "
+            "give a longer record or a smaller fir_length"
+        )
+    r11 = np.triu(triangle[:p, :p])
+    column_length = np.linalg.norm(r11, axis=0)
+    weak = np.abs(np.diag(r11)) <= _EXCITATION * column_length
+    if np.any(weak | (column_length == 0)):
+        raise ValueError(
+            f"the input does not excite regressor {int(np.argmax(weak | (column_length == 0))) + 1} of {p} apart from "
+            "the others: excite more frequencies or take fewer poles"
+        )
+    return ReducedRegression(
+        r11=r11,
+        r12=triangle[:p, p:-1],
+        r1=triangle[:p, -1],
+        r22=np.triu(triangle[p:-1, p:-1]),
+        z=triangle[p:-1, -1],
+        rest=float(triangle[-1, -1] ** 2),
+        n_rows=n_rows,
+    )
+
+
+def tc_factor(lam: float, length: int) -> RealArray:
+    """B (L,L) with (B B^T)_ij = lam^max(i,j), i, j = 1..L: the tuned/correlated kernel of unit alpha."""
+    k = np.arange(1, length + 1, dtype=np.float64)
+    step = lam**k * (1 - lam)
+    step[-1] = lam**length
+    return np.asarray(np.triu(np.ones((length, length))) * np.sqrt(step))
+
+
+def exponential_factor(lam: float, length: int) -> RealArray:
+    """B (L,L) with B B^T = diag(lam^k), k = 1..L: the prior of the classical recipe."""
+    return np.diag(np.sqrt(lam ** np.arange(1, length + 1, dtype=np.float64)))
+
+
+@dataclass(frozen=True, eq=False)
+class KernelSpectrum:
+    """Singular value decomposition of R22 B for one kernel shape: every alpha then costs O(L)."""
+
+    lam: float
+    factor: RealArray  # B (L,L)
+    singular: RealArray  # d (L,)
+    projected: RealArray  # U^T z (L,)
+    right: RealArray  # V (L,L), columns
+
+
+def kernel_spectrum(reduced: ReducedRegression, lam: float, factor: RealArray) -> KernelSpectrum:
+    u, d, vt = svd(reduced.r22 @ factor, full_matrices=False, check_finite=False)
+    return KernelSpectrum(lam=lam, factor=factor, singular=d, projected=u.T @ reduced.z, right=vt.T)
+
+
+def restricted_log_likelihood(
+    reduced: ReducedRegression, spectrum: KernelSpectrum, alpha: RealArray
+) -> tuple[RealArray, RealArray]:
+    """log L (up to a constant shared by all kernels) and s2, both (A,), for alphas (A,) with C = s2 alpha B B^T.
+
+    -2 log L = nu log s2 + log det M + nu, M = I + R22 Ct R22^T, s2 = (S + z^T M^-1 z) / nu.
+    """
+    gain = 1.0 + alpha[:, None] * spectrum.singular**2
+    nu = reduced.degrees_of_freedom
+    s2 = (reduced.rest + np.sum(spectrum.projected**2 / gain, axis=1)) / nu
+    floor = np.finfo(np.float64).tiny
+    return -0.5 * (nu * np.log(np.maximum(s2, floor)) + np.sum(np.log(gain), axis=1) + nu), s2
+
+
+@dataclass(frozen=True, eq=False)
+class KernelGrid:
+    """Weights of all (lam, alpha) pairs and of alpha = 0, given the data."""
+
+    spectra: tuple[KernelSpectrum, ...]
+    alpha: RealArray  # (K, A)
+    noise_variance: RealArray  # (K, A)
+    log_likelihood: RealArray  # (K, A)
+    noise_variance_none: float
+    log_likelihood_none: float
+
+
+def evaluate_grid(
+    reduced: ReducedRegression, spectra: Iterable[KernelSpectrum], relative_alpha: RealArray
+) -> KernelGrid:
+    """Restricted likelihood over kernel shapes and alpha = relative_alpha / d_max^2.
+
+    Scaled by the largest singular value, a relative alpha of 1 is a remainder just as strong as the noise in its
+    best-excited direction, so that the grid fits any units of input and output.
+    """
+    spectra = tuple(spectra)
+    alpha = np.stack([relative_alpha / max(float(s.singular[0]) ** 2, 1e-300) for s in spectra])
+    values = [restricted_log_likelihood(reduced, s, a) for s, a in zip(spectra, alpha, strict=True)]
+    none, s2_none = restricted_log_likelihood(reduced, spectra[0], np.zeros(1))
+    return KernelGrid(
+        spectra=spectra,
+        alpha=alpha,
+        log_likelihood=np.stack([value[0] for value in values]),
+        noise_variance=np.stack([value[1] for value in values]),
+        noise_variance_none=float(s2_none[0]),
+        log_likelihood_none=float(none[0]),
+    )
+
+
+def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray, float]:
+    """Posterior weights (K,A) of the grid points and of alpha = 0; the prior is flat over the grid."""
+    n = grid.log_likelihood.size
+    log_grid = grid.log_likelihood + np.log((1 - prior_no_remainder) / n)
+    log_none = grid.log_likelihood_none + (np.log(prior_no_remainder) if prior_no_remainder > 0 else -np.inf)
+    top = max(float(log_grid.max()), log_none)
+    weights, none = np.exp(log_grid - top), float(np.exp(log_none - top))
+    total = float(weights.sum()) + none
+    return weights / total, none / total
+
+
+def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: float) -> KernelPosterior:
+    """Mean and covariance of eta given the data, averaged over the grid (the spread of the means included).
+
+    For one pair: m = Ct R22^T M^-1 z = alpha B V diag(d / (1 + alpha d^2)) U^T z and
+    s2 V = s2 alpha B V diag(1 / (1 + alpha d^2)) V^T B^T.
+    """
+    length = grid.spectra[0].singular.size
+    mean, covariance = np.zeros(length), np.zeros((length, length))
+    means: list[tuple[RealArray, RealArray]] = []
+    for spectrum, alpha, s2, weight in zip(
+        grid.spectra, grid.alpha, grid.noise_variance, weights, strict=True
+    ):
+        # Grid points that together weigh less than a millionth are not worth their arithmetic.
+        kept = weight > 1e-6 / weights.size
+        if not np.any(kept):
+            continue
+        a, w = alpha[kept, None], weight[kept]
+        gain = 1.0 + a * spectrum.singular**2
+        axes = spectrum.factor @ spectrum.right
+        means.append((w, (a * spectrum.singular / gain * spectrum.projected) @ axes.T))
+        mean += w @ means[-1][1]
+        covariance += (axes * ((w * s2[kept]) @ (a / gain))) @ axes.T
+    for w, of_point in means:
+        covariance += (of_point - mean).T @ ((of_point - mean) * w[:, None])
+    covariance += weight_none * np.outer(mean, mean)
+    noise = weight_none * grid.noise_variance_none + float(np.sum(weights * grid.noise_variance))
+    best = np.unravel_index(int(np.argmax(weights)), weights.shape)
+    return KernelPosterior(
+        kernel_mean=mean,
+        kernel_factor=_symmetric_factor(covariance),
+        noise_variance=noise,
+        alpha=float(grid.alpha[best]),
+        lam=grid.spectra[best[0]].lam,
+        probability_no_remainder=weight_none,
+        log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
+    )
+
+
+def prior_posterior(grid: KernelGrid) -> KernelPosterior:
+    """The classical recipe: alpha, lam of largest restricted likelihood, eta left at its prior (unconditional)."""
+    best = np.unravel_index(int(np.argmax(grid.log_likelihood)), grid.log_likelihood.shape)
+    spectrum = grid.spectra[best[0]]
+    s2, alpha = float(grid.noise_variance[best]), float(grid.alpha[best])
+    return KernelPosterior(
+        kernel_mean=np.zeros(spectrum.singular.size),
+        kernel_factor=np.sqrt(s2 * alpha) * spectrum.factor,
+        noise_variance=s2,
+        alpha=alpha,
+        lam=spectrum.lam,
+        probability_no_remainder=0.0,
+        log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
+    )
+
+
+def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tuple[RealArray, RealArray]:
+    """Mean (p+L,) and covariance factor (p+L, P') of (theta, eta) of a KernelPosterior."""
+    p = reduced.n_regressors
+    scale = np.linalg.norm(reduced.r11, axis=0)
+    r11 = reduced.r11 / scale
+    right_hand = np.column_stack(
+        [
+            reduced.r1 - reduced.r12 @ posterior.kernel_mean,
+            np.sqrt(posterior.noise_variance) * np.eye(p),
+            -reduced.r12 @ posterior.kernel_factor,
+        ]
+    )
+    solved = solve_triangular(r11, right_hand, check_finite=False) / scale[:, None]
+    below = np.hstack([np.zeros((posterior.kernel_mean.size, p)), posterior.kernel_factor])
+    return np.concatenate([solved[:, 0], posterior.kernel_mean]), np.vstack([solved[:, 1:], below])
+
+
+def _symmetric_factor(covariance: RealArray) -> RealArray:
+    """Factor S (L,L') with S S^T = covariance, directions below rounding left out."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    kept = values > values[-1] * 1e-15 if values[-1] > 0 else np.zeros(values.size, dtype=np.bool_)
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))

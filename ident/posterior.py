@@ -1,0 +1,191 @@
+"""What identification knows about a response, as a Gaussian over coefficients: evaluable at any frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ident.arrays import ComplexArray, RealArray
+from ident.basis import basis_response
+from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.poles import Poles
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddingReport:
+    """How a posterior came about, in numbers a reader can judge.
+
+    noise_std is that of the (whitened, if ar_coefficients is not empty) output noise in output units; alpha and
+    lam are the kernel's scale (relative to the noise variance) and decay per sample at the largest weight;
+    probability_no_remainder the posterior probability that the poles explain everything (prior 1/2);
+    log_evidence the gain in restricted log likelihood of the best kernel over none; n_rows the samples used after
+    nuisance columns; ar_coefficients (a_1 .. a_n) of the noise filter 1 / (1 + a_1 q^-1 + ...).
+    """
+
+    method: str
+    noise_std: float
+    alpha: float
+    lam: float
+    probability_no_remainder: float
+    log_evidence: float
+    n_rows: int
+    n_regressors: int
+    ar_coefficients: tuple[float, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        return asdict(self) | {"ar_coefficients": list(self.ar_coefficients)}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`."""
+        return cls(**(dict(document) | {"ar_coefficients": tuple(document["ar_coefficients"])}))
+
+
+@dataclass(frozen=True, eq=False)
+class ResponsePosterior:
+    """G(z) = [sum_i a_i L_i(z) + d + sum_k h_k z^-k] (z / (z - 1))^integrators z^-delay with Gaussian coefficients.
+
+    poles are those of the basis functions L_i (the doubled ones for the tangent method); has_feedthrough says
+    whether d is among the coefficients; fir_length = L. mean (P,) and covariance_factor S (P,P') with
+    P = poles.order + has_feedthrough + L, in the order a, d, h_1 .. h_L; the covariance is S S^T.
+    """
+
+    poles: Poles
+    mean: RealArray
+    covariance_factor: RealArray
+    dt_s: float
+    fir_length: int = 0
+    has_feedthrough: bool = False
+    integrators: int = 0
+    input_delay_samples: int = 0
+    input_name: str = "u"
+    output_name: str = "y"
+    report: EmbeddingReport | None = None
+
+    def __post_init__(self) -> None:
+        mean = np.array(self.mean, dtype=np.float64)
+        factor = np.array(self.covariance_factor, dtype=np.float64)
+        size = self.poles.order + int(self.has_feedthrough) + self.fir_length
+        if mean.shape != (size,) or factor.ndim != 2 or factor.shape[0] != size:
+            raise ValueError(
+                f"need mean ({size},) and covariance_factor ({size}, P'); got {mean.shape}, {factor.shape}"
+            )
+        if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(factor))):
+            raise ValueError("mean and covariance_factor must be finite")
+        if not 0 < self.dt_s < np.inf:
+            raise ValueError(f"dt_s must be positive and finite; got {self.dt_s}")
+        if min(self.fir_length, self.integrators, self.input_delay_samples) < 0:
+            raise ValueError("fir_length, integrators and input_delay_samples must not be negative")
+        for name, array in (("mean", mean), ("covariance_factor", factor)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def frequency_rows(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
+        """(F,P) matrix that maps coefficients to the response at omega (F,) [rad/s], 0 <= omega <= pi / dt_s.
+
+        Raises ValueError outside that range, and at omega = 0 when there are integrators.
+        """
+        omega = np.asarray(omega_rad_s, dtype=np.float64)
+        nyquist = np.pi / self.dt_s
+        if omega.ndim != 1 or not np.all((omega >= 0) & (omega <= nyquist * (1 + 1e-9))):
+            raise ValueError(f"omega (F,) is in rad/s, from 0 to pi / dt_s = {nyquist:.6g}")
+        if self.integrators and not np.all(omega > 0):
+            raise ValueError("the response of an integrator has no value at omega = 0")
+        z = np.exp(1j * omega * self.dt_s)
+        parts = [basis_response(self.poles, z)]
+        if self.has_feedthrough:
+            parts.append(np.ones((omega.size, 1), dtype=np.complex128))
+        parts.append(np.exp(-1j * self.dt_s * np.outer(omega, np.arange(1, self.fir_length + 1))))
+        # 1 - z^-1 written with sin, which keeps its digits near omega = 0 where the difference would lose them.
+        half = 0.5 * omega * self.dt_s
+        common = np.exp(-1j * omega * self.dt_s * self.input_delay_samples)
+        if self.integrators:
+            common = common / (2j * np.sin(half) * np.exp(-1j * half)) ** self.integrators
+        return np.asarray(common[:, None] * np.hstack(parts))
+
+    def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:
+        """Centre and 2x2 covariances at any strictly increasing omega (F,) [rad/s]."""
+        rows = self.frequency_rows(omega_rad_s)
+        spread = rows @ self.covariance_factor
+        re, im = spread.real, spread.imag
+        covariance = np.empty((rows.shape[0], 2, 2))
+        covariance[:, 0, 0] = np.einsum("fp,fp->f", re, re)
+        covariance[:, 1, 1] = np.einsum("fp,fp->f", im, im)
+        covariance[:, 0, 1] = covariance[:, 1, 0] = np.einsum("fp,fp->f", re, im)
+        method = self.report.method if self.report is not None else "coefficient posterior"
+        return FrequencyUncertainty(
+            np.asarray(omega_rad_s, dtype=np.float64), rows @ self.mean, covariance, self.dt_s, level, method
+        )
+
+    def centre(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
+        """Posterior mean response (F,) alone."""
+        return np.asarray(self.frequency_rows(omega_rad_s) @ self.mean)
+
+    def sample(self, rng: np.random.Generator, n_draws: int) -> RealArray:
+        """(n_draws, P) coefficient draws."""
+        noise = rng.standard_normal((n_draws, self.covariance_factor.shape[1]))
+        return np.asarray(self.mean + noise @ self.covariance_factor.T)
+
+    def response_of(self, draws: RealArray, omega_rad_s: npt.ArrayLike) -> ComplexArray:
+        """Responses (n_draws, F) of coefficient draws (n_draws, P)."""
+        return np.asarray(draws @ self.frequency_rows(omega_rad_s).T)
+
+    def joint_level(
+        self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
+    ) -> float:
+        """Per-frequency level whose ellipses hold the whole response over omega (F,) with probability `level`.
+
+        The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses, as a
+        per-frequency level; the sampling error of the joint probability is sqrt(level (1 - level) / n_draws).
+        """
+        set_of_ellipses = self.at(omega_rad_s, level=0.5)
+        responses = self.response_of(self.sample(rng, n_draws), omega_rad_s)
+        largest = np.array([set_of_ellipses.normalised_distance(response).max() for response in responses])
+        # Ellipses at level 1/2 have squared radius 2 ln 2; a distance d on them is level 1 - 2^(-d^2).
+        worst = float(np.quantile(largest, level))
+        return float(min(-np.expm1(-(worst**2) * np.log(2)), 1 - 1e-15))
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Plain arrays for `np.savez`; `from_arrays` gives back exactly this record."""
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "poles_real": self.poles.real,
+            "poles_pairs": self.poles.pairs,
+            "mean": self.mean,
+            "covariance_factor": self.covariance_factor,
+            "dt_s": np.array(self.dt_s),
+            "names": np.array([self.input_name, self.output_name]),
+        }
+        for name in ("fir_length", "has_feedthrough", "integrators", "input_delay_samples"):
+            arrays[name] = np.array(getattr(self, name))
+        if self.report is not None:
+            arrays |= {
+                f"report_{f.name}": np.array(getattr(self.report, f.name)) for f in fields(EmbeddingReport)
+            }
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+        report = None
+        if "report_method" in mapping:
+            values = {f.name: mapping[f"report_{f.name}"] for f in fields(EmbeddingReport)}
+            numbers = {name: value.item() for name, value in values.items() if name != "ar_coefficients"}
+            report = EmbeddingReport(**numbers, ar_coefficients=tuple(values["ar_coefficients"].tolist()))
+        return cls(
+            poles=Poles(mapping["poles_real"], mapping["poles_pairs"]),
+            mean=mapping["mean"],
+            covariance_factor=mapping["covariance_factor"],
+            dt_s=float(mapping["dt_s"]),
+            fir_length=int(mapping["fir_length"]),
+            has_feedthrough=bool(mapping["has_feedthrough"]),
+            integrators=int(mapping["integrators"]),
+            input_delay_samples=int(mapping["input_delay_samples"]),
+            input_name=str(mapping["names"][0]),
+            output_name=str(mapping["names"][1]),
+            report=report,
+        )
