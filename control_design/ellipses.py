@@ -1,0 +1,281 @@
+"""Ellipses of frequency-response uncertainty and the exact geometry control needs of them.
+
+One frequency, one filled ellipse E = {centre + u1 s1 d1 + j u1 s2 d2 : d1^2 + d2^2 <= 1} in the complex plane, with
+|u1| = 1 and s1 >= s2 >= 0. Everything here is vectorised over F frequencies and exact up to rounding: no sampling of
+the boundary, no enclosing disc.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+def readonly_real(value: npt.ArrayLike) -> Real:
+    """Copy to float64 and lock."""
+    array = np.array(value, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def readonly_complex(value: npt.ArrayLike) -> Complex:
+    """Copy to complex128 and lock."""
+    array = np.array(value, dtype=np.complex128)
+    array.setflags(write=False)
+    return array
+
+
+class ResponseSet(Protocol):
+    """Uncertain response on given frequencies; `ident.uncertainty.FrequencyUncertainty` is one.
+
+    omega_rad_s (F,), centre (F,) complex, covariance (F, 2, 2) of (real, imaginary), level in (0, 1).
+    """
+
+    @property
+    def omega_rad_s(self) -> Real: ...
+    @property
+    def centre(self) -> Complex: ...
+    @property
+    def covariance(self) -> Real: ...
+    @property
+    def level(self) -> float: ...
+
+
+@runtime_checkable
+class EvaluableUncertainty(Protocol):
+    """Uncertainty known at any frequency; `ident.uncertainty.ResponsePosterior` is one."""
+
+    def at(self, omega_rad_s: Real, level: float) -> ResponseSet: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipses:
+    """Filled uncertainty ellipses at F frequencies.
+
+    omega_rad_s (F,) ascending, centre (F,), semi_major >= semi_minor >= 0 (F,), direction (F,) unit complex: the
+    major axis. The minor axis is 1j * direction.
+    """
+
+    omega_rad_s: Real
+    centre: Complex
+    semi_major: Real
+    semi_minor: Real
+    direction: Complex
+
+    def __post_init__(self) -> None:
+        for name in ("omega_rad_s", "semi_major", "semi_minor"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        for name in ("centre", "direction"):
+            object.__setattr__(self, name, readonly_complex(getattr(self, name)))
+        shapes = {
+            name: getattr(self, name).shape
+            for name in ("omega_rad_s", "centre", "semi_major", "semi_minor", "direction")
+        }
+        if self.omega_rad_s.ndim != 1 or len(set(shapes.values())) != 1:
+            raise ValueError(f"ellipses need arrays of one shape (F,); got {shapes}")
+        if self.omega_rad_s.size and not (
+            np.all(self.omega_rad_s >= 0) and np.all(np.diff(self.omega_rad_s) > 0)
+        ):
+            raise ValueError("ellipses need non-negative, strictly ascending omega_rad_s")
+        if not np.all(np.isfinite(self.centre)):
+            raise ValueError("ellipse centres must be finite; the plant may have a pole at a grid frequency")
+        if not (np.all(self.semi_minor >= 0) and np.all(self.semi_major >= self.semi_minor)):
+            raise ValueError("ellipse semi-axes need semi_major >= semi_minor >= 0")
+
+    @classmethod
+    def from_covariance(
+        cls, omega_rad_s: Real, centre: Complex, covariance: Real, level: float, *, what: str = "uncertainty"
+    ) -> Ellipses:
+        """Ellipse e^T P^-1 e <= chi2_2(level) of covariance P (F, 2, 2); the quantile is -2 ln(1 - level).
+
+        Raises
+        ------
+        ValueError
+            If level is outside (0, 1) or a covariance is not symmetric positive semi-definite (names the frequency).
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"{what}: level must lie in (0, 1); got {level}")
+        covariance = np.asarray(covariance, dtype=np.float64)
+        if covariance.shape != (np.size(omega_rad_s), 2, 2):
+            raise ValueError(f"{what}: covariance must be (F, 2, 2); got {covariance.shape}")
+        a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+        trace = a + d
+        half_gap = np.hypot((a - d) / 2, b)
+        large = trace / 2 + half_gap
+        # small = determinant / large keeps the relative accuracy of thin ellipses.
+        determinant = a * d - b * covariance[:, 1, 0]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            small = np.where(large > 0, determinant / np.where(large > 0, large, 1.0), 0.0)
+        tolerance = 1e-9 * np.abs(large) + 1e-300
+        good = (
+            np.isfinite(trace)
+            & (large >= 0)
+            & (small >= -tolerance)
+            & (np.abs(b - covariance[:, 1, 0]) <= tolerance)
+        )
+        if not np.all(good):
+            worst = float(np.asarray(omega_rad_s)[np.argmin(good)])
+            raise ValueError(
+                f"{what}: covariance at {worst:.4g} rad/s is not symmetric positive semi-definite"
+            )
+        quantile = -2.0 * np.log1p(-level)
+        angle = 0.5 * np.arctan2(2 * b, a - d)
+        semi_major = np.sqrt(quantile * large)
+        semi_minor = np.minimum(np.sqrt(quantile * np.maximum(small, 0.0)), semi_major)
+        return cls(np.asarray(omega_rad_s), centre, semi_major, semi_minor, np.exp(1j * angle))
+
+    def subset(self, index: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Ellipses:
+        """The ellipses at the given positions."""
+        return Ellipses(
+            self.omega_rad_s[index],
+            self.centre[index],
+            self.semi_major[index],
+            self.semi_minor[index],
+            self.direction[index],
+        )
+
+    def points(self, d1: Real, d2: Real) -> Complex:
+        """Members centre + u1 s1 d1 + j u1 s2 d2; d1, d2 broadcast against (F,) on the last axis."""
+        return np.asarray(
+            self.centre + self.direction * (self.semi_major * d1 + 1j * self.semi_minor * d2),
+            dtype=np.complex128,
+        )
+
+    def farthest(self) -> Real:
+        """max |G| over each ellipse, (F,)."""
+        return farthest_distance(-self.centre * np.conj(self.direction), self.semi_major, self.semi_minor)
+
+
+def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
+    """Distance from `point` to the filled axis-parallel ellipse at the origin; 0 inside. All (F,).
+
+    The nearest point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)) for the root t >= 0 of
+    (a x/(a^2 + t))^2 + (b y/(b^2 + t))^2 = 1 (first-order condition; t is the multiplier). The left side is convex and
+    decreasing, so Newton from the left never overshoots; degenerate axes (segments, points) are the limit b -> 0.
+    """
+    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
+    a = np.asarray(semi_major, dtype=np.float64)
+    b = np.asarray(semi_minor, dtype=np.float64)
+    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
+    x, y, a, b = x / scale, y / scale, a / scale, b / scale
+    ax, by = a * x, b * y
+    # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
+    t = np.maximum(np.maximum(ax - a * a, by - b * b), 0.0)
+    tiny = 1e-300
+    for _ in range(60):
+        da, db = a * a + t + tiny, b * b + t + tiny
+        pa, pb = (ax / da) ** 2, (by / db) ** 2
+        value = pa + pb - 1.0
+        slope = -2.0 * (pa / da + pb / db)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            step = np.where((value > 0) & (slope < 0), -value / np.where(slope < 0, slope, -1.0), 0.0)
+        t = t + step
+        if np.all(step <= 1e-15 * (t + 1e-16)):
+            break
+    da, db = a * a + t, b * b + t
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # t = 0 on a degenerate axis: the point projects onto the segment itself.
+        nx = np.where(da > 0, a * a * x / np.where(da > 0, da, 1.0), 0.0)
+        ny = np.where(db > 0, b * b * y / np.where(db > 0, db, 1.0), 0.0)
+        inside_a = np.where(a > 0, x / np.where(a > 0, a, 1.0), np.where(x > 0, np.inf, 0.0))
+        inside_b = np.where(b > 0, y / np.where(b > 0, b, 1.0), np.where(y > 0, np.inf, 0.0))
+    inside = inside_a**2 + inside_b**2 <= 1.0
+    distance = np.hypot(x - nx, y - ny)
+    return np.asarray(np.where(inside, 0.0, distance) * scale, dtype=np.float64)
+
+
+def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
+    """Distance from `point` to the farthest point of the axis-parallel ellipse at the origin. All (F,).
+
+    Maximise |(a cos f + x, b sin f + y)| with x, y >= 0: the maximiser is in the first quadrant, and with
+    c = a^2 - b^2 >= 0 the secular equation (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1 has one root m > a^2, bracketed by
+    a^2 + a x ... a^2 + |(a x, b y)|-type bounds; solved by safeguarded Newton on the (convex) inverse square root.
+    """
+    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
+    a = np.asarray(semi_major, dtype=np.float64)
+    b = np.asarray(semi_minor, dtype=np.float64)
+    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
+    x, y, a, b = x / scale, y / scale, a / scale, b / scale
+    ax, by = a * x, b * y
+    gap = a * a - b * b
+    # Unknown n = m - a^2 >= 0. Bisection on log-free bounds: lower = larger single-term root, upper = sum of terms.
+    low = np.maximum(ax, np.maximum(by - gap, 0.0))
+    high = ax + by + 1e-300
+    for _ in range(80):
+        mid = 0.5 * (low + high)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            value = (ax / np.maximum(mid, 1e-300)) ** 2 + (by / np.maximum(mid + gap, 1e-300)) ** 2
+        above = value > 1.0
+        low = np.where(above, mid, low)
+        high = np.where(above, high, mid)
+        if np.all(high - low <= 2e-16 * (high + gap)):
+            break
+    n = 0.5 * (low + high)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sin_f = np.where(n + gap > 0, by / np.where(n + gap > 0, n + gap, 1.0), 0.0)
+    sin_f = np.clip(sin_f, 0.0, 1.0)
+    # cos from sin: when x = 0 the cosine term of the secular equation degenerates (n -> 0).
+    cos_f = np.sqrt(1.0 - sin_f**2)
+    distance = np.hypot(x + a * cos_f, y + b * sin_f)
+    # The vertices are members too: they guard the degenerate circles and segments.
+    distance = np.maximum(distance, np.maximum(np.hypot(x + a, y), np.hypot(x, y + b)))
+    return np.asarray(distance * scale, dtype=np.float64)
+
+
+def distance_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
+    """min |1 + G k| over G in E at every frequency, (F,); 0 where some member puts the loop on -1. Exact."""
+    size = np.abs(loop_gain)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k centre.
+        turned = np.where(
+            size > 0,
+            (1.0 + loop_gain * ellipses.centre)
+            * np.conj(loop_gain * ellipses.direction)
+            / np.where(size > 0, size, 1.0),
+            1.0,
+        )
+    return nearest_distance(turned, size * ellipses.semi_major, size * ellipses.semi_minor)
+
+
+def largest_disturbance_gain(loop_gain: Complex, ellipses: Ellipses, *, iterations: int = 60) -> Real:
+    """max |G / (1 + G k)| over G in E at every frequency, (F,); inf where some member puts the loop on -1. Exact.
+
+    |G| <= h |1 + G k| is, with q = h^2 |k|^2, an Apollonius set: |G - g0| >= r for q > 1, <= r for q < 1, with
+    g0 = h^2 conj(k)/(1 - q) and r = h/|1 - q|. The ellipse lies in it or not by its exact nearest/farthest distance from g0; h by
+    bisection (the same lossless statement as the S-lemma of the design notes, without multipliers).
+    """
+    k = np.asarray(loop_gain, dtype=np.complex128)
+    blocked = distance_to_minus_one(k, ellipses) <= 0.0
+    centre_value = np.abs(ellipses.centre) / np.maximum(np.abs(1.0 + k * ellipses.centre), 1e-300)
+    upper = np.where(
+        blocked, 1.0, ellipses.farthest() / np.maximum(distance_to_minus_one(k, ellipses), 1e-300)
+    )
+    low = np.minimum(centre_value, upper)
+    high = np.maximum(upper, 1e-300)
+    for _ in range(iterations):
+        mid = 0.5 * (low + high)
+        inside = _in_apollonius_set(mid, k, ellipses)
+        high = np.where(inside, mid, high)
+        low = np.where(inside, low, mid)
+        if np.all(high - low <= 1e-13 * high):
+            break
+    return np.asarray(np.where(blocked, np.inf, high), dtype=np.float64)
+
+
+def _in_apollonius_set(h: Real, k: Complex, ellipses: Ellipses) -> npt.NDArray[np.bool_]:
+    """True where |G| <= h |1 + G k| holds on all of E."""
+    q = (h * np.abs(k)) ** 2
+    gap = 1.0 - q
+    gap = np.where(np.abs(gap) < 1e-13, 1e-13, gap)  # a half-plane is the limit of both cases
+    centre = h**2 * np.conj(k) / gap
+    radius = h / np.abs(gap)
+    turned = (centre - ellipses.centre) * np.conj(ellipses.direction)
+    outside = nearest_distance(turned, ellipses.semi_major, ellipses.semi_minor) >= radius
+    within = farthest_distance(turned, ellipses.semi_major, ellipses.semi_minor) <= radius
+    return np.asarray(np.where(gap < 0, outside, within), dtype=np.bool_)
