@@ -7,9 +7,9 @@
     figures/
     report.html
 
-A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the stage
-would be given now (its share of the configuration, its input files, the content of the stages before it). File and
-hash appear in one rename, so there is no instant at which one is there without the other.
+A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the
+stage would be given now (its share of the configuration, its input files, the content of the stages before
+it). File and hash appear in one rename, so there is no instant at which one is there without the other.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class RunDirectory:
     def check_free(cls, path: Path, *, resume: bool = False, replace: bool = False) -> None:
         """Refuse, before any work is done, a place where the run could not be written.
 
-        Raises InputError: not writable, not a directory, not empty with neither `resume` nor `replace`, or holding
-        something that is no run (which is never replaced).
+        Raises InputError: not writable, not a directory, not empty with neither `resume` nor `replace`, or
+        holding something that is no run (which is never replaced).
         """
         path = Path(path)
         try:
@@ -117,11 +117,12 @@ class RunDirectory:
         resume: bool = False,
         replace: bool = False,
     ) -> RunDirectory:
-        """Create the directory, or with `resume` take up the run that is there, or with `replace` start it afresh.
+        """Create the directory, or with `resume` take up the run that is there, or with `replace` start it
+        afresh.
 
-        `config` is the resolved configuration (JSON-able), `inputs` maps every input file as the user named it to
-        its SHA-256. Raises InputError: see `check_free`; on resuming also a changed configuration (naming the key)
-        or a changed input file (naming the file).
+        `config` is the resolved configuration (JSON-able), `inputs` maps every input file as the user named
+        it to its SHA-256. Raises InputError: see `check_free`; on resuming also a changed configuration
+        (naming the key) or a changed input file (naming the file).
         """
         path = Path(path)
         cls.check_free(path, resume=resume, replace=replace)
@@ -172,7 +173,8 @@ class RunDirectory:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the directory against a second writer; the system lets go of the lock when the process dies."""
+        """Hold the directory against a second writer; the system lets go of the lock when the process
+        dies."""
         import fcntl
 
         with open(self.path / "lock", "w") as stream:
@@ -242,7 +244,8 @@ class RunDirectory:
         text = json.dumps(_plain(data.document), ensure_ascii=False)
         if data.arrays:
             path, other = self.stages_path / f"{name}.npz", self.stages_path / f"{name}.json"
-            # The document travels as UTF-8 bytes: a unicode array would drop trailing NULs and take four bytes each.
+            # The document travels as UTF-8 bytes: a unicode array would drop trailing NULs and take four
+            # bytes each.
             own = {
                 _INPUT_HASH: np.array(input_hash),
                 _DOCUMENT: np.frombuffer(text.encode("utf-8"), dtype=np.uint8),
@@ -296,7 +299,8 @@ class RunDirectory:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on; packages that are not installed as distributions are left out."""
+    """Versions of what the numbers depend on; packages that are not installed as distributions are left
+    out."""
     versions = {}
     for name in _PACKAGES:
         try:
@@ -339,9 +343,8 @@ def _recorded_hash(path: Path) -> str | None:
     try:
         if path.suffix == ".json":
             return str(storage.read_json(path).get(_INPUT_HASH))
-        with np.load(path, allow_pickle=False) as archive:
-            return str(archive[_INPUT_HASH])
-    except (InputError, OSError, ValueError, KeyError, EOFError):
+        return str(storage.read_npz(path, only=_INPUT_HASH)[_INPUT_HASH])
+    except InputError:
         return None  # damaged from outside: treat as not done
 
 

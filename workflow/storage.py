@@ -1,8 +1,9 @@
 """Files that are either whole or absent: atomic writes of npz, JSON and text, and their readers.
 
-A file is written under a temporary name in its own directory, flushed to the disk, renamed over the final name,
-and the directory entry is flushed as well. A kill or a power cut at any instant leaves the old file or the new one.
-Pickle never appears: object arrays are refused on writing and `allow_pickle=False` holds on reading.
+A file is written under a temporary name in its own directory, flushed to the disk, renamed over the final
+name, and the directory entry is flushed as well. A kill or a power cut at any instant leaves the old file or
+the new one. Pickle never appears: object arrays are refused on writing and `allow_pickle=False` holds on
+reading.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import math
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -78,7 +80,8 @@ def npz_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
             if array.dtype.hasobject:
                 raise TypeError(f"array {name!r} has dtype {array.dtype}: objects would need pickle")
             entry = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
-            # Level 1: signals and responses shrink about as far as they will, at a tenth of the time of level 6.
+            # Level 1: signals and responses shrink about as far as they will, at a tenth of the time of
+            # level 6.
             entry.compress_type = zipfile.ZIP_DEFLATED
             content = io.BytesIO()
             np.lib.format.write_array(content, array, allow_pickle=False)
@@ -91,19 +94,22 @@ def write_npz(path: Path, arrays: Mapping[str, AnyArray]) -> None:
     write_bytes(path, npz_bytes(arrays))
 
 
-def read_npz(path: Path) -> dict[str, AnyArray]:
-    """All arrays of an npz file, read without pickle. Raises InputError naming the file."""
+def read_npz(path: Path, *, only: str | None = None) -> dict[str, AnyArray]:
+    """All arrays of an npz file (or just the one called `only`), read without pickle.
+
+    Raises InputError naming the file.
+    """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here: np.load leaves its own handle to the garbage collector when the content is damaged.
+        with open(path, "rb") as stream:
+            archive = np.load(stream, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: a single array, expected an npz archive")
-            return {name: archive[name] for name in archive.files}
+                raise ValueError("it holds a single array")
+            return {name: archive[name] for name in (archive.files if only is None else [only])}
     except OSError as error:
         raise InputError(f"cannot read {path}: {describe_os_error(error)}") from error
-    except (ValueError, zipfile.BadZipFile, EOFError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: not a readable npz file: {error}") from error
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: not an npz file written without pickle: {error}") from error
 
 
 def sha256_of_bytes(content: bytes) -> str:
@@ -120,7 +126,8 @@ def sha256_of_file(path: Path) -> str:
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Delete temporary files that a killed writer left in `directory` (call it while holding the run's lock)."""
+    """Delete temporary files that a killed writer left in `directory` (call it while holding the run's
+    lock)."""
     for leftover in directory.glob(f".*{TEMPORARY_SUFFIX}"):
         leftover.unlink(missing_ok=True)
 
@@ -131,6 +138,17 @@ def _flush_directory(directory: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def strict_json(value: Any) -> Any:
+    """For readers other than us: the same document with nan and infinity as null."""
+    if isinstance(value, Mapping):
+        return {str(key): strict_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [strict_json(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def encode(value: Any) -> Any:

@@ -1,0 +1,113 @@
+"""TOML errors: one line with the file, the dotted key as the user wrote it, and what was expected."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import BaseModel, ConfigDict, Field
+
+from workflow.errors import InputError
+from workflow.settings import InputPath, check, expand, read_toml
+
+
+class Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Options(Strict):
+    level: float = Field(0.95, gt=0, lt=1)
+
+
+class FromFiles(Strict):
+    kind: Literal["files"]
+    path: InputPath
+
+
+class Simulated(Strict):
+    kind: Literal["simulated"]
+    bandwidth_rad_s: float = 1.0
+
+
+class Channel(Strict):
+    input: str
+    options: Options = Options()
+
+
+class Config(Strict):
+    source: Annotated[FromFiles | Simulated, Field(discriminator="kind")]
+    channels: tuple[Channel, ...] = ()
+
+
+SIMULATED = {"kind": "simulated"}
+
+
+@pytest.mark.parametrize(
+    ("document", "expected"),
+    [
+        (
+            {"source": {"kind": "simulated", "bandwith_rad_s": 2}},
+            "unknown key source.bandwith_rad_s (did you mean bandwidth_rad_s?)",
+        ),
+        ({"source": SIMULATED, "zzz": 1}, "unknown key zzz (known keys: channels, source)"),
+        (
+            {"source": SIMULATED, "channels": [{"input": "u"}, {"inptu": "u"}]},
+            "unknown key channels[1].inptu (did you mean input?) (and 1 more)",
+        ),
+        ({"source": SIMULATED, "channels": [{}]}, "missing key channels[0].input"),
+        ({}, "missing key source"),
+        ({"source": {}}, "missing key source.kind"),
+        ({"source": {"kind": "wire"}}, "source.kind: expected one of 'files', 'simulated', got 'wire'"),
+        (
+            {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": 1.5}}]},
+            "channels[0].options.level: input should be less than 1, got 1.5",
+        ),
+        (
+            {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": float("nan")}}]},
+            "channels[0].options.level: input should be a finite number, got nan",
+        ),
+        (
+            {"source": {"kind": "simulated", "bandwidth_rad_s": "fast"}},
+            "source.bandwidth_rad_s: input should be a valid number, unable to parse string as a number, got 'fast'",
+        ),
+    ],
+)
+def test_first_complaint(document, expected):
+    with pytest.raises(InputError) as caught:
+        check(Config, document, source="arm.toml")
+    assert str(caught.value) == f"arm.toml: {expected}"
+
+
+def test_paths_are_relative_to_the_configuration_and_must_be_there(tmp_path, monkeypatch):
+    (tmp_path / "log.csv").write_text("")
+    found = check(FromFiles, {"kind": "files", "path": "log.csv"}, source="a", context={"base": tmp_path})
+    assert found.path == tmp_path / "log.csv"
+    with pytest.raises(InputError, match=r"a: path: no such file: .*missing\.csv"):
+        check(FromFiles, {"kind": "files", "path": "missing.csv"}, source="a", context={"base": tmp_path})
+    with pytest.raises(InputError, match="a directory, expected a file"):
+        check(FromFiles, {"kind": "files", "path": "."}, source="a", context={"base": tmp_path})
+    gone = {"base": tmp_path, "may_be_gone": True}
+    assert check(FromFiles, {"kind": "files", "path": "missing.csv"}, source="a", context=gone)
+
+
+def test_environment_variables_are_expanded_or_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("FLEXLINK_DATA", str(tmp_path))
+    assert expand("${FLEXLINK_DATA}/a.csv") == f"{tmp_path}/a.csv"
+    monkeypatch.delenv("FLEXLINK_DATA")
+    with pytest.raises(InputError, match="a: path: environment variable FLEXLINK_DATA is not set"):
+        check(FromFiles, {"kind": "files", "path": "${FLEXLINK_DATA}/a.csv"}, source="a")
+
+
+def test_toml_syntax_error_names_line_and_column(tmp_path):
+    path = tmp_path / "arm.toml"
+    path.write_text("[run]\nname = \n")
+    with pytest.raises(InputError, match=r"arm\.toml: not valid TOML: .*line 2, column 8"):
+        read_toml(path)
+
+
+def test_unreadable_files_are_one_line(tmp_path):
+    with pytest.raises(InputError, match=r"cannot read .*absent\.toml: No such file"):
+        read_toml(tmp_path / "absent.toml")
+    (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"')
+    with pytest.raises(InputError, match="not UTF-8"):
+        read_toml(tmp_path / "latin.toml")

@@ -1,0 +1,228 @@
+"""The command line: every command parses, makes one library call, prints, and leaves an exit code.
+
+0 ok; 1 internal error; 2 something given is wrong (one line on standard error, nothing half-written); 3 the result
+is not certified or misses its specification (the report is written all the same).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from workflow.errors import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERNAL,
+    EXIT_NOT_CERTIFIED,
+    EXIT_OK,
+    InputError,
+    StageError,
+    one_line,
+)
+
+_EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
+
+app = typer.Typer(
+    name="flexlink",
+    help="From a flexible-link arm and its logs to a robust controller with a certificate.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"flexlink {metadata.version('flexlink')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and leave.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file; without it the built-in default arm.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Run directory [default: runs/<name>-<date>-<time>]", show_default=False)
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Delete an earlier run in --out first.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
+    from workflow.console import TerminalProgress, print_summary
+    from workflow.entry import run_from_files
+
+    with TerminalProgress() as progress:
+        summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
+    if as_json:
+        _print_json(summary.to_document())
+    else:
+        print_summary(summary)
+    _leave(summary.certified, summary.verdict)
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Option(help="Directory for one CSV file per record; new or empty.")],
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file with [source] kind = 'simulated'; without it the default arm.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Simulate the experiments of a configuration and write them as CSV."""
+    from workflow.entry import simulate_to_csv
+
+    files = simulate_to_csv(config, out)
+    if as_json:
+        _print_json({"files": [str(path) for path in files]})
+    else:
+        for path in files:
+            typer.echo(str(path))
+
+
+@app.command()
+def identify(
+    log: Annotated[list[Path], typer.Argument(help="CSV, npz or mat; several files are fitted together.")],
+    input_name: Annotated[str, typer.Option("--input", help="Input column.")],
+    output_name: Annotated[str, typer.Option("--output", help="Output column.")],
+    time: Annotated[str | None, typer.Option(help="Time column [s].", show_default=False)] = None,
+    dt_s: Annotated[float | None, typer.Option(help="Sampling period, if no --time.", show_default=False)] = None,
+    validation: Annotated[
+        list[Path] | None, typer.Option(help="Log kept for validation (repeatable).", show_default=False)
+    ] = None,
+    pairs: Annotated[int | None, typer.Option(help="Pole pairs [default: from the data]", show_default=False)] = None,
+    real: Annotated[int | None, typer.Option(help="Real poles [default: from the data]", show_default=False)] = None,
+    integrators: Annotated[int, typer.Option(help="Known poles at z = 1.")] = 0,
+    level: Annotated[float, typer.Option(help="Confidence of the ellipses.")] = 0.95,
+    out: Annotated[
+        Path | None, typer.Option(help="Write model and posterior here (npz).", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Identify one channel from log files: poles, modes, fit, residual tests."""
+    from workflow.console import print_summary
+    from workflow.entry import identify_logs
+
+    summary = identify_logs(
+        log,
+        input_name,
+        output_name,
+        time=time,
+        dt_s=dt_s,
+        validation=validation or [],
+        n_pairs=pairs,
+        n_real=real,
+        integrators=integrators,
+        level=level,
+        out=out,
+    )
+    if as_json:
+        _print_json(summary.to_document())
+    else:
+        print_summary(summary)
+
+
+@app.command()
+def design(
+    source: Annotated[Path, typer.Argument(help="Run directory, or npz written by `flexlink identify --out`.")],
+    specification: Annotated[
+        Path | None, typer.Option(help="TOML with the keys of [specification]; for a run directory its own if left out.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the controller here (JSON).", show_default=False)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Root of the random starts.")] = 2006,
+    as_json: Json = False,
+) -> None:
+    """Design and certify a controller for an identified plant."""
+    from workflow.console import print_summary
+    from workflow.entry import design_controller
+
+    summary = design_controller(source, specification, out=out, seed=seed)
+    if as_json:
+        _print_json(summary.to_document())
+    else:
+        print_summary(summary)
+    _leave(summary.certified, summary.verdict)
+
+
+@app.command()
+def report(
+    directory: Annotated[Path, typer.Argument(help="Run directory.")],
+    as_json: Json = False,
+) -> None:
+    """Write report.html of a run directory anew and print its table."""
+    from workflow.console import print_summary
+    from workflow.pipeline import rebuild_report
+    from workflow.run_directory import RunDirectory
+
+    summary = rebuild_report(RunDirectory.open(directory))
+    if as_json:
+        _print_json(summary.to_document())
+    else:
+        print_summary(summary)
+
+
+def _print_json(document: Mapping[str, Any]) -> None:
+    from workflow.storage import strict_json
+
+    sys.stdout.write(json.dumps(strict_json(document), allow_nan=False, ensure_ascii=False, indent=1) + "\n")
+
+
+def _leave(certified: bool, verdict: str) -> None:
+    if not certified:
+        print(f"flexlink: {one_line(verdict)}", file=sys.stderr)  # noqa: T201
+        raise typer.Exit(EXIT_NOT_CERTIFIED)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code; every error is one line on standard error."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    if debug:
+        arguments.remove("--debug")
+    try:
+        code = app(arguments, standalone_mode=False)
+        return int(code or EXIT_OK)
+    except typer.Exit as leaving:
+        return int(leaving.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain("interrupted; `flexlink run --out DIR --resume` continues", _EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has left; there is nobody to tell
+        return EXIT_OK
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        return _complain(*_explain(error))
+
+
+def _explain(error: Exception) -> tuple[str, int]:
+    if isinstance(error, (InputError, StageError)):
+        return str(error), error.exit_code
+    if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
+        return f"{error.format_message()} (flexlink --help)", EXIT_BAD_INPUT
+    return f"internal error: {type(error).__name__}: {error} (--debug shows where)", EXIT_INTERNAL
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"flexlink: {one_line(message)}", file=sys.stderr)  # noqa: T201
+    return code

@@ -1,0 +1,109 @@
+"""Progress and tables on a terminal (rich); everything goes to standard error unless a table is asked for."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TaskID, TextColumn
+from rich.table import Table
+from rich.text import Text
+
+from workflow.summary import RunSummary
+
+
+class _Remaining(ProgressColumn):
+    """Seconds left, from the stages' expected times and the speed seen so far."""
+
+    def render(self, task: Task) -> Text:
+        left = task.fields.get("remaining_s")
+        return Text("" if left is None else f"about {left:.0f} s left", style="cyan")
+
+
+class TerminalProgress:
+    """Progress with remaining time on standard error; silent when that is no terminal. Use as a context manager."""
+
+    def __init__(self) -> None:
+        console = Console(stderr=True)
+        self._bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.percentage:>3.0f} %"),
+            _Remaining(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task: TaskID | None = None
+        self._expected: dict[str, float] = {}
+        self._done_s = 0.0
+        self._started = time.monotonic()
+        self._skipped_s = 0.0
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def plan(self, stages: Sequence[tuple[str, float]]) -> None:
+        self._expected = dict(stages)
+        self._started = time.monotonic()
+        self._task = self._bar.add_task("", total=sum(self._expected.values()) or 1.0)
+
+    def start(self, stage: str) -> None:
+        self._show(stage, 0.0, "")
+
+    def update(self, stage: str, fraction: float, message: str = "") -> None:
+        self._show(stage, min(max(fraction, 0.0), 1.0), message)
+
+    def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
+        expected = self._expected.get(stage, 0.0)
+        self._done_s += expected
+        if taken_up:
+            self._skipped_s += expected
+        if not self._bar.disable:
+            words = "taken up from the earlier run" if taken_up else f"{seconds:.1f} s"
+            self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)
+        self._show(stage, 0.0, "")
+
+    def _show(self, stage: str, fraction: float, message: str) -> None:
+        if self._task is None:
+            return
+        total = sum(self._expected.values())
+        done = self._done_s + fraction * self._expected.get(stage, 0.0)
+        worked = done - self._skipped_s
+        elapsed = time.monotonic() - self._started
+        # The expected times set the shape, the run so far the speed; early on there is too little to go by.
+        speed = min(max(elapsed / worked, 0.3), 10.0) if worked > 0.05 * total else 1.0
+        text = stage if not message else f"{stage}: {message}"
+        self._bar.update(
+            self._task, completed=done, description=escape(text), remaining_s=max(total - done, 0.0) * speed
+        )
+
+
+def print_summary(summary: RunSummary) -> None:
+    """The table of numbers on standard output."""
+    # A pipe has no width; 120 columns keep the rows on one line there.
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 120)
+    table = Table(title=escape(summary.title), title_justify="left", show_header=False, pad_edge=False)
+    table.add_column("section", style="bold")
+    table.add_column("quantity")
+    table.add_column("value")
+    for section in summary.sections:
+        for index, row in enumerate(section.rows):
+            label = escape(section.title) if index == 0 else ""
+            table.add_row(label, escape(row.label), escape(row.value), end_section=index == len(section.rows) - 1)
+    console.print(table)
+    console.print(f"{escape(summary.verdict)}", highlight=False, soft_wrap=True)
+    if summary.report_path:
+        console.print(f"report: {escape(summary.report_path)}", highlight=False, soft_wrap=True)
