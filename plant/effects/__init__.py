@@ -1,0 +1,117 @@
+"""Effects that can separate a machine from its nominal rig, and their registry.
+
+A new effect is one class in the module of its group and one line in `EFFECTS`; the contract test does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from plant.effects.actuator import ActuatorDeadZone, ActuatorGain, ActuatorSaturation, InputDelay
+from plant.effects.base import Effect
+from plant.effects.joint import CoulombFriction, HubInertia, StribeckFriction, ViscousFriction
+from plant.effects.link import LinkStiffness, StructuralDamping, TipPayload
+from plant.effects.sensor import Quantisation, SensorDrift, SensorGain
+from plant.machine import Machine
+from plant.rig import Rig, one_line
+
+EFFECTS: dict[str, type[Effect]] = {
+    effect.id: effect
+    for effect in (
+        CoulombFriction,
+        StribeckFriction,
+        ViscousFriction,
+        ActuatorSaturation,
+        ActuatorDeadZone,
+        InputDelay,
+        ActuatorGain,
+        TipPayload,
+        LinkStiffness,
+        StructuralDamping,
+        SensorGain,
+        SensorDrift,
+        Quantisation,
+        HubInertia,
+    )
+}
+
+__all__ = [
+    "EFFECTS",
+    "ActuatorDeadZone",
+    "ActuatorGain",
+    "ActuatorSaturation",
+    "CoulombFriction",
+    "Effect",
+    "HubInertia",
+    "InputDelay",
+    "LinkStiffness",
+    "Quantisation",
+    "SensorDrift",
+    "SensorGain",
+    "StribeckFriction",
+    "StructuralDamping",
+    "TipPayload",
+    "ViscousFriction",
+    "make_machine",
+    "parse_effect",
+    "parse_effects",
+    "without",
+]
+
+
+def parse_effect(entry: Mapping[str, Any]) -> Effect:
+    """An effect from {"name": id, parameter: value, ...}.
+
+    Raises
+    ------
+    ValueError
+        One line naming the effect and the parameter, or listing the known effects.
+    """
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"an effect is a table with a name and its parameters; got {entry!r}")
+    if "name" not in entry:
+        raise ValueError(f"effect without a name; known effects: {', '.join(EFFECTS)}")
+    name = entry["name"]
+    if name not in EFFECTS:
+        raise ValueError(f"unknown effect {name!r}; known effects: {', '.join(EFFECTS)}")
+    try:
+        return EFFECTS[name].model_validate({key: value for key, value in entry.items() if key != "name"})
+    except ValidationError as error:
+        raise ValueError(f"effect {name}: {one_line(error)}") from error
+
+
+def parse_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:
+    """Several effects; see `parse_effect`."""
+    return tuple(parse_effect(entry) for entry in entries)
+
+
+def without(effects: Sequence[Effect], kind: type[Effect] | str) -> tuple[Effect, ...]:
+    """The effects that are not of the given class or registry id."""
+    if isinstance(kind, str):
+        if kind not in EFFECTS:
+            raise ValueError(f"unknown effect {kind!r}; known effects: {', '.join(EFFECTS)}")
+        return tuple(effect for effect in effects if type(effect).id != kind)
+    return tuple(effect for effect in effects if not isinstance(effect, kind))
+
+
+def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:
+    """The machine made of a rig and effects; the order of the effects does not matter.
+
+    Raises
+    ------
+    ValueError
+        If an entry is not an effect, or an effect is given twice.
+    """
+    machine = Machine(rig)
+    seen: set[str] = set()
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise ValueError(f"expected effects (see plant.effects); got {effect!r}")
+        if effect.id in seen:
+            raise ValueError(f"effect {effect.id} is given twice")
+        seen.add(effect.id)
+        machine = effect.modify(machine)
+    return machine

@@ -1,0 +1,48 @@
+"""Effects on the tip sensor. They act in the order lag, gain, drift, noise, quantisation."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from plant.effects.base import Effect, NotNegative, Positive, with_sensor
+from plant.machine import Machine
+
+
+class SensorGain(Effect):
+    """tip_m multiplied by a ratio, before its noise."""
+
+    id = "sensor_gain"
+    group = "sensor"
+    neutral = {"ratio": 1.0}
+
+    ratio: Positive = Field(description="measured over true tip position")
+
+    def modify(self, machine: Machine) -> Machine:
+        return with_sensor(machine, gain=machine.sensor.gain * self.ratio)
+
+
+class SensorDrift(Effect):
+    """rate * time added to tip_m, time from the start of the record."""
+
+    id = "sensor_drift"
+    group = "sensor"
+    neutral = {"rate_m_s": 0.0}
+
+    rate_m_s: float = Field(description="drift of the tip sensor")
+
+    def modify(self, machine: Machine) -> Machine:
+        return with_sensor(machine, drift_m_s=machine.sensor.drift_m_s + self.rate_m_s)
+
+
+class Quantisation(Effect):
+    """tip_m rounded to the nearest multiple of a step, after the noise."""
+
+    id = "quantisation"
+    group = "sensor"
+    neutral = {"step_m": 0.0}
+    smooth = False
+
+    step_m: NotNegative = Field(description="resolution of the tip sensor; 0 is none")
+
+    def modify(self, machine: Machine) -> Machine:
+        return with_sensor(machine, step_m=max(machine.sensor.step_m, self.step_m))

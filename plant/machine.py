@@ -1,0 +1,104 @@
+"""A machine: the rig together with everything an effect can change, as one frozen description.
+
+An effect is a function Machine -> Machine (see `plant.effects`). The description is physical, not numerical: matrices are
+made from it in `plant.modal`, compiled arrays in `plant.plan`. Every field's default means "as nominal".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from plant.rig import Rig
+
+
+@dataclass(frozen=True)
+class VoltagePath:
+    """From the commanded to the acting voltage, in this order: delay, gain, dead zone, saturation, lag."""
+
+    delay_s: float = 0.0
+    gain: float = 1.0
+    dead_zone_V: float = 0.0
+    limit_V: float = float("inf")
+    lag_s: float = 0.0
+
+    def static(self, voltage_V: float) -> float:
+        """The memoryless part: gain, dead zone, saturation."""
+        value = self.gain * voltage_V
+        size = min(max(abs(value) - self.dead_zone_V, 0.0), self.limit_V)
+        return size if value >= 0 else -size
+
+
+@dataclass(frozen=True)
+class DryFriction:
+    """Dry friction of the level Tc + (Ts - Tc) exp(-|omega| / vs) with 10 microradian of elastic pre-sliding."""
+
+    static_torque_Nm: float
+    coulomb_torque_Nm: float
+    stribeck_velocity_rad_s: float
+
+    PRE_SLIDING_RAD = 1e-5
+
+    @property
+    def stiffness_Nm_rad(self) -> float:
+        return self.static_torque_Nm / self.PRE_SLIDING_RAD
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """Torque a sin(N angle + phase) between motor housing and motor shaft, referred to the hub."""
+
+    amplitude_Nm: float
+    cycles_per_rev: float
+    phase_rad: float
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Torque a sin(2 pi f t + phase) from ground on the hub."""
+
+    amplitude_Nm: float
+    frequency_Hz: float
+    phase_rad: float
+
+
+@dataclass(frozen=True)
+class TorsionSpring:
+    """A torsion spring and damper, with the inertia of what it carries (0 where it carries none)."""
+
+    stiffness_Nm_rad: float
+    damping_Nms: float
+    inertia_kg_m2: float = 0.0
+
+
+@dataclass(frozen=True)
+class JointPath:
+    """What acts between voltage and link root."""
+
+    friction: tuple[DryFriction, ...] = ()
+    ripple: tuple[Ripple, ...] = ()
+    disturbance: tuple[Disturbance, ...] = ()
+    cubic_spring_Nm_rad3: float = 0.0
+    compliance: TorsionSpring | None = None
+    base: TorsionSpring | None = None
+    backlash_gap_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class SensorPath:
+    """The tip sensor, in this order: lag, gain, drift, noise, quantisation."""
+
+    lag_s: float = 0.0
+    gain: float = 1.0
+    drift_m_s: float = 0.0
+    step_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Machine:
+    """The rig (its parameters already changed by parametric effects) and the paths around it."""
+
+    rig: Rig
+    voltage: VoltagePath = field(default_factory=VoltagePath)
+    joint: JointPath = field(default_factory=JointPath)
+    sensor: SensorPath = field(default_factory=SensorPath)
+    gravity_m_s2: float = 0.0

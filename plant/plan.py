@@ -1,0 +1,326 @@
+"""From a machine to the arrays the compiled stepper works on.
+
+Method. Dry friction (an elastic element whose force is limited) and contact in a gear with play are *piecewise linear*:
+in each of their modes the arm is one linear system, stepped exactly with its matrix exponential. A step at whose end some
+element no longer holds its mode is halved, down to 1/512 of the basic step, and only there the mode changes; the step sizes are the
+basic one divided by powers of two, so their matrices are prepared once. Smooth forces (ripple, cubic spring, gravity, the falling part of
+Stribeck friction) enter as a parabola through their values at start, middle and end of the step (collocation, order 4); linear dynamics
+stay exact. Lags and a sinusoidal disturbance are linear systems of their own and part of the state matrix. A delay splits every sample at the
+instant where the held voltage changes. Without switching or smooth forces there is one exact step a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+
+from plant.kernel import CONTACT, CUBIC, FRICTION, GRAVITY, SINE, STRIBECK
+from plant.machine import Machine
+from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion
+
+Real = npt.NDArray[np.float64]
+Integer = npt.NDArray[np.int64]
+
+# Basic step where something switches or is not linear: 8 a sample at 5 ms.
+SUBSTEP_S = 6.25e-4
+# A basic step is halved this many times to place a switching instant (to 1.2 us at the basic step above).
+_HALVINGS = 9
+# A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic step.
+_PHASE_PER_STEP_RAD = 0.8
+# A fraction of a sample below this is no separate part of it.
+_SMALLEST_PART = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Arrays of `plant.kernel.run` in its order, the initial state, and the whole-sample part of the delay."""
+
+    arrays: tuple[npt.NDArray[np.float64] | npt.NDArray[np.int64], ...]
+    initial_state: Real
+    n_elements: int
+    delay_samples: int
+    parts: int
+
+
+def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: float) -> Plan:
+    """Prepare the stepper for a machine sampled at dt_s.
+
+    The outputs of the plan are the hub angle, the true tip position and the tip position behind the sensor's lag.
+    """
+    equations = equations_of_motion(machine, default_n_modes(machine.rig) if n_modes is None else n_modes)
+    builder = _Builder(machine, equations)
+    element, element_rows = builder.elements()
+    kinds, channel, channel_rows, force_columns = builder.channels()
+    n, n_elements, n_channels = builder.n, element.shape[0], kinds.size
+    held_columns = builder.held_columns()
+    switching = n_elements + n_channels > 0
+    halvings = _HALVINGS if n_elements else 0
+    state_matrices = [builder.state_matrix(q, element, element_rows) for q in range(2**n_elements)]
+    longest = builder.longest_step_s(element, element_rows, held_columns, substep_s)
+
+    whole, fraction = _split_delay(machine.voltage.delay_s, dt_s)
+    part_lengths = (dt_s,) if fraction == 0.0 else (fraction * dt_s, (1 - fraction) * dt_s)
+    substeps = [int(np.ceil(length / longest * (1 - 1e-12))) if switching else 1 for length in part_lengths]
+    rows = n + held_columns.shape[1] + 3 * n_channels
+    step = np.empty((len(part_lengths), len(state_matrices), halvings + 1, rows, n))
+    reach = np.empty((len(part_lengths), len(state_matrices), halvings + 1, rows, 2 * n_channels))
+    for part, (length, count) in enumerate(zip(part_lengths, substeps, strict=True)):
+        for q, a in enumerate(state_matrices):
+            _transitions(
+                a, held_columns, force_columns, channel_rows, length / count, step[part, q], reach[part, q]
+            )
+    rate = np.zeros((len(state_matrices), n_elements, n + held_columns.shape[1] + n_channels))
+    for q, a in enumerate(state_matrices):
+        for e in range(n_elements):
+            rate[q, e] = element_rows[e, 1] @ np.hstack([a, held_columns, force_columns])
+    static_moment, geometric_stiffness = builder.gravity()
+    return Plan(
+        arrays=(
+            np.array(substeps, dtype=np.int64),
+            step,
+            reach,
+            np.ascontiguousarray(builder.outputs().T),
+            element,
+            element_rows,
+            rate,
+            kinds,
+            channel,
+            np.ascontiguousarray(channel_rows.T),
+            static_moment,
+            geometric_stiffness,
+        ),
+        initial_state=builder.initial_state(),
+        n_elements=n_elements,
+        delay_samples=whole,
+        parts=len(part_lengths),
+    )
+
+
+def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
+    """Whole samples and the remaining fraction of one."""
+    samples = delay_s / dt_s
+    whole = int(np.floor(samples))
+    fraction = samples - whole
+    if fraction < _SMALLEST_PART:
+        return whole, 0.0
+    if fraction > 1 - _SMALLEST_PART:
+        return whole + 1, 0.0
+    return whole, fraction
+
+
+class _Builder:
+    """State layout: coordinates, speeds, then voltage lag, tip sensor lag, and a sine and cosine per disturbance."""
+
+    def __init__(self, machine: Machine, equations: Equations) -> None:
+        self.machine, self.equations = machine, equations
+        size = 2 * equations.mass.shape[0]
+        self.mechanical = size
+        self.voltage_state = size if machine.voltage.lag_s > 0 else -1
+        size += self.voltage_state >= 0
+        self.sensor_state = size if machine.sensor.lag_s > 0 else -1
+        size += self.sensor_state >= 0
+        self.oscillators = size
+        self.n = size + 2 * len(machine.joint.disturbance)
+
+    def _row(self, mechanical_row: Real) -> Real:
+        return np.concatenate([mechanical_row, np.zeros(self.n - self.mechanical)])
+
+    def _column(self, direction: Real) -> Real:
+        return self._row(self.equations.input_column(direction))
+
+    def _position(self, direction: Real) -> Real:
+        return self._row(self.equations.position_row(direction))
+
+    def _speed(self, direction: Real) -> Real:
+        return self._row(self.equations.speed_row(direction))
+
+    def _motor_column(self) -> Real:
+        return self.machine.rig.motor.torque_per_volt_Nm_V * self._column(self.equations.shaft)
+
+    def state_matrix(self, q: int, element: Real, element_rows: Real) -> Real:
+        """A with the springs of the elements whose bit is set in q: stuck friction, closed contact."""
+        machine, eq = self.machine, self.equations
+        a = np.zeros((self.n, self.n))
+        a[: self.mechanical, : self.mechanical] = eq.state_matrix()
+        if self.voltage_state >= 0:
+            a[:, self.voltage_state] += self._motor_column()
+            a[self.voltage_state, self.voltage_state] = -1 / machine.voltage.lag_s
+        if self.sensor_state >= 0:
+            a[self.sensor_state] += self._position(eq.tip) / machine.sensor.lag_s
+            a[self.sensor_state, self.sensor_state] = -1 / machine.sensor.lag_s
+        for i, disturbance in enumerate(machine.joint.disturbance):
+            sine = self.oscillators + 2 * i
+            omega = 2 * np.pi * disturbance.frequency_Hz
+            a[:, sine] += disturbance.amplitude_Nm * self._column(eq.hub)
+            a[sine, sine + 1], a[sine + 1, sine] = omega, -omega
+        columns = self._element_columns()
+        for e in range(element.shape[0]):
+            if q >> e & 1:
+                if element[e, 0] == FRICTION:
+                    a -= element[e, 1] * np.outer(columns[:, e], element_rows[e, 0])
+                else:
+                    a += np.outer(
+                        columns[:, e], element[e, 2] * element_rows[e, 0] + element[e, 3] * element_rows[e, 1]
+                    )
+        return a
+
+    def held_columns(self) -> Real:
+        """Columns of what is constant over a step: voltage, hub torque, tip force, one force per element."""
+        eq = self.equations
+        if self.voltage_state >= 0:
+            voltage = np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
+        else:
+            voltage = self._motor_column()
+        return np.column_stack([voltage, self._column(eq.hub), self._column(eq.tip), self._element_columns()])
+
+    def _element_columns(self) -> Real:
+        """One column per element: friction drives the shaft, contact the hub against the motor side."""
+        columns = [self._column(self.equations.shaft) for _ in self._friction()]
+        if self.equations.play is not None:
+            columns.append(-self._column(self.equations.play))
+        return np.column_stack(columns) if columns else np.zeros((self.n, 0))
+
+    def _friction(self) -> list[tuple[float, float, float, float]]:
+        return [
+            (
+                f.stiffness_Nm_rad,
+                f.coulomb_torque_Nm,
+                f.static_torque_Nm - f.coulomb_torque_Nm,
+                f.stribeck_velocity_rad_s,
+            )
+            for f in self.machine.joint.friction
+            if f.static_torque_Nm > 0
+        ]
+
+    def elements(self) -> tuple[Real, Real]:
+        """Parameters (E, 6) and rows of relative angle and speed (E, 2, N)."""
+        eq = self.equations
+        parameters: list[tuple[float, ...]] = [(FRICTION, *f, 0.0) for f in self._friction()]
+        directions = [eq.shaft] * len(parameters)
+        gap = self.machine.joint.backlash_gap_rad
+        if gap is not None and eq.play is not None:
+            inertia = self.machine.rig.hub.inertia_kg_m2
+            stiffness = 0.21 * inertia * (2 * np.pi * 180) ** 2
+            damping = 0.8 * np.sqrt(MOTOR_SIDE_SHARE * inertia * stiffness)
+            parameters.append((CONTACT, gap / 2, stiffness, damping, 0.0, 0.0))
+            directions.append(eq.play)
+        rows = np.array([[self._position(d), self._speed(d)] for d in directions])
+        return np.array(parameters).reshape(-1, 6), rows.reshape(-1, 2, self.n)
+
+    def channels(self) -> tuple[Integer, Real, Real, Real]:
+        """Kinds (J,), parameters (J, 3), position rows (J, N) and force columns (N, J) of the smooth forces."""
+        machine, eq = self.machine, self.equations
+        kinds: list[int] = []
+        parameters: list[tuple[float, float, float]] = []
+        rows: list[Real] = []
+        columns: list[Real] = []
+
+        def add(kind: int, values: tuple[float, float, float], row: Real, column: Real) -> None:
+            kinds.append(kind)
+            parameters.append(values)
+            rows.append(row)
+            columns.append(column)
+
+        for e, (_, _, excess, velocity) in enumerate(self._friction()):
+            if excess != 0:
+                add(STRIBECK, (excess, velocity, e), self._speed(eq.shaft), self._column(eq.shaft))
+        for ripple in machine.joint.ripple:
+            values = ripple.amplitude_Nm, ripple.cycles_per_rev, ripple.phase_rad
+            add(SINE, values, self._position(eq.shaft), self._column(eq.shaft))
+        if machine.joint.cubic_spring_Nm_rad3 != 0:
+            values = machine.joint.cubic_spring_Nm_rad3, 0.0, 0.0
+            add(CUBIC, values, self._position(eq.hub), self._column(eq.hub))
+        if machine.gravity_m_s2 != 0:
+            rig = machine.rig
+            r, length, m = rig.hub.radius_m, rig.link.length_m, rig.link.mass_per_length_kg_m
+            moment = m * length * (r + length / 2) + rig.payload.mass_kg * (r + length)
+            values = machine.gravity_m_s2, moment, 0.0
+            add(GRAVITY, values, self._position(eq.root), self._column(eq.root))
+            for direction in np.eye(eq.mass.shape[0])[eq.first_mode :]:
+                add(GRAVITY, values, self._position(direction), self._column(direction))
+        return (
+            np.array(kinds, dtype=np.int64),
+            np.array(parameters).reshape(-1, 3),
+            np.array(rows).reshape(-1, self.n),
+            np.array(columns).reshape(-1, self.n).T,
+        )
+
+    def gravity(self) -> tuple[Real, Real]:
+        """s_i = int m phi_i dx + mp phi_i(L) and int (mass outboard of x) phi_i' phi_j' dx (the link hangs: it stiffens)."""
+        if self.machine.gravity_m_s2 == 0:
+            return np.zeros(0), np.zeros((0, 0))
+        rig, modes = self.machine.rig, self.equations.modes
+        nodes, weights = np.polynomial.legendre.leggauss(8 * modes.tip.size + 16)
+        x = 0.5 * rig.link.length_m * (nodes + 1)
+        outboard = rig.link.mass_per_length_kg_m * (rig.link.length_m - x) + rig.payload.mass_kg
+        slope = modes.slope(x)
+        return modes.first_moment.copy(), slope.T @ (
+            (0.5 * rig.link.length_m * weights * outboard)[:, None] * slope
+        )
+
+    def outputs(self) -> Real:
+        """Rows: encoder, tip, tip behind the sensor lag."""
+        tip = self._position(self.equations.tip)
+        behind = np.eye(self.n)[self.sensor_state] if self.sensor_state >= 0 else tip
+        return np.array([self._position(self.equations.encoder), tip, behind])
+
+    def initial_state(self) -> Real:
+        x = np.zeros(self.n)
+        for i, disturbance in enumerate(self.machine.joint.disturbance):
+            sine = self.oscillators + 2 * i
+            x[sine], x[sine + 1] = np.sin(disturbance.phase_rad), np.cos(disturbance.phase_rad)
+        return x
+
+    def longest_step_s(
+        self, element: Real, element_rows: Real, held_columns: Real, substep_s: float
+    ) -> float:
+        longest = substep_s
+        for e in range(element.shape[0]):
+            stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]
+            mobility = abs(element_rows[e, 1] @ held_columns[:, 3 + e])
+            longest = min(longest, _PHASE_PER_STEP_RAD / np.sqrt(stiffness * mobility))
+        return float(longest)
+
+
+def _transitions(
+    a: Real, held: Real, force: Real, rows: Real, length: float, step: Real, reach: Real
+) -> None:
+    """Fill step (L, N + H + 3J, N) and reach (L, N + H + 3J, 2J) for the lengths length * 2^(l - L + 1)."""
+    n, n_held, n_force = a.shape[0], held.shape[1], force.shape[1]
+    levels = step.shape[0]
+    size = n + n_held + 3 * n_force
+    block = np.zeros((size, size))
+    block[:n] = np.hstack([a, held, force, np.zeros((n, 2 * n_force))])
+    # Force, slope and curvature in time: a chain of integrators.
+    first = n + n_held
+    block[first : first + 2 * n_force, first + n_force :] = np.eye(2 * n_force)
+    shortest = length / 2 ** (levels - 1)
+    if n_force == 0:
+        transition = expm(block * shortest)
+        for level in range(levels):
+            step[level] = transition[:n].T
+            transition = transition @ transition
+        return
+    transition = expm(block * (shortest / 2))
+    for level in range(levels):
+        h = shortest * 2**level
+        middle, transition = transition, transition @ transition
+        step[level] = _by_nodes(transition[:n], first, n_force, h).T
+        reach[level, :, :n_force] = (rows @ _by_nodes(middle[:n], first, n_force, h)).T
+        reach[level, :, n_force:] = step[level] @ rows.T
+
+
+def _by_nodes(transition: Real, first: int, n_force: int, h: float) -> Real:
+    """Replace columns for force, slope and curvature at the start by columns for the forces at start, middle and end."""
+    value, slope, curve = (transition[:, first + i * n_force : first + (i + 1) * n_force] for i in range(3))
+    return np.hstack(
+        [
+            transition[:, :first],
+            value - 3 / h * slope + 4 / h**2 * curve,
+            4 / h * slope - 8 / h**2 * curve,
+            -slope / h + 4 / h**2 * curve,
+        ]
+    )

@@ -1,0 +1,232 @@
+"""The nominal rig: every physical parameter of a flexible-link arm, as read from a TOML file.
+
+Keys, units and meaning are those of the rig description in the documentation: a straight uniform link clamped to a
+rigid hub, turned by a voltage-driven gear motor, with noisy measurements of hub angle and tip position.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+_STRICT = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Link(BaseModel):
+    """A uniform, isotropic Euler-Bernoulli link of rectangular cross section; it bends about I = b h^3 / 12."""
+
+    model_config = _STRICT
+
+    length_m: Positive = Field(description="free length, from the clamp to the tip")
+    width_m: Positive = Field(description="side b of the cross section, along the bending axis")
+    thickness_m: Positive = Field(description="side h of the cross section, in the plane of motion")
+    density_kg_m3: Positive = Field(description="mass density")
+    youngs_modulus_Pa: Positive = Field(description="Young's modulus")
+    kelvin_voigt_s: NotNegative = Field(description="kappa in M = E I (w'' + kappa dw''/dt)")
+
+    @property
+    def mass_per_length_kg_m(self) -> float:
+        return self.density_kg_m3 * self.width_m * self.thickness_m
+
+    @property
+    def bending_stiffness_Nm2(self) -> float:
+        return self.youngs_modulus_Pa * self.width_m * self.thickness_m**3 / 12.0
+
+
+class Hub(BaseModel):
+    """The rigid body between motor and link."""
+
+    model_config = _STRICT
+
+    inertia_kg_m2: Positive = Field(description="about the hub axis, reflected motor inertia included")
+    radius_m: NotNegative = Field(description="distance from the hub axis to the clamp")
+    viscous_friction_Nms: NotNegative = Field(description="linear friction of motor and gear, at the hub")
+
+
+class Motor(BaseModel):
+    """A voltage-driven direct-current motor without inductance, behind a rigid gear."""
+
+    model_config = _STRICT
+
+    torque_constant_Nm_A: Positive = Field(description="torque constant, motor side")
+    back_emf_Vs_rad: NotNegative = Field(description="back-EMF constant, motor side")
+    resistance_ohm: Positive = Field(description="winding resistance")
+    gear_ratio: Positive = Field(description="motor turns per hub turn")
+
+    @property
+    def torque_per_volt_Nm_V(self) -> float:
+        """Stall torque at the hub for one volt."""
+        return self.gear_ratio * self.torque_constant_Nm_A / self.resistance_ohm
+
+    @property
+    def back_emf_damping_Nms(self) -> float:
+        """Braking torque at the hub per unit hub speed at zero volts."""
+        return self.torque_per_volt_Nm_V * self.gear_ratio * self.back_emf_Vs_rad
+
+
+class Payload(BaseModel):
+    """A point mass at the tip, without rotary inertia."""
+
+    model_config = _STRICT
+
+    mass_kg: NotNegative = Field(description="point mass at the tip")
+
+
+class Sensors(BaseModel):
+    """White Gaussian measurement noise of the two outputs."""
+
+    model_config = _STRICT
+
+    hub_angle_noise_rad: NotNegative = Field(description="standard deviation of the hub angle noise")
+    tip_noise_m: NotNegative = Field(description="standard deviation of the tip position noise")
+
+
+class Sampling(BaseModel):
+    """Sampling of inputs (held) and outputs."""
+
+    model_config = _STRICT
+
+    dt_s: Positive = Field(description="sampling period; the voltage is held over it")
+
+
+class Rig(BaseModel):
+    """Nominal parameters of the arm; immutable and checked when built.
+
+    `tolerances` holds relative standard deviations of nominal values under dotted keys such as
+    "hub.inertia_kg_m2"; a parameter that is not listed is exact.
+    """
+
+    model_config = _STRICT
+
+    link: Link
+    hub: Hub
+    motor: Motor
+    payload: Payload
+    sensors: Sensors
+    sampling: Sampling
+    tolerances: dict[str, Positive] = Field(default_factory=dict, description="relative standard deviations")
+
+    @model_validator(mode="after")
+    def _tolerances_name_parameters(self) -> Self:
+        known = parameter_keys()
+        for key in self.tolerances:
+            if key not in known:
+                raise ValueError(f"tolerances.{key}: unknown parameter, expected one of {', '.join(known)}")
+        return self
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a rig file.
+
+        Raises
+        ------
+        ValueError
+            One line with the file and the dotted key (or the line of a syntax error) and what was expected.
+        FileNotFoundError
+            If there is no such file.
+        """
+        text = Path(path).read_bytes()
+        try:
+            content = tomllib.loads(text.decode("utf-8"))
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: not UTF-8 text (byte {error.start})") from error
+        except tomllib.TOMLDecodeError as error:
+            raise ValueError(f"{path}: not valid TOML: {error}") from error
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise ValueError(f"{path}: {one_line(error)}") from error
+
+    def to_toml(self) -> str:
+        """The rig as the text of a rig file; reading it back gives an equal Rig."""
+        lines: list[str] = ["# rig; SI units, given in the key names"]
+        for section, values in self.model_dump().items():
+            if section == "tolerances":
+                if not values:
+                    continue
+                lines += ["", "# relative standard deviations of the values above; not listed = exact"]
+                lines += ["[tolerances]", *(f'"{key}" = {float(value)!r}' for key, value in values.items())]
+            else:
+                lines += ["", f"[{section}]", *(f"{key} = {float(value)!r}" for key, value in values.items())]
+        return "\n".join(lines) + "\n"
+
+    def value(self, key: str) -> float:
+        """The parameter under a dotted key such as "link.length_m"; ValueError if there is none."""
+        if key not in parameter_keys():
+            raise ValueError(f"{key}: unknown parameter, expected one of {', '.join(parameter_keys())}")
+        section, name = key.split(".")
+        return float(getattr(getattr(self, section), name))
+
+    def perturbed(self, values: Mapping[str, float]) -> Self:
+        """The same rig with the parameters under the given dotted keys set to new values.
+
+        The result is checked like any other rig; an unknown key or a bad value raises a one-line ValueError.
+        """
+        content: dict[str, Any] = self.model_dump()
+        for key, value in values.items():
+            self.value(key)
+            section, name = key.split(".")
+            content[section][name] = float(value)
+        try:
+            return type(self).model_validate(content)
+        except ValidationError as error:
+            raise ValueError(one_line(error)) from error
+
+    def scaled(self, factors: Mapping[str, float]) -> Self:
+        """The same rig with the parameters under the given dotted keys multiplied by factors."""
+        return self.perturbed({key: self.value(key) * factor for key, factor in factors.items()})
+
+    def drawn(self, rng: np.random.Generator) -> Self:
+        """A rig as the tolerances allow: every listed parameter times (1 + tolerance * normal deviate).
+
+        A factor is kept above 0.05 so that a wide tolerance cannot turn a parameter negative.
+        """
+        return self.scaled(
+            {k: max(1.0 + s * rng.standard_normal(), 0.05) for k, s in self.tolerances.items()}
+        )
+
+
+def parameter_keys() -> tuple[str, ...]:
+    """Dotted keys of all parameters of a Rig, in file order."""
+    return _PARAMETER_KEYS
+
+
+def one_line(error: ValidationError) -> str:
+    """The gravest complaint of pydantic in one line: dotted key, what was expected, what came."""
+    # An unknown key first: a misspelt key is also a missing one, and the spelling is what the user has to see.
+    first = min(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
+    key = ".".join(str(part) for part in first["loc"])
+    kind, message = first["type"], first["msg"].removeprefix("Value error, ")
+    if kind == "missing":
+        text = f"{key}: missing, expected a value"
+    elif kind == "extra_forbidden":
+        text = f"{key}: unknown key"
+    elif kind == "value_error":
+        text = f"{key}: {message}" if key else message
+    else:
+        expected = message.removeprefix("Input should be ")
+        text = f"{key}: expected {expected}, got {first['input']!r}"
+    return text
+
+
+_PARAMETER_KEYS: tuple[str, ...] = tuple(
+    f"{section}.{name}"
+    for section, model in (
+        ("link", Link),
+        ("hub", Hub),
+        ("motor", Motor),
+        ("payload", Payload),
+        ("sensors", Sensors),
+        ("sampling", Sampling),
+    )
+    for name in model.model_fields
+)

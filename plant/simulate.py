@@ -1,0 +1,254 @@
+"""Simulation of a machine: whole records, and sample by sample for a closed loop."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from plant.effects import Effect, make_machine
+from plant.kernel import run
+from plant.machine import Machine, SensorPath
+from plant.modal import OUTPUT_NAMES
+from plant.plan import SUBSTEP_S, Plan, make_plan
+from plant.rig import Rig
+
+Real = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A simulated record; all arrays (T,), read-only.
+
+    Attributes
+    ----------
+    time_s
+        t_k = k dt.
+    voltage_V
+        Commanded voltage, held over [t_k, t_(k+1)).
+    hub_angle_rad, tip_m
+        As measured at t_k, before the voltage of the same row takes effect: with the effects on the sensors, and with noise if the
+        simulation was given a generator.
+    hub_angle_true_rad, tip_true_m
+        Before every sensor effect and without noise.
+    """
+
+    time_s: Real
+    voltage_V: Real
+    hub_angle_rad: Real
+    tip_m: Real
+    hub_angle_true_rad: Real
+    tip_true_m: Real
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            array = np.array(getattr(self, entry.name), dtype=np.float64)
+            if array.ndim != 1 or array.shape != np.shape(self.time_s):
+                raise ValueError(f"{entry.name} must be (T,) like time_s; got shape {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, entry.name, array)
+
+    @property
+    def output(self) -> Real:
+        """(T, 2): hub_angle_rad, tip_m as measured."""
+        return np.column_stack([self.hub_angle_rad, self.tip_m])
+
+    def to_arrays(self) -> dict[str, npt.NDArray[np.float64]]:
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[np.float64]]) -> Trajectory:
+        return cls(**{entry.name: np.asarray(mapping[entry.name]) for entry in fields(cls)})
+
+
+def simulate(
+    rig: Rig,
+    voltage_V: npt.ArrayLike,
+    effects: Sequence[Effect] = (),
+    *,
+    rng: np.random.Generator | None = None,
+    dt_s: float | None = None,
+    hub_torque_Nm: npt.ArrayLike | None = None,
+    tip_force_N: npt.ArrayLike | None = None,
+    n_modes: int | None = None,
+    substep_s: float = SUBSTEP_S,
+) -> Trajectory:
+    """Drive a machine from rest with a held voltage.
+
+    Parameters
+    ----------
+    rig, effects
+        The machine.
+    voltage_V : (T,)
+        Commanded voltage; before the first sample it is zero.
+    rng
+        Source of the sensor noise; without it the measurement is noise-free.
+    dt_s
+        Sampling period, if not the rig's.
+    hub_torque_Nm, tip_force_N : (T,), optional
+        Outside torque on the hub and transverse outside force at the tip, held over the sample.
+    n_modes
+        Number of modes, if not `plant.modal.default_n_modes`.
+    substep_s
+        Longest step where the machine is not linear; see `plant.plan`.
+
+    Raises
+    ------
+    ValueError
+        One line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect given twice.
+    """
+    machine = make_machine(rig, effects)
+    dt = _sampling_period(rig, dt_s)
+    plan = make_plan(machine, dt, _mode_count(n_modes), _positive("substep_s", substep_s))
+    voltage = _signal("voltage_V", voltage_V, None)
+    n_samples = voltage.size
+    acting = np.zeros(plan.delay_samples + 1 + n_samples)
+    acting[plan.delay_samples + 1 :] = _static(machine, voltage)
+    inputs = np.zeros((n_samples, 4))
+    late, early = acting[:n_samples], acting[1 : n_samples + 1]
+    inputs[:, 0], inputs[:, 1] = (late, early) if plan.parts == 2 else (early, early)
+    if hub_torque_Nm is not None:
+        inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
+    if tip_force_N is not None:
+        inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
+    observed = np.empty((n_samples, 3))
+    state = _State(plan)
+    run(inputs, observed, state.x, state.reference, state.mode, *plan.arrays)
+    time = np.arange(n_samples) * dt
+    noise = None if rng is None else rng.standard_normal((n_samples, 2))
+    measured = _measured(machine, observed[:, [0, 2]], time, noise)
+    return Trajectory(time, voltage, measured[:, 0], measured[:, 1], observed[:, 0], observed[:, 1])
+
+
+class SampledArm:
+    """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
+
+    The same compiled stepper and the same numbers as `simulate`. Mutable: it is the one object of this package with a state.
+    """
+
+    output_names = OUTPUT_NAMES
+
+    def __init__(
+        self,
+        rig: Rig,
+        effects: Sequence[Effect] = (),
+        rng: np.random.Generator | None = None,
+        *,
+        dt_s: float | None = None,
+        n_modes: int | None = None,
+        substep_s: float = SUBSTEP_S,
+    ) -> None:
+        self._machine = make_machine(rig, effects)
+        self._dt_s = _sampling_period(rig, dt_s)
+        self._plan = make_plan(
+            self._machine, self._dt_s, _mode_count(n_modes), _positive("substep_s", substep_s)
+        )
+        self._rng = rng
+        self._inputs = np.zeros((1, 4))
+        self._unused = np.empty((1, 3))
+        self._rows = self._plan.arrays[3].T.copy()
+        self.reset()
+
+    @property
+    def dt_s(self) -> float:
+        return self._dt_s
+
+    def reset(self) -> None:
+        """Back to rest at time zero. The noise generator goes on; it is not rewound."""
+        self._state = _State(self._plan)
+        self._sample = 0
+        self._pending: deque[float] = deque([0.0] * (self._plan.delay_samples + 1))
+        self._measurement: Real | None = None
+
+    @property
+    def true_output(self) -> Real:
+        """(2,) hub_angle_rad, tip_m at t_k before sensor effects and noise."""
+        return np.asarray((self._rows @ self._state.x)[:2])
+
+    def measure(self) -> Real:
+        """(2,) hub_angle_rad, tip_m at t_k as measured; repeated calls at one instant give the same sample."""
+        if self._measurement is None:
+            now = (self._rows @ self._state.x)[[0, 2]][None, :]
+            noise = None if self._rng is None else self._rng.standard_normal((1, 2))
+            time = np.array([self._sample * self._dt_s])
+            self._measurement = _measured(self._machine, now, time, noise)[0]
+        return self._measurement.copy()
+
+    def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
+        """Hold voltage, outside hub torque and outside tip force until t_(k+1)."""
+        if not (abs(voltage_V) < np.inf and abs(hub_torque_Nm) < np.inf and abs(tip_force_N) < np.inf):
+            raise ValueError(
+                f"inputs must be finite; got {voltage_V} V, {hub_torque_Nm} N m, {tip_force_N} N"
+            )
+        if self._rng is not None:
+            self.measure()  # every instant takes its noise, looked at or not, so that a record does not depend on who looks
+        self._pending.append(self._machine.voltage.static(float(voltage_V)))
+        late = self._pending.popleft()
+        row = self._inputs[0]
+        row[0], row[1] = (
+            (late, self._pending[0]) if self._plan.parts == 2 else (self._pending[0], self._pending[0])
+        )
+        row[2], row[3] = hub_torque_Nm, tip_force_N
+        state = self._state
+        run(self._inputs, self._unused, state.x, state.reference, state.mode, *self._plan.arrays)
+        self._sample += 1
+        self._measurement = None
+
+
+class _State:
+    """What the stepper changes in place: at rest, every friction element stuck, every contact open."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.x = plan.initial_state.copy()
+        self.reference = np.zeros(plan.n_elements)
+        self.mode = np.zeros(plan.n_elements, dtype=np.int64)
+
+
+def _static(machine: Machine, voltage: Real) -> Real:
+    path = machine.voltage
+    value = path.gain * voltage
+    return np.asarray(np.copysign(np.clip(np.abs(value) - path.dead_zone_V, 0.0, path.limit_V), value))
+
+
+def _measured(machine: Machine, output: Real, time: Real, noise: Real | None) -> Real:
+    """Gain, drift, noise and quantisation of (T, 2) outputs whose tip is already behind the sensor lag."""
+    sensor: SensorPath = machine.sensor
+    measured = output.copy()
+    measured[:, 1] = sensor.gain * measured[:, 1] + sensor.drift_m_s * time
+    if noise is not None:
+        measured += noise * (machine.rig.sensors.hub_angle_noise_rad, machine.rig.sensors.tip_noise_m)
+    if sensor.step_m > 0:
+        measured[:, 1] = sensor.step_m * np.round(measured[:, 1] / sensor.step_m)
+    return measured
+
+
+def _sampling_period(rig: Rig, dt_s: float | None) -> float:
+    return rig.sampling.dt_s if dt_s is None else _positive("dt_s", dt_s)
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0 < value < np.inf:
+        raise ValueError(f"{name} must be positive and finite; got {value}")
+    return float(value)
+
+
+def _mode_count(n_modes: int | None) -> int | None:
+    if n_modes is not None and not n_modes >= 1:
+        raise ValueError(f"n_modes must be at least 1; got {n_modes}")
+    return n_modes
+
+
+def _signal(name: str, values: npt.ArrayLike, n_samples: int | None) -> Real:
+    try:
+        signal = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of numbers: {error}") from error
+    if signal.ndim != 1 or signal.size == 0 or (n_samples is not None and signal.size != n_samples):
+        raise ValueError(f"{name} must have shape ({n_samples or 'T'},), T >= 1; got {signal.shape}")
+    if not np.all(np.isfinite(signal)):
+        first = int(np.flatnonzero(~np.isfinite(signal))[0])
+        raise ValueError(f"{name} must be finite; got {signal[first]} at sample {first}")
+    return signal
