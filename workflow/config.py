@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from control_design.specification import Specification
+from ident.embedding import EmbeddingOptions
 from ident.options import IdentOptions
 from workflow.excitations import Excitation
-from workflow.settings import InputPath, check, expand, read_toml
+from workflow.settings import InputPath, check, read_toml
 from workflow.simulated_rig import EffectTable, RigChoice
 
 Role = Literal["estimation", "validation", "repeat"]
@@ -50,6 +51,7 @@ class SimulatedSource(Section):
     rig: RigChoice = Field("paper_link", description="preset 'paper_link', or the path of a rig TOML file")
     modes: int | None = Field(None, ge=1, le=20, description="flexible modes; default: all below Nyquist, at least 3")
     effects: tuple[EffectTable, ...] = Field((), description="what the nominal rig does not have, e.g. coulomb_friction")
+    encoder_step_rad: float = Field(0.0, ge=0, description="resolution of the hub encoder; 0 is none")
     records: tuple[SimulatedRecord, ...] = Field(min_length=1)
 
 
@@ -102,13 +104,13 @@ Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
 # -- what is made of them --------------------------------------------------------------------------------------
 
 
-class UncertaintyOptions(Section):
+class UncertaintyOptions(EmbeddingOptions):
     """How the ellipses around an identified response are made (design 4.5)."""
 
-    method: Literal["tangent", "classical"] = "tangent"
+    method: Literal["tangent", "classical"] = Field(
+        "tangent", description="tangent covers; classical is the published recipe, for comparison"
+    )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each frequency's ellipse taken alone")
-    fir_length: int = Field(150, ge=10, le=1000, description="taps of the kernel on the remainder")
-    prewhiten: bool = Field(True, description="AR model of coloured residuals, order by BIC, up to 8")
 
 
 class Channel(Section):
@@ -260,5 +262,3 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
     text, document = read_toml(path)
     return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
 
-
-__all__ = ["BeforeValidator", "Channel", "RunConfig", "expand", "load_config", "record_name"]

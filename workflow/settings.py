@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails
 
-from workflow.errors import InputError, describe_os_error
+from workflow.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -137,18 +137,23 @@ def _expand_before(value: Any) -> Any:
     return expand(value) if isinstance(value, str) else value
 
 
-def _resolve(path: Path, info: ValidationInfo) -> Path:
-    """Relative to the `base` of the validation context; the file must be there unless `may_be_gone` is set."""
+def resolve(path: Path, info: ValidationInfo, *, kind: str = "file") -> Path:
+    """Relative to the `base` of the validation context; must be a file unless `may_be_gone` is set there.
+
+    Raises ValueError saying what was found instead.
+    """
     context = info.context or {}
     base = context.get("base")
     resolved = Path(os.path.normpath(Path(base) / path)) if base else path
     if not context.get("may_be_gone") and not resolved.is_file():
-        try:
-            found = "a directory, expected a file" if resolved.is_dir() else "no such file"
-        except OSError as error:
-            found = describe_os_error(error)
-        raise ValueError(f"{found}: {resolved}")
+        if resolved.is_dir():
+            raise ValueError(f"expected a {kind}, found a directory: {resolved}")
+        raise ValueError(f"no such {kind}: {resolved}")
     return resolved
 
 
-InputPath = Annotated[Path, BeforeValidator(_expand_before), AfterValidator(_resolve)]
+def _input_path(path: Path, info: ValidationInfo) -> Path:
+    return resolve(path, info)
+
+
+InputPath = Annotated[Path, BeforeValidator(_expand_before), AfterValidator(_input_path)]

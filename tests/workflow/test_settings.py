@@ -84,7 +84,7 @@ def test_paths_are_relative_to_the_configuration_and_must_be_there(tmp_path, mon
     assert found.path == tmp_path / "log.csv"
     with pytest.raises(InputError, match=r"a: path: no such file: .*missing\.csv"):
         check(FromFiles, {"kind": "files", "path": "missing.csv"}, source="a", context={"base": tmp_path})
-    with pytest.raises(InputError, match="a directory, expected a file"):
+    with pytest.raises(InputError, match="expected a file, found a directory"):
         check(FromFiles, {"kind": "files", "path": "."}, source="a", context={"base": tmp_path})
     gone = {"base": tmp_path, "may_be_gone": True}
     assert check(FromFiles, {"kind": "files", "path": "missing.csv"}, source="a", context=gone)

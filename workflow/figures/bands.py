@@ -1,0 +1,82 @@
+"""Numbers behind the pictures: gain and phase of ellipses, outlines of long signals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.ellipses import farthest_distance, nearest_distance
+from ident.uncertainty import FrequencyUncertainty
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseBand:
+    """Gain and phase [deg] of an uncertain response over its ellipses, all (F,).
+
+    The gain's range is exact; the phase's is taken from 128 boundary points and is the whole circle where the ellipse
+    holds the origin.
+    """
+
+    omega_rad_s: Real
+    gain: Real
+    gain_low: Real
+    gain_high: Real
+    phase_deg: Real
+    phase_low_deg: Real
+    phase_high_deg: Real
+
+
+def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
+    """Band of a response; frequency 0 is left out, it has no place on a log axis."""
+    keep = uncertainty.omega_rad_s > 0
+    ellipse = uncertainty.ellipse()
+    centre = uncertainty.centre[keep]
+    s1, s2, u1 = ellipse.semi_major[keep], ellipse.semi_minor[keep], ellipse.direction[keep]
+    origin = -centre * np.conj(u1)
+    low = nearest_distance(origin, s1, s2)
+    phase = unwrapped_degrees(centre)
+    turn = ellipse.boundary(128)[keep] / np.where(centre == 0, 1.0, centre)[:, None]
+    swing = np.degrees(np.angle(1.0 + turn))
+    holds_origin = low <= 0
+    return ResponseBand(
+        omega_rad_s=uncertainty.omega_rad_s[keep],
+        gain=np.abs(centre),
+        gain_low=low,
+        gain_high=farthest_distance(origin, s1, s2),
+        phase_deg=phase,
+        phase_low_deg=phase + np.where(holds_origin, -180.0, swing.min(axis=1)),
+        phase_high_deg=phase + np.where(holds_origin, 180.0, swing.max(axis=1)),
+    )
+
+
+def unwrapped_degrees(response: Complex) -> Real:
+    """Phase without jumps, started in (-270, 90]."""
+    phase = np.degrees(np.unwrap(np.angle(response)))
+    return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
+
+
+def degrees_near(response: Complex, target_deg: Real) -> Real:
+    """Phase of each point on the turn that is nearest to `target_deg`."""
+    phase = np.degrees(np.angle(response))
+    return np.asarray(phase + 360.0 * np.round((target_deg - phase) / 360.0))
+
+
+def outline(time_s: Real, signal: Real, bins: int = 700) -> tuple[Real, Real]:
+    """A long signal as the smallest and largest sample of each of `bins` equal parts, in order of time.
+
+    Drawn as a line it covers the same pixels as the whole signal. Short signals come back as they are.
+    """
+    if signal.size <= 3 * bins:
+        return time_s, signal
+    length = signal.size // bins
+    used = length * bins
+    parts = signal[:used].reshape(bins, length)
+    first = np.arange(bins) * length
+    index = np.sort(np.stack([first + parts.argmin(axis=1), first + parts.argmax(axis=1)], axis=1), axis=1).ravel()
+    index = np.unique(np.concatenate([index, [signal.size - 1]]))
+    return time_s[index], signal[index]

@@ -1,0 +1,216 @@
+"""The house style: one colour per meaning, units on every axis, the same bytes every time.
+
+Colours are from the Okabe-Ito palette (told apart with every common colour-vision deficiency) and every meaning has a
+line style of its own as well, so a grey print still reads.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
+
+MEASURED = "#6b6b6b"  # what sensors said
+MODEL = "#0072B2"  # identified model, open loop
+UNCERTAIN = "#56B4E9"  # ellipses and the bands made of them
+PREDICTED = "#009E73"  # controller, and the loop as computed from the model
+ACHIEVED = "#D55E00"  # the loop as it ran on the machine
+REFERENCE = "#111111"  # what was asked for
+LIMIT = "#8B2E7F"  # specification and hard limits
+HIGHLIGHT = "#E69F00"  # the one point the sentence below the picture speaks of
+SHADE = {"estimation": "#0072B2", "validation": "#E69F00", "repeat": "#6b6b6b"}
+
+MEASURED_LINE: dict[str, Any] = {"color": MEASURED, "lw": 0.9}
+MODEL_LINE: dict[str, Any] = {"color": MODEL, "lw": 1.4}
+PREDICTED_LINE: dict[str, Any] = {"color": PREDICTED, "lw": 1.5}
+ACHIEVED_LINE: dict[str, Any] = {"color": ACHIEVED, "lw": 1.1}
+REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "lw": 1.0, "ls": (0, (4, 2))}
+LIMIT_LINE: dict[str, Any] = {"color": LIMIT, "lw": 1.3, "ls": (0, (6, 2, 1.5, 2))}
+BAND: dict[str, Any] = {"color": UNCERTAIN, "alpha": 0.42, "lw": 0}
+
+WIDTH_IN = 10.0  # 100 px per inch at the width of the page
+SVG_LIMIT_BYTES = 400_000
+_PNG_DPI = 160
+
+_RC: dict[str, Any] = {
+    "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same picture on every machine
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#444444",
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 9.0,
+    "legend.frameon": False,
+    "xtick.labelsize": 9.0,
+    "ytick.labelsize": 9.0,
+    "xtick.color": "#333333",
+    "ytick.color": "#333333",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.3,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "flexlink",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "axes.unicode_minus": True,
+    "axes.formatter.use_mathtext": True,
+    "axes.formatter.limits": (-4, 4),
+    "mathtext.fontset": "dejavusans",
+    "figure.constrained_layout.h_pad": 0.06,
+    "figure.constrained_layout.w_pad": 0.06,
+}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A rendered figure: SVG text or PNG bytes."""
+
+    kind: Literal["svg", "png"]
+    content: bytes
+
+
+def house_style() -> Any:
+    """Context in which figures are built and rendered; global matplotlib settings come back afterwards."""
+    return mpl.rc_context(_RC)
+
+
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+    """An empty figure of the page's width, laid out automatically, owned by no global state."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def render(figure: Figure) -> Picture:
+    """SVG, or PNG where the SVG would be larger than 400 kB. Equal figures give equal bytes."""
+    with house_style():
+        buffer = io.BytesIO()
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(buffer, format="svg", metadata=nothing, dpi=_PNG_DPI)
+        if buffer.tell() <= SVG_LIMIT_BYTES:
+            return Picture("svg", buffer.getvalue())
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", metadata={"Software": None}, dpi=_PNG_DPI)
+        return Picture("png", buffer.getvalue())
+
+
+@lru_cache(maxsize=1)
+def _drawable() -> frozenset[int]:
+    return frozenset(get_font(findfont(FontProperties(family="DejaVu Sans"))).get_charmap())
+
+
+def plain(text: object, longest: int = 60) -> str:
+    """Somebody else's text as matplotlib may safely draw it.
+
+    No formula starts at a dollar sign, line breaks become blanks, characters the font lacks become a box, and a text
+    longer than `longest` is cut with an ellipsis.
+    """
+    one_line = " ".join(str(text).split())
+    if len(one_line) > longest:
+        one_line = one_line[: longest - 1] + "\u2026"
+    return "".join(
+        "\\$" if letter == "$" else letter if ord(letter) in _drawable() else "\u25a1" for letter in one_line
+    )
+
+
+def axis_label(name: object, unit: str) -> str:
+    """`name [unit]`; a unit nobody stated is said to be as logged, never guessed."""
+    return f"{plain(name, 34)} [{plain(unit, 20) if unit else 'as logged'}]"
+
+
+def ratio_unit(output_unit: str, input_unit: str) -> str:
+    """Unit of a gain."""
+    return f"{output_unit or '(out as logged)'} / {input_unit or '(in as logged)'}"
+
+
+def legend_below(figure: Figure, axes: Axes | Iterable[Axes], columns: int = 4) -> None:
+    """One legend for all `axes` below the figure, every label once: it can hide nothing there."""
+    handles: dict[str, Any] = {}
+    for one in [axes] if isinstance(axes, Axes) else axes:
+        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    if handles:
+        figure.legend(
+            list(handles.values()), list(handles), loc="outside lower center", ncols=min(columns, len(handles))
+        )
+
+
+def tag(axes: Axes, x: float, text: str) -> None:
+    """A small word at the top of a vertical line at data position x, inside the axes."""
+    axes.annotate(
+        text,
+        xy=(x, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(3, -3),
+        textcoords="offset points",
+        va="top",
+        ha="left",
+        fontsize=8.5,
+        color="#444444",
+        bbox={"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.8},
+    )
+
+
+def hertz_axis(axes: Axes, label: bool = True) -> None:
+    """A second frequency axis on top, in Hz, for axes whose x is in rad/s."""
+    turn = 6.283185307179586
+    top = axes.secondary_xaxis("top", functions=(lambda w: w / turn, lambda f: f * turn))
+    top.tick_params(labelsize=8.5, colors="#666666")
+    if label:
+        top.set_xlabel("frequency [Hz]", fontsize=8.5, color="#666666")
+    else:
+        top.set_xticklabels([])
+
+
+def inline_svg(svg: bytes, prefix: str, label: str) -> str:
+    """The <svg> element alone, ids made unique by `prefix`, `label` (already HTML-escaped) as its accessible name.
+
+    Comments go (they carry the drawn texts a second time), so do the XML prologue, the metadata and the fixed size.
+    """
+    text = svg.decode("utf-8")
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}\1"', text)
+    text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}\1)", text)
+    # The common style rule of matplotlib would reach every other figure of the page: give it to this one's group.
+    text = re.sub(r"<defs>\s*<style[^>]*>.*?</style>\s*</defs>\s*", "", text, count=1, flags=re.DOTALL)
+    head, body = text.split(">", 1)
+    box = re.search(r'viewBox="([^"]+)"', head)
+    view = box.group(1) if box else "0 0 720 400"
+    return (
+        f'<svg viewBox="{view}" role="img" aria-label="{label}" xmlns="http://www.w3.org/2000/svg" '
+        f'xmlns:xlink="http://www.w3.org/1999/xlink" '
+        f'style="stroke-linejoin:round;stroke-linecap:butt">{body.rstrip()}'
+    )
+
+
+def pad_limits(low: float, high: float, share: float = 0.06) -> tuple[float, float]:
+    """Axis limits with a margin; a constant signal gets room on both sides."""
+    span = high - low
+    if not span > 0:
+        span = abs(high) or 1.0
+    return low - share * span, high + share * span
+
+
+def shown(names: Sequence[str], longest: int = 6) -> str:
+    """A short list of names for a title."""
+    rest = f" and {len(names) - longest} more" if len(names) > longest else ""
+    return ", ".join(plain(name, 28) for name in names[:longest]) + rest
