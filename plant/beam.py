@@ -1,12 +1,13 @@
 """Exact vibration modes of a uniform clamped-free link with a point mass at the tip.
 
-Euler-Bernoulli: E I phi'''' = m omega^2 phi, phi(0) = phi'(0) = 0, phi''(L) = 0 and, because the tip mass is part of
-the boundary condition, E I phi'''(L) = -mp omega^2 phi(L). With lambda = beta L and mu = mp / (m L),
+Euler-Bernoulli: E I phi'''' = m omega^2 phi, phi(0) = phi'(0) = 0, phi''(L) = 0 and, because the tip mass
+is part of the boundary condition, E I phi'''(L) = -mp omega^2 phi(L). With lambda = beta L and mu = mp / (m
+L),
 
     1 + cos(lambda) cosh(lambda) + mu lambda (cos(lambda) sinh(lambda) - sin(lambda) cosh(lambda)) = 0.
 
-Every hyperbolic function is written in exp(-lambda), so no mode number overflows. Shear and the rotary inertia of the
-cross section are neglected.
+Every hyperbolic function is written in exp(-lambda), so no mode number overflows. Shear and the rotary
+inertia of the cross section are neglected.
 """
 
 from __future__ import annotations
@@ -114,11 +115,12 @@ def clamped_free_modes(
     denominator = tanh + np.sin(lam) * sech
     end = 2 * (np.sin(lam) - np.cos(lam) * tanh) / denominator
     end_slope = 2 * beta * tanh * np.sin(lam) / denominator
-    # 4 beta^4 int phi^2 = [3 phi phi''' - phi' phi'' + x (beta^4 phi^2 - 2 phi' phi''' + phi''^2)] from 0 to L,
-    # whose derivative is 4 beta^4 phi^2 for every solution of the beam equation; the ends follow from the boundary conditions.
+    # 4 beta^4 int phi^2 = [3 phi phi''' - phi' phi'' + x (beta^4 phi^2 - 2 phi' phi''' + phi''^2)] from 0
+    # to L: the bracket's derivative is 4 beta^4 phi^2 for every solution of the beam equation, its ends are
+    # boundary conditions.
     square = 0.25 * length * (end**2 * (1 - 3 * mu) + 2 * mu * length * end_slope * end)
     scale = 1 / np.sqrt(m * square + tip_mass_kg * end**2)
-    # Twice by parts, with the boundary conditions: int m (r + x) phi + mp (r + L) phi(L) = (m / beta^4) (phi''(0) - r phi'''(0)).
+    # Twice by parts: int m (r + x) phi dx + mp (r + L) phi(L) = (m / beta^4) (phi''(0) - r phi'''(0)).
     moment = 2 * m * scale / beta**2
     force = 2 * m * scale * _sigma(lam) / beta
     return BeamModes(

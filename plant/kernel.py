@@ -1,4 +1,4 @@
-"""The compiled time stepper. Everything here is plain arrays; `plant.plan` makes them and explains the method.
+"""The compiled time stepper on plain arrays; `plant.plan` makes them and explains the method.
 
 One loop serves records (T samples) and closed loops (one sample a call), so both give the same numbers.
 """
@@ -87,13 +87,18 @@ def run(
 
     inputs (T, 4): voltage of the first and second part of the sample, hub torque, tip force.
     observed (T, O): filled with output_rows (N, O) applied to the state at the start of each sample.
-    x (N,), reference (E,), mode (E,): state, friction slider positions and slip/contact signs; changed in place.
+    x (N,), reference (E,), mode (E,): state, friction slider positions, slip and contact signs; changed in
+        place.
     substeps (G,): steps per part of the sample (G = 1, or 2 with a fractional delay).
-    step (G, Q, L, N + 3 + E + 3J, N): transition of (x, held inputs, node forces), per matrix set Q and step size 2^l.
-    reach (G, Q, L, N + 3 + E + 3J, 2J): the same to the channel positions, at the middle and at the end of the step.
-    element (E, 6): kind, then friction (k, Tc, Ts - Tc, vs, -) or contact (gap/2, kc, cc, -, -).
-    element_rows (E, 2, N): relative angle and speed; element_rate (Q, E, N + 3 + E + J): relative acceleration.
+    step (G, Q, L, N + 3 + E + 3J, N): transition of (x, held inputs, node forces) per matrix set and step
+        size 2^l.
+    reach (G, Q, L, N + 3 + E + 3J, 2J): the same to the channel positions at the middle and the end of the
+        step.
+    element (E, 6): kind, then friction (k, Tc, Ts - Tc, vs, 0) or contact (gap/2, kc, cc, 0, 0).
+    element_rows (E, 2, N): relative angle and speed.
+    element_rate (Q, E, N + 3 + E + J): relative acceleration.
     channel_kind (J,), channel (J, 3), channel_rows (N, J): smooth forces and the position each depends on.
+    static_moment (M,), geometric_stiffness (M, M): of the modes under gravity; empty without it.
     """
     n, n_elements, n_channels = x.size, mode.size, channel_kind.size
     n_held = 3 + n_elements
@@ -216,7 +221,8 @@ def run(
                                 if abs(stretch) >= limit:
                                     wanted[e] = 1 if stretch > 0 else -1
                             else:
-                                # The slider follows only while its own speed, shaft minus stretch rate, keeps the sign.
+                                # The slider follows only while its own speed, shaft minus stretch rate,
+                                # keeps the sign.
                                 slider = speed
                                 if element[e, 3] != 0.0:
                                     rate = 0.0

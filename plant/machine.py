@@ -1,7 +1,8 @@
 """A machine: the rig together with everything an effect can change, as one frozen description.
 
-An effect is a function Machine -> Machine (see `plant.effects`). The description is physical, not numerical: matrices are
-made from it in `plant.modal`, compiled arrays in `plant.plan`. Every field's default means "as nominal".
+An effect is a function Machine -> Machine (see `plant.effects`). The description is physical, not
+numerical: matrices are made from it in `plant.modal`, arrays for the stepper in `plant.plan`. Every default
+means "as nominal".
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class VoltagePath:
 
 @dataclass(frozen=True)
 class DryFriction:
-    """Dry friction of the level Tc + (Ts - Tc) exp(-|omega| / vs) with 10 microradian of elastic pre-sliding."""
+    """Dry friction of the level Tc + (Ts - Tc) exp(-|omega| / vs) with elastic pre-sliding."""
 
     static_torque_Nm: float
     coulomb_torque_Nm: float

@@ -1,10 +1,11 @@
 """Equations of motion in a rigid-body coordinate and modal deflections.
 
-The displacement of the link point x is y = (r + x) theta + w(x, t), w = sum_i phi_i(x) q_i with the exact clamped-free modes
-of `plant.beam`, the tip mass (nominal payload included) in their boundary condition. Unit modal mass makes
+The displacement of the link point x is y = (r + x) theta + w(x, t), w = sum_i phi_i(x) q_i with the exact
+clamped-free modes of `plant.beam`, the whole tip mass in their boundary condition. Unit modal mass makes
 
     T = 1/2 J thetadot^2 + 1/2 I thetadot^2 + thetadot sum_i b_i qdot_i + 1/2 sum_i qdot_i^2,
-    U = 1/2 sum_i omega_i^2 q_i^2,        damping power kappa sum_i omega_i^2 qdot_i^2 + (b + n^2 Kt Kb / R) thetadot^2
+    U = 1/2 sum_i omega_i^2 q_i^2,
+    damping power = kappa sum_i omega_i^2 qdot_i^2 + (b + n^2 Kt Kb / R) thetadot^2
 
 with I = int m (r + x)^2 dx + mp (r + L)^2 and b_i = int m (r + x) phi_i dx + mp (r + L) phi_i(L).
 
@@ -28,7 +29,7 @@ Real = npt.NDArray[np.float64]
 
 INPUT_NAMES = ("voltage_V", "hub_torque_Nm", "tip_force_N")
 OUTPUT_NAMES = ("hub_angle_rad", "tip_m")
-# Of the inertia: 30 % on the motor side of a gear with play, and the contact it makes (rig description, "backlash").
+# Share of the hub inertia on the motor side of a gear with play.
 MOTOR_SIDE_SHARE = 0.3
 
 
@@ -93,8 +94,9 @@ class Equations:
 def default_n_modes(rig: Rig) -> int:
     """As many modes as lie below the Nyquist frequency of the rig's sampling, at least three.
 
-    The modes left out still deflect statically. On the rigs of the reference records that residue is below 0.3 % of the
-    sensor noise with three modes (2.5 % with two, 60 % with one), so no static correction is added.
+    The modes left out still deflect statically. On the rigs of the reference records that residue is below
+    0.3 % of the sensor noise with three modes (2.5 % with two, 60 % with one), so no static correction is
+    added.
     """
     nyquist = np.pi / rig.sampling.dt_s
     n = 1
@@ -116,7 +118,7 @@ def link_modes(rig: Rig, n_modes: int) -> BeamModes:
 
 
 def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
-    """Linear equations of the machine: rig, joint compliance, base compliance and the two sides of a backlash.
+    """Linear equations of the machine: rig, joint compliance, base compliance, the two sides of a backlash.
 
     Torques that are not linear in the state (friction, contact, ripple, cubic spring, gravity) are not in it.
     """

@@ -1,12 +1,14 @@
 """From a machine to the arrays the compiled stepper works on.
 
-Method. Dry friction (an elastic element whose force is limited) and contact in a gear with play are *piecewise linear*:
-in each of their modes the arm is one linear system, stepped exactly with its matrix exponential. A step at whose end some
-element no longer holds its mode is halved, down to 1/512 of the basic step, and only there the mode changes; the step sizes are the
-basic one divided by powers of two, so their matrices are prepared once. Smooth forces (ripple, cubic spring, gravity, the falling part of
-Stribeck friction) enter as a parabola through their values at start, middle and end of the step (collocation, order 4); linear dynamics
-stay exact. Lags and a sinusoidal disturbance are linear systems of their own and part of the state matrix. A delay splits every sample at the
-instant where the held voltage changes. Without switching or smooth forces there is one exact step a sample.
+Method. Dry friction (an elastic element whose force is limited) and contact in a gear with play are
+*piecewise linear*: in each of their modes the arm is one linear system, stepped exactly with its matrix
+exponential. A step at whose end some element no longer holds its mode is halved, down to 1/512 of the basic
+step, and only there the mode changes; step sizes are the basic one divided by powers of two, so their
+matrices are prepared once. Smooth forces (ripple, cubic spring, gravity, the falling part of Stribeck
+friction) enter as a parabola through their values at start, middle and end of the step (collocation, order
+4); linear dynamics stay exact. Lags and a sinusoidal disturbance are linear systems of their own and part
+of the state matrix. A delay splits every sample at the instant where the held voltage changes. Without
+switching or smooth forces there is one exact step a sample.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
-from plant.kernel import CONTACT, CUBIC, FRICTION, GRAVITY, SINE, STRIBECK
+from plant.kernel import CONTACT, CUBIC, FRICTION, GRAVITY, SINE, STRIBECK, run
 from plant.machine import Machine
 from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion
 
@@ -28,27 +30,75 @@ Integer = npt.NDArray[np.int64]
 SUBSTEP_S = 6.25e-4
 # A basic step is halved this many times to place a switching instant (to 1.2 us at the basic step above).
 _HALVINGS = 9
-# A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic step.
-_PHASE_PER_STEP_RAD = 0.8
+# A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
+# step. Less for contacts, which bounce: what a step misses there is amplified by the bounces that follow.
+_PHASE_PER_STEP_RAD = {FRICTION: 0.8, CONTACT: 0.25}
 # A fraction of a sample below this is no separate part of it.
 _SMALLEST_PART = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Arrays of `plant.kernel.run` in its order, the initial state, and the whole-sample part of the delay."""
+    """Arrays of `plant.kernel.run` under its names, the initial state, and the whole samples of delay."""
 
-    arrays: tuple[npt.NDArray[np.float64] | npt.NDArray[np.int64], ...]
+    substeps: Integer
+    step: Real
+    reach: Real
+    output_rows: Real
+    element: Real
+    element_rows: Real
+    element_rate: Real
+    channel_kind: Integer
+    channel: Real
+    channel_rows: Real
+    static_moment: Real
+    geometric_stiffness: Real
     initial_state: Real
-    n_elements: int
     delay_samples: int
-    parts: int
+
+    def advance(self, inputs: Real, observed: Real, state: PlanState) -> None:
+        """Run the compiled stepper over inputs (T, 4), filling observed (T, 3) and changing the state."""
+        run(
+            inputs,
+            observed,
+            state.x,
+            state.reference,
+            state.mode,
+            self.substeps,
+            self.step,
+            self.reach,
+            self.output_rows,
+            self.element,
+            self.element_rows,
+            self.element_rate,
+            self.channel_kind,
+            self.channel,
+            self.channel_rows,
+            self.static_moment,
+            self.geometric_stiffness,
+        )
+
+    def at_rest(self) -> PlanState:
+        """The state at time zero: at rest, every friction element stuck, every contact open."""
+        n_elements = self.element.shape[0]
+        return PlanState(
+            self.initial_state.copy(), np.zeros(n_elements), np.zeros(n_elements, dtype=np.int64)
+        )
+
+
+@dataclass(eq=False)
+class PlanState:
+    """What the stepper changes in place: state, slider positions, slip and contact signs."""
+
+    x: Real
+    reference: Real
+    mode: Integer
 
 
 def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: float) -> Plan:
     """Prepare the stepper for a machine sampled at dt_s.
 
-    The outputs of the plan are the hub angle, the true tip position and the tip position behind the sensor's lag.
+    Its outputs are the hub angle, the true tip position and the tip position behind the sensor's lag.
     """
     equations = equations_of_motion(machine, default_n_modes(machine.rig) if n_modes is None else n_modes)
     builder = _Builder(machine, equations)
@@ -78,24 +128,20 @@ def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: flo
             rate[q, e] = element_rows[e, 1] @ np.hstack([a, held_columns, force_columns])
     static_moment, geometric_stiffness = builder.gravity()
     return Plan(
-        arrays=(
-            np.array(substeps, dtype=np.int64),
-            step,
-            reach,
-            np.ascontiguousarray(builder.outputs().T),
-            element,
-            element_rows,
-            rate,
-            kinds,
-            channel,
-            np.ascontiguousarray(channel_rows.T),
-            static_moment,
-            geometric_stiffness,
-        ),
+        substeps=np.array(substeps, dtype=np.int64),
+        step=step,
+        reach=reach,
+        output_rows=np.ascontiguousarray(builder.outputs().T),
+        element=element,
+        element_rows=element_rows,
+        element_rate=rate,
+        channel_kind=kinds,
+        channel=channel,
+        channel_rows=np.ascontiguousarray(channel_rows.T),
+        static_moment=static_moment,
+        geometric_stiffness=geometric_stiffness,
         initial_state=builder.initial_state(),
-        n_elements=n_elements,
         delay_samples=whole,
-        parts=len(part_lengths),
     )
 
 
@@ -112,7 +158,7 @@ def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
 
 
 class _Builder:
-    """State layout: coordinates, speeds, then voltage lag, tip sensor lag, and a sine and cosine per disturbance."""
+    """State layout: coordinates, speeds, voltage lag, tip sensor lag, a sine and cosine per disturbance."""
 
     def __init__(self, machine: Machine, equations: Equations) -> None:
         self.machine, self.equations = machine, equations
@@ -211,7 +257,7 @@ class _Builder:
         return np.array(parameters).reshape(-1, 6), rows.reshape(-1, 2, self.n)
 
     def channels(self) -> tuple[Integer, Real, Real, Real]:
-        """Kinds (J,), parameters (J, 3), position rows (J, N) and force columns (N, J) of the smooth forces."""
+        """Smooth forces: kinds (J,), parameters (J, 3), position rows (J, N), force columns (N, J)."""
         machine, eq = self.machine, self.equations
         kinds: list[int] = []
         parameters: list[tuple[float, float, float]] = []
@@ -249,7 +295,10 @@ class _Builder:
         )
 
     def gravity(self) -> tuple[Real, Real]:
-        """s_i = int m phi_i dx + mp phi_i(L) and int (mass outboard of x) phi_i' phi_j' dx (the link hangs: it stiffens)."""
+        """First moments of the modes, int m phi_i dx + mp phi_i(L), and the stiffness of the hanging weight.
+
+        The latter is int (mass outboard of x) phi_i' phi_j' dx, per unit of gravity.
+        """
         if self.machine.gravity_m_s2 == 0:
             return np.zeros(0), np.zeros((0, 0))
         rig, modes = self.machine.rig, self.equations.modes
@@ -279,9 +328,9 @@ class _Builder:
     ) -> float:
         longest = substep_s
         for e in range(element.shape[0]):
-            stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]
+            stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
             mobility = abs(element_rows[e, 1] @ held_columns[:, 3 + e])
-            longest = min(longest, _PHASE_PER_STEP_RAD / np.sqrt(stiffness * mobility))
+            longest = min(longest, _PHASE_PER_STEP_RAD[int(element[e, 0])] / np.sqrt(stiffness * mobility))
         return float(longest)
 
 
@@ -314,7 +363,7 @@ def _transitions(
 
 
 def _by_nodes(transition: Real, first: int, n_force: int, h: float) -> Real:
-    """Replace columns for force, slope and curvature at the start by columns for the forces at start, middle and end."""
+    """Columns for the forces at start, middle and end, from force, slope and curvature at the start."""
     value, slope, curve = (transition[:, first + i * n_force : first + (i + 1) * n_force] for i in range(3))
     return np.hstack(
         [

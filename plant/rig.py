@@ -1,7 +1,7 @@
 """The nominal rig: every physical parameter of a flexible-link arm, as read from a TOML file.
 
-Keys, units and meaning are those of the rig description in the documentation: a straight uniform link clamped to a
-rigid hub, turned by a voltage-driven gear motor, with noisy measurements of hub angle and tip position.
+A straight uniform link is clamped radially to a rigid hub, which a voltage-driven gear motor turns in a
+horizontal plane; hub angle and tip position are measured with noise.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class Link(BaseModel):
-    """A uniform, isotropic Euler-Bernoulli link of rectangular cross section; it bends about I = b h^3 / 12."""
+    """A uniform Euler-Bernoulli link of rectangular cross section; it bends about I = b h^3 / 12."""
 
     model_config = _STRICT
 
@@ -202,7 +202,7 @@ def parameter_keys() -> tuple[str, ...]:
 
 def one_line(error: ValidationError) -> str:
     """The gravest complaint of pydantic in one line: dotted key, what was expected, what came."""
-    # An unknown key first: a misspelt key is also a missing one, and the spelling is what the user has to see.
+    # An unknown key first: a misspelt key is also a missing one, and its spelling is what has to be seen.
     first = min(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
     key = ".".join(str(part) for part in first["loc"])
     kind, message = first["type"], first["msg"].removeprefix("Value error, ")

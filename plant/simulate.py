@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from plant.effects import Effect, make_machine
-from plant.kernel import run
 from plant.machine import Machine, SensorPath
 from plant.modal import OUTPUT_NAMES
-from plant.plan import SUBSTEP_S, Plan, make_plan
+from plant.plan import SUBSTEP_S, make_plan
 from plant.rig import Rig
 
 Real = npt.NDArray[np.float64]
@@ -30,8 +30,8 @@ class Trajectory:
     voltage_V
         Commanded voltage, held over [t_k, t_(k+1)).
     hub_angle_rad, tip_m
-        As measured at t_k, before the voltage of the same row takes effect: with the effects on the sensors, and with noise if the
-        simulation was given a generator.
+        As measured at t_k, before the voltage of the same row takes effect: with the effects on the
+        sensors, and with noise if the simulation was given a generator.
     hub_angle_true_rad, tip_true_m
         Before every sensor effect and without noise.
     """
@@ -109,15 +109,14 @@ def simulate(
     acting[plan.delay_samples + 1 :] = _static(machine, voltage)
     inputs = np.zeros((n_samples, 4))
     late, early = acting[:n_samples], acting[1 : n_samples + 1]
-    inputs[:, 0], inputs[:, 1] = (late, early) if plan.parts == 2 else (early, early)
+    inputs[:, 0], inputs[:, 1] = (late, early) if plan.substeps.size == 2 else (early, early)
     if hub_torque_Nm is not None:
         inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
     if tip_force_N is not None:
         inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
     observed = np.empty((n_samples, 3))
-    state = _State(plan)
-    run(inputs, observed, state.x, state.reference, state.mode, *plan.arrays)
-    time = np.arange(n_samples) * dt
+    plan.advance(inputs, observed, plan.at_rest())
+    time = np.arange(n_samples, dtype=np.float64) * dt
     noise = None if rng is None else rng.standard_normal((n_samples, 2))
     measured = _measured(machine, observed[:, [0, 2]], time, noise)
     return Trajectory(time, voltage, measured[:, 0], measured[:, 1], observed[:, 0], observed[:, 1])
@@ -126,7 +125,8 @@ def simulate(
 class SampledArm:
     """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
 
-    The same compiled stepper and the same numbers as `simulate`. Mutable: it is the one object of this package with a state.
+    The same compiled stepper and the same numbers as `simulate`. It is the one object of this package with
+    a state.
     """
 
     output_names = OUTPUT_NAMES
@@ -149,7 +149,7 @@ class SampledArm:
         self._rng = rng
         self._inputs = np.zeros((1, 4))
         self._unused = np.empty((1, 3))
-        self._rows = self._plan.arrays[3].T.copy()
+        self._rows = self._plan.output_rows.T.copy()
         self.reset()
 
     @property
@@ -158,7 +158,7 @@ class SampledArm:
 
     def reset(self) -> None:
         """Back to rest at time zero. The noise generator goes on; it is not rewound."""
-        self._state = _State(self._plan)
+        self._state = self._plan.at_rest()
         self._sample = 0
         self._pending: deque[float] = deque([0.0] * (self._plan.delay_samples + 1))
         self._measurement: Real | None = None
@@ -169,7 +169,7 @@ class SampledArm:
         return np.asarray((self._rows @ self._state.x)[:2])
 
     def measure(self) -> Real:
-        """(2,) hub_angle_rad, tip_m at t_k as measured; repeated calls at one instant give the same sample."""
+        """(2,) hub_angle_rad, tip_m at t_k as measured; asking twice at one instant gives the same sample."""
         if self._measurement is None:
             now = (self._rows @ self._state.x)[[0, 2]][None, :]
             noise = None if self._rng is None else self._rng.standard_normal((1, 2))
@@ -184,27 +184,19 @@ class SampledArm:
                 f"inputs must be finite; got {voltage_V} V, {hub_torque_Nm} N m, {tip_force_N} N"
             )
         if self._rng is not None:
-            self.measure()  # every instant takes its noise, looked at or not, so that a record does not depend on who looks
+            self.measure()  # every instant takes its noise, looked at or not
         self._pending.append(self._machine.voltage.static(float(voltage_V)))
         late = self._pending.popleft()
         row = self._inputs[0]
         row[0], row[1] = (
-            (late, self._pending[0]) if self._plan.parts == 2 else (self._pending[0], self._pending[0])
+            (late, self._pending[0])
+            if self._plan.substeps.size == 2
+            else (self._pending[0], self._pending[0])
         )
         row[2], row[3] = hub_torque_Nm, tip_force_N
-        state = self._state
-        run(self._inputs, self._unused, state.x, state.reference, state.mode, *self._plan.arrays)
+        self._plan.advance(self._inputs, self._unused, self._state)
         self._sample += 1
         self._measurement = None
-
-
-class _State:
-    """What the stepper changes in place: at rest, every friction element stuck, every contact open."""
-
-    def __init__(self, plan: Plan) -> None:
-        self.x = plan.initial_state.copy()
-        self.reference = np.zeros(plan.n_elements)
-        self.mode = np.zeros(plan.n_elements, dtype=np.int64)
 
 
 def _static(machine: Machine, voltage: Real) -> Real:
@@ -213,7 +205,9 @@ def _static(machine: Machine, voltage: Real) -> Real:
     return np.asarray(np.copysign(np.clip(np.abs(value) - path.dead_zone_V, 0.0, path.limit_V), value))
 
 
-def _measured(machine: Machine, output: Real, time: Real, noise: Real | None) -> Real:
+def _measured(
+    machine: Machine, output: Real, time: Real, noise: npt.NDArray[np.floating[Any]] | None
+) -> Real:
     """Gain, drift, noise and quantisation of (T, 2) outputs whose tip is already behind the sensor lag."""
     sensor: SensorPath = machine.sensor
     measured = output.copy()

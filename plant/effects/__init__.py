@@ -1,6 +1,6 @@
 """Effects that can separate a machine from its nominal rig, and their registry.
 
-A new effect is one class in the module of its group and one line in `EFFECTS`; the contract test does the rest.
+A new effect is one class in the module of its group and one line in `EFFECTS`; the contract test follows.
 """
 
 from __future__ import annotations
@@ -10,11 +10,22 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from plant.effects.actuator import ActuatorDeadZone, ActuatorGain, ActuatorSaturation, InputDelay
+from plant.effects.actuator import ActuatorDeadZone, ActuatorGain, ActuatorLag, ActuatorSaturation, InputDelay
 from plant.effects.base import Effect
-from plant.effects.joint import CoulombFriction, HubInertia, StribeckFriction, ViscousFriction
-from plant.effects.link import LinkStiffness, StructuralDamping, TipPayload
-from plant.effects.sensor import Quantisation, SensorDrift, SensorGain
+from plant.effects.joint import (
+    Backlash,
+    BaseCompliance,
+    CoulombFriction,
+    HardeningSpring,
+    HubInertia,
+    JointCompliance,
+    PeriodicDisturbance,
+    StribeckFriction,
+    TorqueRipple,
+    ViscousFriction,
+)
+from plant.effects.link import Gravity, LinkStiffness, StructuralDamping, TipPayload
+from plant.effects.sensor import Quantisation, SensorDrift, SensorGain, SensorLag
 from plant.machine import Machine
 from plant.rig import Rig, one_line
 
@@ -35,6 +46,15 @@ EFFECTS: dict[str, type[Effect]] = {
         SensorDrift,
         Quantisation,
         HubInertia,
+        ActuatorLag,
+        TorqueRipple,
+        PeriodicDisturbance,
+        HardeningSpring,
+        JointCompliance,
+        BaseCompliance,
+        Backlash,
+        Gravity,
+        SensorLag,
     )
 }
 
@@ -42,18 +62,27 @@ __all__ = [
     "EFFECTS",
     "ActuatorDeadZone",
     "ActuatorGain",
+    "ActuatorLag",
     "ActuatorSaturation",
+    "Backlash",
+    "BaseCompliance",
     "CoulombFriction",
     "Effect",
+    "Gravity",
+    "HardeningSpring",
     "HubInertia",
     "InputDelay",
+    "JointCompliance",
     "LinkStiffness",
+    "PeriodicDisturbance",
     "Quantisation",
     "SensorDrift",
     "SensorGain",
+    "SensorLag",
     "StribeckFriction",
     "StructuralDamping",
     "TipPayload",
+    "TorqueRipple",
     "ViscousFriction",
     "make_machine",
     "parse_effect",

@@ -1,6 +1,8 @@
-"""Effects between the commanded voltage and the motor. They act in the order delay, gain, dead zone, saturation, lag."""
+"""Effects between commanded voltage and motor, in the order delay, gain, dead zone, saturation, lag."""
 
 from __future__ import annotations
+
+from types import MappingProxyType
 
 from pydantic import Field
 
@@ -13,7 +15,7 @@ class InputDelay(Effect):
 
     id = "input_delay"
     group = "actuator"
-    neutral = {"delay_s": 0.0}
+    neutral = MappingProxyType({"delay_s": 0.0})
 
     delay_s: NotNegative = Field(description="delay of the voltage")
 
@@ -26,7 +28,7 @@ class ActuatorGain(Effect):
 
     id = "actuator_gain"
     group = "actuator"
-    neutral = {"ratio": 1.0}
+    neutral = MappingProxyType({"ratio": 1.0})
 
     ratio: Positive = Field(description="acting voltage over commanded voltage")
 
@@ -39,7 +41,7 @@ class ActuatorDeadZone(Effect):
 
     id = "actuator_dead_zone"
     group = "actuator"
-    neutral = {"width_V": 0.0}
+    neutral = MappingProxyType({"width_V": 0.0})
     smooth = False
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
@@ -53,10 +55,23 @@ class ActuatorSaturation(Effect):
 
     id = "actuator_saturation"
     group = "actuator"
-    neutral = {"limit_V": 1e6}
+    neutral = MappingProxyType({"limit_V": 1e6})
     smooth = False
 
     limit_V: Positive = Field(description="largest voltage the driver delivers")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, limit_V=min(machine.voltage.limit_V, self.limit_V))
+
+
+class ActuatorLag(Effect):
+    """First-order lag 1 / (T s + 1) on the acting voltage, after every other voltage effect."""
+
+    id = "actuator_lag"
+    group = "actuator"
+    neutral = MappingProxyType({"time_constant_s": 0.0})
+
+    time_constant_s: NotNegative = Field(description="time constant T; 0 is none")
+
+    def modify(self, machine: Machine) -> Machine:
+        return with_voltage(machine, lag_s=self.time_constant_s)

@@ -1,4 +1,4 @@
-"""What an effect is: a small frozen object with physical parameters that changes the description of a machine."""
+"""What an effect is: a small frozen object with physical parameters that changes a machine's description."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ NotNegative = Annotated[float, Field(ge=0)]
 class Effect(BaseModel, ABC):
     """One deviation of a machine from its nominal rig.
 
-    A subclass has its parameters as fields, SI units in their names, with bounds; its docstring states the equation. An instance is
-    frozen; effects commute, because every one changes fields of its own or multiplies.
+    A subclass has its parameters as fields, SI units in their names, with bounds; its docstring states the
+    equation. An instance is frozen; effects commute, because every one changes fields of its own or
+    multiplies.
 
     Attributes
     ----------

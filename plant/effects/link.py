@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import MappingProxyType
+
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, with_parameters
@@ -13,7 +16,7 @@ class TipPayload(Effect):
 
     id = "tip_payload"
     group = "link"
-    neutral = {"mass_kg": 0.0}
+    neutral = MappingProxyType({"mass_kg": 0.0})
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
 
@@ -26,7 +29,7 @@ class LinkStiffness(Effect):
 
     id = "link_stiffness"
     group = "link"
-    neutral = {"ratio": 1.0}
+    neutral = MappingProxyType({"ratio": 1.0})
 
     ratio: Positive = Field(description="true over nominal bending stiffness")
 
@@ -41,9 +44,26 @@ class StructuralDamping(Effect):
 
     id = "structural_damping"
     group = "link"
-    neutral = {"ratio": 1.0}
+    neutral = MappingProxyType({"ratio": 1.0})
 
     ratio: NotNegative = Field(description="true over nominal kappa")
 
     def modify(self, machine: Machine) -> Machine:
         return with_parameters(machine, {"link.kelvin_voigt_s": machine.rig.link.kelvin_voigt_s * self.ratio})
+
+
+class Gravity(Effect):
+    """The plane is tilted: in-plane gravity g along the link axis at theta = 0, pointing away from the hub.
+
+    Acts on link and tip mass with the full angle of the link root; the deflection enters to second order,
+    so the hanging link is also stiffened by its own weight.
+    """
+
+    id = "gravity"
+    group = "link"
+    neutral = MappingProxyType({"acceleration_m_s2": 0.0})
+
+    acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
+
+    def modify(self, machine: Machine) -> Machine:
+        return replace(machine, gravity_m_s2=machine.gravity_m_s2 + self.acceleration_m_s2)

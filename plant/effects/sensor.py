@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, with_sensor
@@ -13,7 +15,7 @@ class SensorGain(Effect):
 
     id = "sensor_gain"
     group = "sensor"
-    neutral = {"ratio": 1.0}
+    neutral = MappingProxyType({"ratio": 1.0})
 
     ratio: Positive = Field(description="measured over true tip position")
 
@@ -26,7 +28,7 @@ class SensorDrift(Effect):
 
     id = "sensor_drift"
     group = "sensor"
-    neutral = {"rate_m_s": 0.0}
+    neutral = MappingProxyType({"rate_m_s": 0.0})
 
     rate_m_s: float = Field(description="drift of the tip sensor")
 
@@ -39,10 +41,23 @@ class Quantisation(Effect):
 
     id = "quantisation"
     group = "sensor"
-    neutral = {"step_m": 0.0}
+    neutral = MappingProxyType({"step_m": 0.0})
     smooth = False
 
     step_m: NotNegative = Field(description="resolution of the tip sensor; 0 is none")
 
     def modify(self, machine: Machine) -> Machine:
         return with_sensor(machine, step_m=max(machine.sensor.step_m, self.step_m))
+
+
+class SensorLag(Effect):
+    """First-order lag on the tip sensor, before its gain, drift and noise."""
+
+    id = "sensor_lag"
+    group = "sensor"
+    neutral = MappingProxyType({"time_constant_s": 0.0})
+
+    time_constant_s: NotNegative = Field(description="time constant; 0 is none")
+
+    def modify(self, machine: Machine) -> Machine:
+        return with_sensor(machine, lag_s=self.time_constant_s)
