@@ -18,8 +18,8 @@ Complex = npt.NDArray[np.complex128]
 class ResponseBand:
     """Gain and phase [deg] of an uncertain response over its ellipses, all (F,).
 
-    The gain's range is exact; the phase's is taken from 128 boundary points and is the whole circle where the ellipse
-    holds the origin.
+    The gain's range is exact; the phase's is taken from 128 boundary points and is the whole circle where the
+    ellipse holds the origin.
     """
 
     omega_rad_s: Real
@@ -77,6 +77,8 @@ def outline(time_s: Real, signal: Real, bins: int = 700) -> tuple[Real, Real]:
     used = length * bins
     parts = signal[:used].reshape(bins, length)
     first = np.arange(bins) * length
-    index = np.sort(np.stack([first + parts.argmin(axis=1), first + parts.argmax(axis=1)], axis=1), axis=1).ravel()
+    index = np.sort(
+        np.stack([first + parts.argmin(axis=1), first + parts.argmax(axis=1)], axis=1), axis=1
+    ).ravel()
     index = np.unique(np.concatenate([index, [signal.size - 1]]))
     return time_s[index], signal[index]

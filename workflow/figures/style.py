@@ -1,7 +1,7 @@
 """The house style: one colour per meaning, units on every axis, the same bytes every time.
 
-Colours are from the Okabe-Ito palette (told apart with every common colour-vision deficiency) and every meaning has a
-line style of its own as well, so a grey print still reads.
+Colours are from the Okabe-Ito palette (told apart with every common colour-vision deficiency) and every
+meaning has a line style of its own as well, so a grey print still reads.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -41,7 +42,7 @@ WIDTH_IN = 10.0  # 100 px per inch at the width of the page
 SVG_LIMIT_BYTES = 400_000
 _PNG_DPI = 160
 
-_RC: dict[str, Any] = {
+_RC: Any = {
     "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same picture on every machine
     "font.size": 9.5,
     "axes.titlesize": 10.5,
@@ -118,8 +119,8 @@ def _drawable() -> frozenset[int]:
 def plain(text: object, longest: int = 60) -> str:
     """Somebody else's text as matplotlib may safely draw it.
 
-    No formula starts at a dollar sign, line breaks become blanks, characters the font lacks become a box, and a text
-    longer than `longest` is cut with an ellipsis.
+    No formula starts at a dollar sign, line breaks become blanks, characters the font lacks become a box, and
+    a text longer than `longest` is cut with an ellipsis.
     """
     one_line = " ".join(str(text).split())
     if len(one_line) > longest:
@@ -147,7 +148,10 @@ def legend_below(figure: Figure, axes: Axes | Iterable[Axes], columns: int = 4) 
             handles.setdefault(label, handle)
     if handles:
         figure.legend(
-            list(handles.values()), list(handles), loc="outside lower center", ncols=min(columns, len(handles))
+            list(handles.values()),
+            list(handles),
+            loc="outside lower center",
+            ncols=min(columns, len(handles)),
         )
 
 
@@ -167,10 +171,30 @@ def tag(axes: Axes, x: float, text: str) -> None:
     )
 
 
+def tag_below(axes: Axes, x: float, text: str) -> None:
+    """A small word at the bottom of a vertical line at data position x, inside the axes."""
+    axes.annotate(
+        plain(text, 20),
+        (x, 0.02),
+        xycoords=("data", "axes fraction"),
+        xytext=(2, 1),
+        textcoords="offset points",
+        fontsize=8,
+        color="#666666",
+    )
+
+
+def _to_hertz(omega: Any) -> Any:
+    return omega / (2 * np.pi)
+
+
+def _to_rad_s(frequency: Any) -> Any:
+    return frequency * (2 * np.pi)
+
+
 def hertz_axis(axes: Axes, label: bool = True) -> None:
     """A second frequency axis on top, in Hz, for axes whose x is in rad/s."""
-    turn = 6.283185307179586
-    top = axes.secondary_xaxis("top", functions=(lambda w: w / turn, lambda f: f * turn))
+    top = axes.secondary_xaxis("top", functions=(_to_hertz, _to_rad_s))
     top.tick_params(labelsize=8.5, colors="#666666")
     if label:
         top.set_xlabel("frequency [Hz]", fontsize=8.5, color="#666666")
@@ -179,9 +203,11 @@ def hertz_axis(axes: Axes, label: bool = True) -> None:
 
 
 def inline_svg(svg: bytes, prefix: str, label: str) -> str:
-    """The <svg> element alone, ids made unique by `prefix`, `label` (already HTML-escaped) as its accessible name.
+    """The <svg> element alone, ids made unique by `prefix`, `label` (already HTML-escaped) as its accessible
+    name.
 
-    Comments go (they carry the drawn texts a second time), so do the XML prologue, the metadata and the fixed size.
+    Comments go (they carry the drawn texts a second time), so do the XML prologue, the metadata and the fixed
+    size.
     """
     text = svg.decode("utf-8")
     text = text[text.index("<svg") :]
@@ -190,7 +216,8 @@ def inline_svg(svg: bytes, prefix: str, label: str) -> str:
     text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}\1"', text)
     text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}\1"', text)
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}\1)", text)
-    # The common style rule of matplotlib would reach every other figure of the page: give it to this one's group.
+    # The common style rule of matplotlib would reach every other figure of the page: give it to this one's
+    # group.
     text = re.sub(r"<defs>\s*<style[^>]*>.*?</style>\s*</defs>\s*", "", text, count=1, flags=re.DOTALL)
     head, body = text.split(">", 1)
     box = re.search(r'viewBox="([^"]+)"', head)

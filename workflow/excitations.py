@@ -1,0 +1,86 @@
+"""Excitation signals as configuration tables; the signals themselves are `plant.excitation`'s."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from plant import excitation
+
+Real = npt.NDArray[np.float64]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @abstractmethod
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        """Voltage (T,). Raises ValueError where the numbers do not fit together."""
+
+
+class Prbs(_Table):
+    kind: Literal["prbs"]
+    amplitude_V: float = Field(gt=0)
+    samples: int = Field(ge=2, le=1_000_000)
+    register_length: int = Field(11, ge=2, le=20)
+    hold_samples: int = Field(1, ge=1, description="samples between possible changes of sign")
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.prbs(self.register_length, self.hold_samples, self.amplitude_V, self.samples, rng)
+
+
+class Multisine(_Table):
+    kind: Literal["multisine"]
+    rms_V: float = Field(gt=0)
+    period_samples: int = Field(ge=2, le=1_000_000)
+    periods: int = Field(1, ge=1, le=1000)
+    from_Hz: float = Field(gt=0)
+    to_Hz: float = Field(gt=0)
+    grid: Literal["full", "odd", "odd_random"] = "full"
+    phase_draws: int = Field(1, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        lines = excitation.multisine_lines(self.period_samples, dt_s, (self.from_Hz, self.to_Hz), self.grid, rng)
+        return excitation.multisine(
+            lines, self.period_samples, self.rms_V, rng, periods=self.periods, draws=self.phase_draws
+        )
+
+
+class LogChirp(_Table):
+    kind: Literal["log_chirp"]
+    amplitude_V: float = Field(gt=0)
+    samples: int = Field(ge=2, le=1_000_000)
+    from_Hz: float = Field(gt=0)
+    to_Hz: float = Field(gt=0)
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.log_chirp(self.from_Hz, self.to_Hz, self.amplitude_V, self.samples, dt_s)
+
+
+class Doublet(_Table):
+    kind: Literal["doublet"]
+    amplitude_V: float = Field(gt=0)
+    samples: int = Field(ge=2, le=1_000_000)
+    start_s: float = Field(0.0, ge=0)
+    pulse_s: float = Field(gt=0)
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.doublet(self.amplitude_V, self.start_s, self.pulse_s, self.samples, dt_s)
+
+
+class BangBang(_Table):
+    kind: Literal["bang_bang"]
+    amplitude_V: float = Field(gt=0)
+    samples: int = Field(ge=2, le=1_000_000)
+    start_s: float = Field(0.0, ge=0)
+    slew_s: float = Field(gt=0)
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.bang_bang(self.amplitude_V, self.start_s, self.slew_s, self.samples, dt_s)
+
+
+Excitation = Annotated[Prbs | Multisine | LogChirp | Doublet | BangBang, Field(discriminator="kind")]

@@ -1,0 +1,192 @@
+"""The loop over time: as computed from the identified model against as run on the machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from workflow.figures import style
+from workflow.figures.bands import Real
+
+
+@dataclass(frozen=True, eq=False)
+class LoopTraces:
+    """Closed-loop runs: time_s and reference (T,); output, command and performance (R, T) of R runs, or None.
+
+    The first run is drawn as a line, all of them as the band between their extremes.
+    """
+
+    output: Real
+    command: Real
+    performance: Real | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("output", "command", "performance"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, np.atleast_2d(np.asarray(value, dtype=np.float64)))
+
+
+@dataclass(frozen=True, eq=False)
+class LoopScene:
+    """What was asked of the loop, and the axes' words: (name, unit) per signal."""
+
+    time_s: Real
+    reference: Real
+    disturbance: Real | None
+    output: tuple[str, str]
+    command: tuple[str, str]
+    performance: tuple[str, str] | None = None
+    command_limit: float | None = None
+
+
+def draw_closed_loop(
+    scene: LoopScene,
+    predicted: LoopTraces,
+    achieved: LoopTraces,
+    *,
+    machine: str,
+    spread: LoopTraces | None = None,
+) -> Figure:
+    """Rows: fed-back output, performance output (if any), command. Left: the reference step. Right: the
+    disturbance.
+
+    `machine` says in words what 'achieved' ran on; `spread` are predictions for plants drawn from the
+    uncertainty.
+    """
+    rows: list[tuple[str, tuple[str, str]]] = [("output", scene.output)]
+    if scene.performance is not None and predicted.performance is not None:
+        rows.append(("performance", scene.performance))
+    rows.append(("command", scene.command))
+    onset = _onset(scene)
+    windows = _windows(scene, onset)
+    with style.house_style():
+        figure = style.new_figure(2.1 * len(rows) + 0.9)
+        grid = figure.subplots(len(rows), len(windows), squeeze=False, sharex="col", sharey="row")
+        for (kind, label), axes_row in zip(rows, grid, strict=True):
+            for axes, (start, stop, _) in zip(axes_row, windows, strict=True):
+                part = slice(
+                    int(np.searchsorted(scene.time_s, start)), int(np.searchsorted(scene.time_s, stop)) + 1
+                )
+                _draw_row(axes, scene, kind, predicted, achieved, spread, machine, part)
+                axes.set_xlim(start, stop)
+                if onset is not None and start <= onset <= stop:
+                    axes.axvline(onset, color="#888888", lw=0.8, ls=":")
+                    if kind == "output":
+                        style.tag(
+                            axes,
+                            onset,
+                            f"disturbance {_disturbance_size(scene):.3g} {scene.command[1]}".rstrip(),
+                        )
+            axes_row[0].set_ylabel(style.axis_label(*label))
+            _room_for_limit(axes_row[0], scene, kind, predicted, achieved)
+        for axes, (_, _, title) in zip(grid[0], windows, strict=True):
+            axes.set_title(title)
+        for axes in grid[-1]:
+            axes.set_xlabel("time [s]")
+        figure.align_ylabels()
+        style.legend_below(figure, grid.ravel(), columns=4)
+    return figure
+
+
+def _onset(scene: LoopScene) -> float | None:
+    if scene.disturbance is None:
+        return None
+    moving = np.flatnonzero(scene.disturbance != scene.disturbance[0])
+    if moving.size:
+        return float(scene.time_s[moving[0]])
+    return float(scene.time_s[0]) if scene.disturbance[0] != 0 else None
+
+
+def _disturbance_size(scene: LoopScene) -> float:
+    values = scene.disturbance if scene.disturbance is not None else np.zeros(1)
+    return float(values[np.argmax(np.abs(values))])
+
+
+def _windows(scene: LoopScene, onset: float | None) -> list[tuple[float, float, str]]:
+    start, stop = float(scene.time_s[0]), float(scene.time_s[-1])
+    margin = 0.03 * (stop - start)
+    if onset is None or not start + 4 * margin < onset < stop - 4 * margin:
+        return [(start, stop, "Reference step" if onset is None else "Reference step and disturbance")]
+    return [
+        (start, onset - 1e-9, "Reference step"),
+        (onset - margin, stop, "Disturbance at the plant's input"),
+    ]
+
+
+def _draw_row(
+    axes: Axes,
+    scene: LoopScene,
+    kind: str,
+    predicted: LoopTraces,
+    achieved: LoopTraces,
+    spread: LoopTraces | None,
+    machine: str,
+    part: slice,
+) -> None:
+    time = scene.time_s[part]
+    hold: dict[str, Any] = {"drawstyle": "steps-post"} if kind == "command" else {}
+    if spread is not None and getattr(spread, kind) is not None:
+        many = getattr(spread, kind)[:, part]
+        axes.fill_between(
+            time,
+            many.min(axis=0),
+            many.max(axis=0),
+            **style.BAND,
+            label=f"{many.shape[0]} plants from the uncertainty",
+        )
+    done = getattr(achieved, kind)
+    if done is not None:
+        if done.shape[0] > 1:
+            axes.fill_between(
+                time,
+                done[:, part].min(axis=0),
+                done[:, part].max(axis=0),
+                color=style.ACHIEVED,
+                alpha=0.22,
+                lw=0,
+                label=f"{machine}: all {done.shape[0]} runs",
+            )
+        first = f"{machine}: first run" if done.shape[0] > 1 else machine
+        axes.plot(time, done[0, part], **style.ACHIEVED_LINE, **hold, label=first)
+    axes.plot(
+        time,
+        getattr(predicted, kind)[0, part],
+        **style.PREDICTED_LINE,
+        **hold,
+        label="predicted, nominal model",
+    )
+    if kind == "output":
+        axes.plot(
+            time, scene.reference[part], **style.REFERENCE_LINE, drawstyle="steps-post", label="reference"
+        )
+
+
+def _room_for_limit(
+    axes: Axes, scene: LoopScene, kind: str, predicted: LoopTraces, achieved: LoopTraces
+) -> None:
+    """The command's limits, where they are near enough to matter to the picture; else they are said in
+    words."""
+    if kind != "command" or scene.command_limit is None:
+        return
+    largest = max(float(np.abs(predicted.command).max()), float(np.abs(achieved.command).max()))
+    if scene.command_limit <= 4 * largest:
+        for sign in (-1, 1):
+            for sibling in [axes, *axes.get_shared_y_axes().get_siblings(axes)]:
+                if sign * scene.command_limit > 0 or float(np.min(achieved.command)) < -0.15 * largest:
+                    sibling.axhline(sign * scene.command_limit, **style.LIMIT_LINE, label="saturation")
+    else:
+        axes.text(
+            0.985,
+            0.95,
+            f"saturation at ±{scene.command_limit:.4g} {scene.command[1]}, far away",
+            transform=axes.transAxes,
+            ha="right",
+            va="top",
+            fontsize=8.5,
+            color=style.LIMIT,
+        )

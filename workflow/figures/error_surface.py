@@ -1,0 +1,93 @@
+"""The error surface of the pole search over frequency and damping of one pole pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from workflow.figures import style
+from workflow.figures.bands import Real
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSurface:
+    """Error over (omega, zeta) of one pair, everything else held at the optimum.
+
+    omega_rad_s (W,), zeta (Z,) ascending; cost (Z, W): root mean square of the residual over that at the
+    optimum. searched (E, 2): frequency and damping the search asked for, in its order; best: those of the
+    result. frozen: what was held, in words.
+    """
+
+    omega_rad_s: Real
+    zeta: Real
+    cost: Real
+    searched: Real
+    best: tuple[float, float]
+    frozen: str = "the other poles held at the optimum"
+
+
+def draw_error_surface(surface: ErrorSurface, *, name: str, evaluations: int | None = None) -> Figure:
+    """Filled contours of the residual's root mean square relative to the optimum, on log axes."""
+    with style.house_style():
+        figure = style.new_figure(4.9)
+        left, right = figure.subplots(1, 2, width_ratios=[1.75, 1.0])
+        cost = np.maximum(surface.cost, 1e-300)
+        top = float(np.nanpercentile(cost, 99))
+        levels = np.geomspace(min(float(np.nanmin(cost)), 1.0), max(top, 1.0 * (1 + 1e-6)), 22)
+        filled = left.contourf(
+            surface.omega_rad_s,
+            surface.zeta,
+            np.minimum(cost, levels[-1]),
+            levels=levels,
+            cmap="cividis_r",
+            norm="log",
+        )
+        left.set_xscale("log")
+        left.set_yscale("log")
+        if surface.searched.size:
+            left.plot(
+                surface.searched[:, 0],
+                surface.searched[:, 1],
+                ls="none",
+                marker=".",
+                ms=3,
+                color="white",
+                mec="black",
+                mew=0.3,
+                label=f"points the search tried ({surface.searched.shape[0]})",
+            )
+        left.plot(
+            [surface.best[0]],
+            [surface.best[1]],
+            marker="*",
+            ms=15,
+            mfc=style.HIGHLIGHT,
+            mec="black",
+            mew=0.8,
+            ls="none",
+            label=f"minimum: {surface.best[0]:.4g} rad/s, damping {surface.best[1]:.3g}",
+        )
+        left.set_xlim(surface.omega_rad_s[0], surface.omega_rad_s[-1])
+        left.set_ylim(surface.zeta[0], surface.zeta[-1])
+        left.set_xlabel("frequency of the pair [rad/s]")
+        left.set_ylabel("damping ratio of the pair [1]")
+        left.set_title(f"Error surface: {style.plain(name, 34)}")
+        bar = figure.colorbar(filled, ax=left, pad=0.01, aspect=30)
+        bar.set_label("residual RMS / its minimum [1]")
+        # log colour bars of contours carry minor ticks that overlap; a handful of round values is readable.
+        ticks = [t for t in (1, 1.02, 1.05, 1.1, 1.2, 1.5, 2, 3, 5, 10, 20, 50, 100, 1e3) if t <= levels[-1]]
+        bar.set_ticks(ticks[-9:], labels=[f"{t:g}" for t in ticks[-9:]])
+        bar.ax.minorticks_off()
+        lowest = np.nanmin(cost, axis=0)
+        right.plot(surface.omega_rad_s, lowest, **style.MODEL_LINE, label="best over damping")
+        right.axvline(surface.best[0], color=style.HIGHLIGHT, lw=1.4)
+        right.set_xscale("log")
+        right.set_yscale("log")
+        right.set_xlim(surface.omega_rad_s[0], surface.omega_rad_s[-1])
+        right.set_title("Along frequency")
+        right.set_xlabel("frequency of the pair [rad/s]")
+        right.set_ylabel("residual RMS / its minimum [1]")
+        style.legend_below(figure, (left, right), columns=4)
+    return figure

@@ -1,0 +1,171 @@
+"""Nyquist picture of the uncertain loop: ellipses of K G, the forbidden disc around -1, the nearest point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from control_design.ellipses import nearest_distance
+from ident.uncertainty import FrequencyUncertainty
+from workflow.figures import style
+from workflow.figures.bands import Complex, Real
+
+_MOST_ELLIPSES = 220
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainLoop:
+    """Loop gain over its ellipses: L = K G with G in {centre + ...}; all (F,).
+
+    outline (F, P): boundary points of each ellipse of L; distance (F,): exact distance of the filled ellipse
+    from -1.
+    """
+
+    omega_rad_s: Real
+    centre: Complex
+    outline: Complex
+    distance: Real
+
+    @property
+    def nearest(self) -> int:
+        """Index of the ellipse that comes nearest to -1."""
+        return int(np.argmin(self.distance))
+
+
+def uncertain_loop(plant: FrequencyUncertainty, controller: Complex) -> UncertainLoop:
+    """Ellipses of the plant multiplied by the controller's response (F,); frequency 0 is left out."""
+    keep = plant.omega_rad_s > 0
+    gain = np.asarray(controller, dtype=np.complex128)[keep]
+    ellipse = plant.ellipse()
+    centre = gain * plant.centre[keep]
+    offset = gain[:, None] * ellipse.boundary(40)[keep]
+    size = np.abs(gain)
+    axis = ellipse.direction[keep] * np.where(size > 0, gain / np.where(size > 0, size, 1.0), 1.0)
+    distance = nearest_distance(
+        (-1.0 - centre) * np.conj(axis), size * ellipse.semi_major[keep], size * ellipse.semi_minor[keep]
+    )
+    return UncertainLoop(plant.omega_rad_s[keep], centre, centre[:, None] + offset, distance)
+
+
+def draw_nyquist(
+    loop: UncertainLoop, *, level: float, modulus_margin: float | None = None, name: str = ""
+) -> Figure:
+    """Whole curve (as far as it fits) and the surroundings of -1. `modulus_margin` is the radius asked
+    for."""
+    with style.house_style():
+        figure = style.new_figure(5.5)
+        whole, near = figure.subplots(1, 2)
+        reach = float(np.clip(1.15 * np.abs(loop.centre).max(), 1.6, 6.0))
+        nearest = loop.nearest
+        closest = loop.distance[nearest]
+        side = float(np.clip(1.35 * max(closest, modulus_margin or 0.0, 0.35), 0.5, 1.3))
+        _draw_loop(whole, loop, (-reach, reach), (-reach, reach), level)
+        _draw_loop(near, loop, (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side), level)
+        for axes in (whole, near):
+            if modulus_margin is not None:
+                axes.add_patch(
+                    Circle(
+                        (-1, 0),
+                        modulus_margin,
+                        fill=False,
+                        **style.LIMIT_LINE,
+                        label="specification: keep out of here",
+                    )
+                )
+            axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
+        touch = _nearest_point(loop.outline[nearest])
+        label = f"nearest: {closest:.3f} at {loop.omega_rad_s[nearest]:.4g} rad/s"
+        near.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
+        near.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
+        whole.set_title(f"Loop K G{': ' + style.plain(name, 34) if name else ''}")
+        near.set_title("Around -1")
+        if np.abs(loop.centre).max() > reach:
+            slow = np.abs(loop.centre) > reach
+            whole.text(
+                0.02,
+                0.02,
+                f"beyond the frame below {loop.omega_rad_s[slow].max():.3g} rad/s"
+                if slow[0] and not slow[-1]
+                else "partly beyond the frame",
+                transform=whole.transAxes,
+                fontsize=8.5,
+                color="#555555",
+                bbox={"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1},
+            )
+        style.legend_below(figure, (near, whole), columns=5)
+    return figure
+
+
+def _draw_loop(
+    axes: Axes, loop: UncertainLoop, real: tuple[float, float], imag: tuple[float, float], level: float
+) -> None:
+    inside = (
+        (loop.outline.real.max(axis=1) > real[0])
+        & (loop.outline.real.min(axis=1) < real[1])
+        & (loop.outline.imag.max(axis=1) > imag[0])
+        & (loop.outline.imag.min(axis=1) < imag[1])
+    )
+    index = np.flatnonzero(inside)
+    if index.size > _MOST_ELLIPSES:
+        index = index[np.linspace(0, index.size - 1, _MOST_ELLIPSES).round().astype(int)]
+    index = np.union1d(index, [loop.nearest])
+    polygons = np.stack([loop.outline[index].real, loop.outline[index].imag], axis=-1)
+    dense = polygons.shape[0] * polygons.shape[1] > 6000
+    axes.add_collection(
+        PolyCollection(
+            list(polygons),
+            facecolors=style.UNCERTAIN,
+            edgecolors=style.MODEL,
+            linewidths=0.35,
+            alpha=0.32,
+            label=f"{100 * level:.4g} % ellipses",
+            rasterized=dense,
+        )
+    )
+    axes.plot(
+        loop.centre.real,
+        loop.centre.imag,
+        **style.PREDICTED_LINE,
+        label="loop at the centres, rising frequency",
+    )
+    _arrow(axes, loop.centre, real, imag)
+    axes.axhline(0, color="#999999", lw=0.7)
+    axes.axvline(0, color="#999999", lw=0.7)
+    axes.set_xlim(*real)
+    axes.set_ylim(*imag)
+    axes.set_aspect("equal")
+    axes.set_xlabel("real part of K G [1]")
+    axes.set_ylabel("imaginary part of K G [1]")
+
+
+def _arrow(axes: Axes, centre: Complex, real: tuple[float, float], imag: tuple[float, float]) -> None:
+    """Direction of rising frequency, half-way along the longest visible run."""
+    seen = (
+        (centre.real > real[0]) & (centre.real < real[1]) & (centre.imag > imag[0]) & (centre.imag < imag[1])
+    )
+    steps = np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0)
+    if not steps.sum() > 0:
+        return
+    k = int(np.searchsorted(np.cumsum(steps), 0.35 * steps.sum()))
+    k = min(k, centre.size - 2)
+    axes.annotate(
+        "",
+        xy=(centre[k + 1].real, centre[k + 1].imag),
+        xytext=(centre[k].real, centre[k].imag),
+        arrowprops={"arrowstyle": "-|>", "color": style.PREDICTED, "lw": 1.4, "mutation_scale": 14},
+    )
+
+
+def _nearest_point(boundary: Complex) -> complex:
+    """Point of a polygonal outline nearest to -1."""
+    a, b = boundary, np.roll(boundary, -1)
+    edge = b - a
+    length = np.abs(edge) ** 2
+    along = np.clip(((-1 - a) * np.conj(edge)).real / np.where(length > 0, length, 1.0), 0, 1)
+    points = a + along * edge
+    return complex(points[np.argmin(np.abs(points + 1))])
