@@ -117,43 +117,50 @@ def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray,
 
 def regressor(poles: Poles, u: RealArray) -> RealArray:
     """Basis functions driven by u from rest: Phi (T, B) with Phi[k, i] = [L_i(q) u](k); Phi[0] = 0."""
-    u = np.ascontiguousarray(u, dtype=np.float64)
-    if u.ndim != 1:
-        raise ValueError(f"u must be (T,); got shape {u.shape}")
-    rows = np.empty((poles.order, u.size))
-    run_cascade(block_parameters(poles), poles.real.size, u.copy(), rows)
+    signal = np.array(u, dtype=np.float64)
+    if signal.ndim != 1:
+        raise ValueError(f"u must be (T,); got shape {signal.shape}")
+    rows = np.empty((poles.order, signal.size))
+    run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
     return rows.T
+
+
+def all_pass_signal(poles: Poles, u: RealArray) -> RealArray:
+    """u (T,) sent through the all-pass of the poles, from rest, (T,)."""
+    signal = np.array(u, dtype=np.float64)
+    rows = np.empty((poles.order, signal.size))
+    run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
+    return signal
 
 
 def free_response(poles: Poles, n_samples: int) -> RealArray:
     """Free responses of the cascade (T, B): column i is the basis impulse response h_i(k + 1), k = 0..T-1.
 
-    They span every output the poles can give without input, so they are the nuisance columns of an unknown initial
-    state.
+    They span every output the poles can give without input, so they are the nuisance columns of an unknown
+    initial state.
     """
     rows = np.empty((poles.order, n_samples))
-    run_cascade_free(block_parameters(poles), poles.real.size, rows)
+    run_cascade_free(block_parameters(poles), poles.real.size, rows, 0, n_samples)
     return rows.T
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any) -> None:
-    """Drive the cascade with w (T,) from rest; rows (B, T) receives the states, w is overwritten by the all-pass output.
+@numba.njit(cache=True)
+def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
+    """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass output.
 
-    One block after the other over the whole signal: the recursions of a block are short chains the processor overlaps,
-    and every row is written once, contiguously.
+    One block after the other over the whole signal: the recursion of a block is a short chain that the
+    processor overlaps, and every row is written once, contiguously.
     """
-    n_samples = w.size
-    row = 0
+    signal = w[lo:hi]
     for i in range(blocks.shape[0]):
+        out1 = rows[row, lo:hi]
         if i < n_real:
             a, b = blocks[i, 0], blocks[i, 1]
             x = 0.0
-            out = rows[row]
-            for k in range(n_samples):
-                v = w[k]
-                out[k] = x
-                w[k] = b * x - a * v
+            for k in range(signal.size):
+                v = signal[k]
+                out1[k] = x
+                signal[k] = b * x - a * v
                 x = a * x + b * v
             row += 1
         else:
@@ -162,42 +169,43 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any) -> None:
             c1, c2 = -beta * sg, sb * sg
             x1 = 0.0
             x2 = 0.0
-            out1, out2 = rows[row], rows[row + 1]
-            for k in range(n_samples):
-                v = w[k]
+            out2 = rows[row + 1, lo:hi]
+            for k in range(signal.size):
+                v = signal[k]
                 out1[k] = x1
                 out2[k] = x2
-                w[k] = c1 * x1 + c2 * x2 + gamma * v
+                signal[k] = c1 * x1 + c2 * x2 + gamma * v
                 x1_next = gb * x1 - gs * x2 + sg * v
                 x2 = sb * x1 + beta * x2
                 x1 = x1_next
             row += 2
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def run_cascade_free(blocks: Any, n_real: int, rows: Any) -> None:
-    """Write the free responses A^k B of the whole cascade into rows (B, T): the states after a unit impulse at k = -1.
+@numba.njit(cache=True)
+def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
+    """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k = -1.
 
-    States below 1e-30 are set to zero, which is far below rounding and keeps denormal numbers (slow) away.
+    Once a block and its input have died out (1e-30, looked at every 32 samples) the rest is set to zero: far
+    below rounding, it saves time and keeps denormal numbers (slow) away.
     """
-    n_samples = rows.shape[1]
-    # All-pass response to the impulse: its value at k = -1 (the direct terms) and the signal from k = 0 on.
+    # The all-pass response to the impulse: its value at k = -1 (the direct terms), the signal w from k = 0 on.
     impulse = 1.0
-    w = np.zeros(n_samples)
-    row = 0
+    w = np.zeros(length)
+    alive = 0  # w is zero from here on
     for i in range(blocks.shape[0]):
+        out1 = rows[row]
+        stop = 0
         if i < n_real:
             a, b = blocks[i, 0], blocks[i, 1]
             x = b * impulse
             impulse = -a * impulse
-            out = rows[row]
-            for k in range(n_samples):
-                v = w[k]
-                out[k] = x
-                w[k] = b * x - a * v
-                x = a * x + b * v
-                if abs(x) < 1e-30:
-                    x = 0.0
+            while stop < length and (stop < alive or abs(x) > 1e-30):
+                start, stop = stop, min(stop + 32, length)
+                for k in range(start, stop):
+                    v = w[k]
+                    out1[k] = x
+                    w[k] = b * x - a * v
+                    x = a * x + b * v
             row += 1
         else:
             gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
@@ -206,16 +214,18 @@ def run_cascade_free(blocks: Any, n_real: int, rows: Any) -> None:
             x1 = sg * impulse
             x2 = 0.0
             impulse = gamma * impulse
-            out1, out2 = rows[row], rows[row + 1]
-            for k in range(n_samples):
-                v = w[k]
-                out1[k] = x1
-                out2[k] = x2
-                w[k] = c1 * x1 + c2 * x2 + gamma * v
-                x1_next = gb * x1 - gs * x2 + sg * v
-                x2 = sb * x1 + beta * x2
-                x1 = x1_next
-                if abs(x1) + abs(x2) < 1e-30:
-                    x1 = 0.0
-                    x2 = 0.0
+            out2 = rows[row + 1]
+            while stop < length and (stop < alive or abs(x1) + abs(x2) > 1e-30):
+                start, stop = stop, min(stop + 32, length)
+                for k in range(start, stop):
+                    v = w[k]
+                    out1[k] = x1
+                    out2[k] = x2
+                    w[k] = c1 * x1 + c2 * x2 + gamma * v
+                    x1_next = gb * x1 - gs * x2 + sg * v
+                    x2 = sb * x1 + beta * x2
+                    x1 = x1_next
+            out2[stop:length] = 0.0
             row += 2
+        out1[stop:length] = 0.0
+        alive = max(alive, stop)

@@ -1,0 +1,63 @@
+"""DIRECT over the unit cube: NLopt's variants and scipy's, recorded point by point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ident.arrays import RealArray
+from ident.options import Algorithm
+
+
+def minimise(
+    cost: Callable[[RealArray], float], dimension: int, algorithm: Algorithm, evaluations: int
+) -> tuple[RealArray, RealArray]:
+    """Points (E, D) of the unit cube that DIRECT looked at, in order, and their costs (E,)."""
+    points: list[RealArray] = []
+    costs: list[float] = []
+
+    def recorded(x: Any, *_: Any) -> float:
+        point = np.array(x, dtype=np.float64)
+        value = cost(point)
+        points.append(point)
+        costs.append(value)
+        return value
+
+    if algorithm.startswith("SCIPY"):
+        from scipy.optimize import direct
+
+        direct(
+            recorded,
+            [(0.0, 1.0)] * dimension,
+            maxfun=evaluations,
+            maxiter=evaluations,
+            vol_tol=0.0,
+            len_tol=0.0,
+            locally_biased=algorithm.endswith("_L"),
+        )
+    else:
+        import nlopt
+
+        if "RAND" in algorithm:
+            # These variants draw from NLopt's own generator; a fixed seed keeps the search reproducible.
+            nlopt.srand(1)
+        problem = nlopt.opt(getattr(nlopt, algorithm), dimension)
+        problem.set_lower_bounds(np.zeros(dimension))
+        problem.set_upper_bounds(np.ones(dimension))
+        problem.set_min_objective(recorded)
+        problem.set_maxeval(evaluations)
+        problem.optimize(np.full(dimension, 0.5))
+    return np.array(points), np.array(costs)
+
+
+def best_apart(points: RealArray, costs: RealArray, count: int, apart: float = 0.15) -> RealArray:
+    """Up to `count` of the best points (C, D), each at least `apart` from the better ones chosen before it."""
+    chosen: list[RealArray] = []
+    for i in np.argsort(costs, kind="stable"):
+        if all(np.linalg.norm(points[i] - other) >= apart for other in chosen):
+            chosen.append(points[i])
+            if len(chosen) == count:
+                break
+    return np.array(chosen)

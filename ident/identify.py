@@ -1,0 +1,351 @@
+"""Records and settings in, a GOBF model with everything needed to judge it out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from ident.arrays import RealArray, readonly_real
+from ident.coordinates import ZETA_LIMIT
+from ident.input_checks import advice, refuse_unusable
+from ident.least_squares import fit, linearisation
+from ident.model import GobfModel
+from ident.options import IdentOptions
+from ident.order_selection import OrderSelection, OrderStep, Progress
+from ident.pole_search import PoleSearch
+from ident.polish import Bounds, Polished, free_optimality
+from ident.poles import Poles
+from ident.record import Record
+from ident.regression import Regression, prepare
+from ident.search_trace import SearchTrace
+from ident.structure import Structure
+
+# A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
+_NUISANCE_LEVEL = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """A fitted model and how well it fits.
+
+    Attributes
+    ----------
+    model : GobfModel
+    structure : Structure
+        What the fit assumed around the basis, after the data decided what was left to them.
+    record_names : tuple of str
+    residuals : tuple of (T - delay,) arrays
+        Output minus fitted output (nuisances included) of each record, from sample `input_delay_samples` on.
+    fit_percent : (K,) array
+        100 (1 - |residual| / |y - mean y|) of each record.
+    rss : float
+        Residual sum of squares over all records.
+    noise_std : float
+        sqrt(rss / (N - number of unknowns)), in units of the output.
+    tangent_optimality : float
+        Share of the residual (0..1) in the tangent space of the poles that are free to move: 0 at an optimum.
+    order_table : tuple of OrderStep
+        Every structure that was tried, by order.
+    verdicts : tuple of str
+        One sentence for each question that was left to the data.
+    search : SearchTrace
+    """
+
+    model: GobfModel
+    structure: Structure
+    record_names: tuple[str, ...]
+    residuals: tuple[RealArray, ...]
+    fit_percent: RealArray
+    rss: float
+    noise_std: float
+    tangent_optimality: float
+    order_table: tuple[OrderStep, ...]
+    verdicts: tuple[str, ...]
+    search: SearchTrace
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
+        object.__setattr__(self, "fit_percent", readonly_real(self.fit_percent))
+        if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
+            raise ValueError("residuals, record_names and fit_percent must have one entry per record")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to look at before trusting the model, one sentence each."""
+        return self.search.warnings
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        structure = self.structure
+        arrays: dict[str, np.ndarray[Any, Any]] = {
+            "structure": np.array(
+                [
+                    structure.integrators,
+                    structure.input_delay_samples,
+                    structure.feedthrough,
+                    structure.estimate_offset,
+                    structure.estimate_initial_state,
+                ],
+                dtype=np.int64,
+            ),
+            "record_names": np.array(self.record_names, dtype=np.str_),
+            "fit_percent": self.fit_percent,
+            "rss": np.array(self.rss),
+            "noise_std": np.array(self.noise_std),
+            "tangent_optimality": np.array(self.tangent_optimality),
+            "order_counts": np.array(
+                [(s.n_real, s.n_pairs) for s in self.order_table], dtype=np.int64
+            ).reshape(-1, 2),
+            "order_values": np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2),
+            "verdicts": np.array(self.verdicts, dtype=np.str_),
+        }
+        arrays |= {f"residual{i}": residual for i, residual in enumerate(self.residuals)}
+        arrays |= {f"model_{key}": value for key, value in self.model.to_arrays().items()}
+        arrays |= {f"search_{key}": value for key, value in self.search.to_arrays().items()}
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Identification:
+        integrators, delay, feedthrough, offset, initial_state = (int(item) for item in arrays["structure"])
+        names = tuple(str(item) for item in arrays["record_names"])
+        return cls(
+            model=GobfModel.from_arrays(_under("model_", arrays)),
+            structure=Structure(integrators, delay, bool(feedthrough), bool(offset), bool(initial_state)),
+            record_names=names,
+            residuals=tuple(arrays[f"residual{i}"] for i in range(len(names))),
+            fit_percent=arrays["fit_percent"],
+            rss=float(arrays["rss"]),
+            noise_std=float(arrays["noise_std"]),
+            tangent_optimality=float(arrays["tangent_optimality"]),
+            order_table=tuple(
+                OrderStep(int(n_real), int(n_pairs), float(rss), float(criterion))
+                for (n_real, n_pairs), (rss, criterion) in zip(
+                    arrays["order_counts"], arrays["order_values"], strict=True
+                )
+            ),
+            verdicts=tuple(str(item) for item in arrays["verdicts"]),
+            search=SearchTrace.from_arrays(_under("search_", arrays)),
+        )
+
+
+def identify(
+    records: Sequence[Record], options: IdentOptions | None = None, *, progress: Progress | None = None
+) -> Identification:
+    """Fit one GOBF model to all records together.
+
+    Parameters
+    ----------
+    records : sequence of single-input single-output records of equal sampling time
+        Each has its own nuisance columns (offset, initial state).
+    options : IdentOptions
+    progress : callable, optional
+        Called with a fraction 0..1 and a short message.
+
+    Raises
+    ------
+    ValueError
+        If a record cannot be used (constant signal, several columns, other sampling time) or all of them are too
+        short for the order asked for.
+
+    Notes
+    -----
+    The result is deterministic: the same records and options give the same numbers.
+    """
+    options = options or IdentOptions()
+    report = progress or _silent
+    data = prepare(records, options.structure())
+    fixed = options.fixed()
+    wanted = fixed.order + (options.n_real or 0) + 2 * (options.n_pairs or 0)
+    refuse_unusable(
+        records, data, wanted if wanted else min(2, options.max_real) + 2 * min(1, options.max_pairs)
+    )
+    outcome = _searched(data, options, lambda fraction, message: report(0.45 * fraction, message))
+    outcome = _with_initial_state_if_asked_for(records, outcome, report)
+    report(0.95, "test of the offset")
+    outcome = _without_offset_if_needless(records, outcome)
+    report(0.98, "final fit")
+    result = _result(records, outcome)
+    report(1.0, "identified")
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """A search that has come to an end on one structure."""
+
+    data: Regression
+    search: PoleSearch
+    selection: OrderSelection
+    best: Polished
+    verdicts: tuple[str, ...] = ()
+
+
+def _searched(data: Regression, options: IdentOptions, report: Progress) -> _Outcome:
+    search = PoleSearch(data, options)
+    selection = OrderSelection(search, report)
+    return _Outcome(data, search, selection, selection.run())
+
+
+def _silent(fraction: float, message: str) -> None:
+    """Default progress: nobody listens."""
+
+
+def _under(prefix: str, arrays: Mapping[str, np.ndarray[Any, Any]]) -> dict[str, np.ndarray[Any, Any]]:
+    return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+
+
+def _statistic(n_samples: int, without: Polished, with_it: Polished) -> float:
+    """Likelihood ratio N ln(J without / J with) of a nuisance."""
+    return float(n_samples * np.log(max(without.rss, 1e-300) / max(with_it.rss, 1e-300)))
+
+
+def _with_initial_state_if_asked_for(
+    records: Sequence[Record], outcome: _Outcome, report: Progress
+) -> _Outcome:
+    """Search again with unknown initial states if the fit from rest is improbably worse than one with them.
+
+    Compared with the chi-square quantile, one degree of freedom per column. Coloured residuals make the statistic
+    larger, so the test errs on the side of estimating the initial state, which costs only variance.
+    """
+    options, data = outcome.search.options, outcome.data
+    if options.estimate_initial_state != "auto":
+        return outcome
+    report(0.46, "test of the initial state")
+    free = prepare(records, replace(data.structure, estimate_initial_state=True))
+    order = outcome.best.poles.order
+    columns = free.n_parameters(order) - data.n_parameters(order)
+    if columns == 0 or not free.n_samples > free.n_parameters(order):
+        return outcome
+    trial = PoleSearch(free, options)
+    end = trial.descend(outcome.best.poles, "with initial state")
+    statistic, limit = (
+        _statistic(data.n_samples, outcome.best, end),
+        float(chi2.ppf(_NUISANCE_LEVEL, columns)),
+    )
+    needed = statistic > limit
+    verdict = (
+        f"initial state {'estimated' if needed else 'left out (records start from rest)'}: its {columns} columns "
+        f"lower the test statistic by {statistic:.1f} (limit {limit:.1f} at {_NUISANCE_LEVEL:.0%})"
+    )
+    if needed:
+        outcome = _searched(free, options, lambda fraction, message: report(0.5 + 0.45 * fraction, message))
+    return replace(outcome, verdicts=(*outcome.verdicts, verdict))
+
+
+def _without_offset_if_needless(records: Sequence[Record], outcome: _Outcome) -> _Outcome:
+    """Re-polish without the offsets if the fit with them is not improbably better."""
+    search, data = outcome.search, outcome.data
+    if search.options.estimate_offset != "auto":
+        return outcome
+    reduced = prepare(records, replace(data.structure, estimate_offset=False))
+    order = outcome.best.poles.order
+    columns = data.n_parameters(order) - reduced.n_parameters(order)
+    if columns == 0:  # the polynomial that integrators leave free contains the constant
+        return outcome
+    trial = PoleSearch(reduced, search.options)
+    end = trial.rescan(trial.descend(outcome.best.poles, "without offset"))
+    statistic, limit = (
+        _statistic(data.n_samples, end, outcome.best),
+        float(chi2.ppf(_NUISANCE_LEVEL, columns)),
+    )
+    needed = statistic > limit
+    verdict = (
+        f"offset {'estimated' if needed else 'left out'}: its {columns} columns lower the test statistic by "
+        f"{statistic:.1f} (limit {limit:.1f} at {_NUISANCE_LEVEL:.0%})"
+    )
+    verdicts = (*outcome.verdicts, verdict)
+    if needed:
+        return replace(outcome, verdicts=verdicts)
+    search.minima += trial.minima
+    search.evaluations += trial.evaluations
+    return replace(outcome, data=reduced, best=end, verdicts=verdicts)
+
+
+def _result(records: Sequence[Record], outcome: _Outcome) -> Identification:
+    data, best, search = outcome.data, outcome.best, outcome.search
+    options = search.options
+    linear = fit(data, best.poles)
+    model = GobfModel(
+        poles=best.poles,
+        coefficients=linear.coefficients,
+        dt_s=data.dt_s,
+        feedthrough=linear.feedthrough,
+        integrators=options.integrators,
+        input_delay_samples=options.input_delay_samples,
+        input_name=records[0].input_names[0],
+        output_name=records[0].output_names[0],
+    )
+    residuals = tuple(linear.residual[data.segment(i)] for i in range(data.n_records))
+    spread = [
+        np.linalg.norm(data.y[here] - data.y[here].mean())
+        for here in map(data.segment, range(data.n_records))
+    ]
+    fixed = search.fixed
+    bounds = Bounds.from_options(options, data.longest, data.dt_s)
+    warnings = [
+        *advice(records, data, best.poles.order),
+        *pole_warnings(best.poles, fixed, bounds, data.dt_s),
+    ]
+    return Identification(
+        model=model,
+        structure=data.structure,
+        record_names=tuple(record.name for record in records),
+        residuals=residuals,
+        fit_percent=np.array(
+            [100 * (1 - np.linalg.norm(r) / size) for r, size in zip(residuals, spread, strict=True)]
+        ),
+        rss=linear.rss,
+        noise_std=float(np.sqrt(linear.rss / (data.n_samples - data.n_parameters(best.poles.order)))),
+        tangent_optimality=free_optimality(
+            linearisation(data, best.poles), best.poles, bounds, fixed.real.size, fixed.pairs.size
+        ),
+        order_table=tuple(
+            sorted(outcome.selection.steps.values(), key=lambda step: (step.order, step.n_real))
+        ),
+        verdicts=outcome.verdicts,
+        search=SearchTrace(
+            tuple(search.stages), tuple(search.minima), tuple(dict.fromkeys(warnings)), search.evaluations
+        ),
+    )
+
+
+def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> list[str]:
+    """One sentence of advice for each searched pole that ended at a bound."""
+    sentences = []
+    close = 1 + 1e-6
+    for a in poles.real[fixed.real.size :]:
+        if 1 - a <= bounds.distance_min * close:
+            sentences.append(
+                f"a real pole went to the slow bound (a = {a:.9g}): it is an integrator as far as the record can "
+                "tell; try integrators = 1 more and compare"
+            )
+        elif 1 - a >= bounds.distance_max / close:
+            sentences.append(
+                f"a real pole went to the fast bound (a = {a:.3g}): it stands for a direct term or a delay; try "
+                "feedthrough = true, another input_delay_samples, or one real pole less"
+            )
+    omegas, zetas = poles.omega_rad_s(dt_s), poles.zeta()
+    for pole, omega, zeta in list(zip(poles.pairs, omegas, zetas, strict=True))[fixed.pairs.size :]:
+        if zeta >= ZETA_LIMIT - 1e-6:
+            sentences.append(
+                f"a pole pair at {omega:.4g} rad/s is overdamped (zeta = {zeta:.2f}): replace the pair by two real poles"
+            )
+        elif zeta >= bounds.zeta_max / close or zeta <= bounds.zeta_min * close:
+            sentences.append(
+                f"the pole pair at {omega:.4g} rad/s sits on your bound of zeta ({zeta:.4g}): widen it"
+            )
+        elif -np.log(abs(pole)) <= bounds.s_min * close:
+            sentences.append(
+                f"the pole pair at {omega:.4g} rad/s does not decay within the record: its damping cannot be told; "
+                "record longer"
+            )
+        if not bounds.omega_min * close < omega * dt_s < bounds.omega_max / close:
+            sentences.append(
+                f"a pole pair went to the bound of its frequency ({omega:.4g} rad/s): widen the bound, or fit one "
+                "pair less"
+            )
+    return sentences

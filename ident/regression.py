@@ -1,0 +1,105 @@
+"""Records made ready for a fit: filtered inputs and outputs of all records, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ident.arrays import RealArray
+from ident.record import Record
+from ident.structure import Structure, filter_input
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Everything a fit needs but the poles.
+
+    Attributes
+    ----------
+    u : (N,) array
+        Inputs after delay and integrators. The first `input_delay_samples` rows of a record are left out: the
+        input they answer to was not recorded.
+    y : (N,) array
+        Outputs of the same rows.
+    starts : (K + 1,) int array
+        Record i owns the rows starts[i]:starts[i + 1].
+    polynomials : (Q, N) array
+        Per-record polynomial nuisance columns, as rows (Legendre, degrees 0 .. Q - 1).
+    structure : Structure
+    dt_s : float
+    """
+
+    u: RealArray
+    y: RealArray
+    starts: npt.NDArray[np.int64]
+    polynomials: RealArray
+    structure: Structure
+    dt_s: float
+
+    @property
+    def n_samples(self) -> int:
+        """Number of rows N over all records."""
+        return int(self.y.size)
+
+    @property
+    def n_records(self) -> int:
+        return int(self.starts.size - 1)
+
+    @property
+    def longest(self) -> int:
+        """Rows of the longest record."""
+        return int(np.max(np.diff(self.starts)))
+
+    def segment(self, record: int) -> slice:
+        return slice(int(self.starts[record]), int(self.starts[record + 1]))
+
+    def n_parameters(self, order: int) -> int:
+        """Number of free real numbers of a fit with `order` poles: coefficients, poles, nuisances."""
+        local = self.polynomials.shape[0] + (order if self.structure.estimate_initial_state else 0)
+        return 2 * order + int(self.structure.feedthrough) + self.n_records * local
+
+
+def prepare(records: Sequence[Record], structure: Structure) -> Regression:
+    """Stack single-input single-output records for one fit.
+
+    Raises
+    ------
+    ValueError
+        If there is no record, a record has more than one input or output, or the sampling times differ by
+        more than 0.1 %.
+    """
+    if not records:
+        raise ValueError("identification needs at least one record; got none")
+    dt_s = records[0].dt_s
+    inputs, outputs, polynomials, starts = [], [], [], [0]
+    for record in records:
+        if record.input.shape[1] != 1 or record.output.shape[1] != 1:
+            raise ValueError(
+                f"{record.label}: identification takes one input and one output, got {list(record.input_names)} "
+                f"and {list(record.output_names)}; choose with Record.siso"
+            )
+        if not abs(record.dt_s - dt_s) <= 1e-3 * dt_s:
+            raise ValueError(f"{record.label}: dt_s = {record.dt_s:.6g}, but the first record has {dt_s:.6g}")
+        delay = structure.input_delay_samples
+        if record.n_samples <= delay:
+            raise ValueError(
+                f"{record.label}: {record.n_samples} samples, not more than the input delay {delay}"
+            )
+        u = filter_input(record.input[:, 0], structure.integrators, delay)[delay:]
+        abscissa = np.linspace(-1, 1, u.size)
+        inputs.append(u)
+        outputs.append(record.output[delay:, 0])
+        polynomials.append(np.polynomial.legendre.legvander(abscissa, max(structure.n_polynomials - 1, 0)))
+        starts.append(starts[-1] + u.size)
+    basis = np.concatenate(polynomials).T[: structure.n_polynomials]
+    return Regression(
+        u=np.concatenate(inputs),
+        y=np.concatenate(outputs),
+        starts=np.array(starts, dtype=np.int64),
+        polynomials=np.ascontiguousarray(basis),
+        structure=structure,
+        dt_s=dt_s,
+    )
