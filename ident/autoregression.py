@@ -13,9 +13,9 @@ from ident.arrays import RealArray
 def fit_autoregression(residuals: Sequence[RealArray], max_order: int) -> RealArray:
     """[1, a_1, ..., a_n] of A(q) e = white, order n <= max_order by BIC, from all records together.
 
-    Conditional least squares on the rows that have max_order predecessors, so that all orders are judged on the
-    same rows; a model with a root on or outside the unit circle has its roots reflected inside. Raises ValueError
-    when no record is longer than twice max_order.
+    Conditional least squares on the rows that have max_order predecessors, so that all orders are judged on
+    the same rows; a model with a root on or outside the unit circle has its roots reflected inside. Raises
+    ValueError when no record is longer than twice max_order.
     """
     usable = [np.asarray(e, dtype=np.float64) for e in residuals if e.size > 2 * max_order]
     if not usable:

@@ -52,8 +52,8 @@ def chi2_radius(level: float) -> float:
 def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexArray]:
     """Standard deviations along the principal axes of (F,2,2) covariances, major first, and the major direction.
 
-    The larger eigenvalue is a sum of positive terms; the smaller one is det / larger, so that it never comes out
-    as a difference of nearly equal eigenvalues; what rounding leaves below zero is set to zero.
+    The larger eigenvalue is a sum of positive terms; the smaller one is det / larger, so that it never comes
+    out as a difference of nearly equal eigenvalues; what rounding leaves below zero is set to zero.
     """
     vr, vi, c = covariance[:, 0, 0], covariance[:, 1, 1], 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
     # Scaling by the trace keeps squares of tiny (1e-200) and huge variances inside the range of doubles.
@@ -81,8 +81,8 @@ def relative_deficit(covariance: RealArray) -> RealArray:
 def ellipse_distance(offset: ComplexArray, ellipses: Ellipses, magnitude: RealArray) -> RealArray:
     """Length of an offset (F,) in units of the ellipse: 0 at the centre, 1 on the boundary.
 
-    magnitude (F,) is the size of the numbers the offset was formed from: axes below its rounding count as that
-    rounding, so a degenerate ellipse (a segment or a point) contains itself and nothing else.
+    magnitude (F,) is the size of the numbers the offset was formed from: axes below its rounding count as
+    that rounding, so a degenerate ellipse (a segment or a point) contains itself and nothing else.
     """
     aligned = offset * np.conj(ellipses.direction)
     floor = np.maximum(_ROUNDING * magnitude, np.finfo(np.float64).tiny)
@@ -93,9 +93,10 @@ def ellipse_distance(offset: ComplexArray, ellipses: Ellipses, magnitude: RealAr
 def offset_disc_radius(offset: ComplexArray, covariance: RealArray, level: float) -> RealArray:
     """rho (F,) with P(|offset + e| <= rho) = level for e ~ N(0, covariance), per frequency.
 
-    This is the additive weight of a low-order nominal model (design 4.5): offset (F,) = posterior centre minus
-    nominal response, covariance (F,2,2) that of (Re, Im). Solved by bisection on the exact probability (one
-    Gauss-Legendre integral over the minor axis, the major one in closed form); relative accuracy about 1e-6.
+    This is the additive weight of a low-order nominal model (design 4.5): offset (F,) = posterior centre
+    minus nominal response, covariance (F,2,2) that of (Re, Im). Solved by bisection on the exact probability
+    (one Gauss-Legendre integral over the minor axis, the major one in closed form); relative accuracy about
+    1e-6.
     """
     if not 0 < level < 1:
         raise ValueError(f"a confidence level lies between 0 and 1; got {level}")

@@ -1,10 +1,10 @@
 """Model error and noise as one covariance: stochastic embedding, classical and tangent (design 4.5).
 
-`classical` is the recipe of Goodwin, Gevers and Ninness (IEEE TAC 37(7), 1992) that the paper's Fig. 7 uses. Its
-ellipses do not cover: poles chosen from the same data are treated as known, and the kernel keeps its prior variance
-at frequencies that the data know well. `tangent` is the default: every pole twice (which spans the first-order
-effect of moving the poles), initial state and offset as nuisance, a short kernel for what is left, everything
-conditioned on the data.
+`classical` is the recipe of Goodwin, Gevers and Ninness (IEEE TAC 37(7), 1992) that the paper's Fig. 7 uses.
+Its ellipses do not cover: poles chosen from the same data are treated as known, and the kernel keeps its
+prior variance at frequencies that the data know well. `tangent` is the default: every pole twice (which spans
+the first-order effect of moving the poles), initial state and offset as nuisance, a short kernel for what is
+left, everything conditioned on the data.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ def tangent(
 ) -> ResponsePosterior:
     """Posterior of the response around a model whose poles were chosen from these records.
 
-    records: SISO, same sampling time as the model, each with its own initial state and offset; model gives poles,
-    integrators and delay (its coefficients are not used). Raises ValueError when the records are too short, have
-    another sampling time, or do not excite the poles.
+    records: SISO, same sampling time as the model, each with its own initial state and offset; model gives
+    poles, integrators and delay (its coefficients are not used). Raises ValueError when the records are too
+    short, have another sampling time, or do not excite the poles.
     """
     options = options or EmbeddingOptions()
     return _embed(records, model, model.poles.doubled(), options, classical_recipe=False)
@@ -96,11 +96,19 @@ def classical(
 ) -> ResponsePosterior:
     """The published recipe, for comparison: F = Phi, prior C = alpha lam^k, unconditional covariance.
 
-    Same arguments and errors as `tangent`; hyperparameters are always those of largest restricted likelihood, and
-    prior_no_remainder is not used. Do not design a controller on it: see the module docstring.
+    Same arguments and errors as `tangent`; hyperparameters are always those of largest restricted likelihood,
+    and prior_no_remainder is not used. Do not design a controller on it: see the module docstring.
     """
     options = options or EmbeddingOptions()
     return _embed(records, model, model.poles, options, classical_recipe=True)
+
+
+def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
+    """Taps of the kernel: as given, else 150 or a third of the rows the regressors (of these poles) leave over."""
+    if options.fir_length is not None:
+        return options.fir_length
+    spare = sum(record.n_samples for record in records) - (len(records) + 1) * (poles.order + 2)
+    return max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +182,7 @@ def _build(
             )
         if not abs(record.dt_s - model.dt_s) <= 1e-9 * model.dt_s:
             raise ValueError(f"record {record.name!r} has dt_s = {record.dt_s}, the model {model.dt_s}")
-    length = options.fir_length
-    if length is None:
-        spare = sum(r.input.shape[0] for r in records) - (len(records) + 1) * (poles.order + 2)
-        length = max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
+    length = common_fir_length(records, poles, options)
     return _Regression(tuple(records), model, poles, options, feedthrough, length)
 
 

@@ -1,8 +1,9 @@
 """Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of kernel coefficients.
 
 Model y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), v ~ N(0, s2 I)
-(Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Ct = alpha B B^T, and everything
-that depends on the data is contained in a triangle of the size of the parameters, whatever the record length.
+(Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Ct = alpha B B^T, and
+everything that depends on the data is contained in a triangle of the size of the parameters, whatever the
+record length.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from ident.arrays import RealArray
 
 # Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
 _NUISANCE_RANK = 1e-10
-# A diagonal entry of R11 (columns of unit length) below this says that the input does not excite that direction.
+# A diagonal entry of R11 (columns of unit length) below this says that the input does not excite that
+# direction.
 _EXCITATION = 1e-11
 
 
@@ -65,9 +67,9 @@ class ReducedRegression:
 class KernelPosterior:
     """Gaussian for (theta, eta): theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w), eta = mean + factor w'.
 
-    w, w' standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the classical
-    recipe) mean 0 and the prior factor. alpha and lam are those of largest weight; probability_no_remainder the
-    weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
+    w, w' standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the
+    classical recipe) mean 0 and the prior factor. alpha and lam are those of largest weight;
+    probability_no_remainder the weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
     """
 
     kernel_mean: RealArray
@@ -84,7 +86,7 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
     if nuisance.shape[1] == 0:
         return nuisance
     length = np.linalg.norm(nuisance, axis=0)
-    scaled = nuisance[:, length > 0] / length[length > 0]
+    scaled = np.asarray(nuisance[:, length > 0] / length[length > 0], dtype=np.float64)
     if scaled.shape[1] == 0:
         return scaled
     q, r, _ = qr(scaled, mode="economic", pivoting=True)
@@ -96,14 +98,14 @@ def without_nuisance(columns: RealArray, basis: RealArray) -> RealArray:
     """Columns minus their projection on an orthonormal basis, applied twice so that rounding is removed too."""
     for _ in range(2):
         columns = columns - basis @ (basis.T @ columns)
-    return np.asarray(columns)
+    return np.asarray(columns, dtype=np.float64)
 
 
 def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
     """One QR for all records: each block's nuisance is projected out, its triangle stacked under the previous.
 
-    Cost O(N (p + L)^2), memory that of the largest block. Raises ValueError when rows do not exceed p + L or the
-    input does not excite a regressor.
+    Cost O(N (p + L)^2), memory that of the largest block. Raises ValueError when rows do not exceed p + L or
+    the input does not excite a regressor.
     """
     triangle: RealArray | None = None
     n_rows = 0
@@ -202,8 +204,8 @@ def evaluate_grid(
 ) -> KernelGrid:
     """Restricted likelihood over kernel shapes and alpha = relative_alpha / d_max^2.
 
-    Scaled by the largest singular value, a relative alpha of 1 is a remainder just as strong as the noise in its
-    best-excited direction, so that the grid fits any units of input and output.
+    Scaled by the largest singular value, a relative alpha of 1 is a remainder just as strong as the noise in
+    its best-excited direction, so that the grid fits any units of input and output.
     """
     spectra = tuple(spectra)
     alpha = np.stack([relative_alpha / max(float(s.singular[0]) ** 2, 1e-300) for s in spectra])

@@ -117,7 +117,9 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     try:
         value = float(cell)
     except ValueError as error:
-        raise ValueError(f"{path}, line {line}, column {column}: expected a number, found {cell!r}") from error
+        raise ValueError(
+            f"{path}, line {line}, column {column}: expected a number, found {cell!r}"
+        ) from error
     if not np.isfinite(value):
         raise ValueError(f"{path}, line {line}, column {column}: expected a finite number, found {cell!r}")
     return value

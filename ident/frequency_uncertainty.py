@@ -22,7 +22,8 @@ from ident.ellipses import (
 )
 from ident.frequency_data import mean_of_repeats, read_frequency_table, write_frequency_table
 
-# A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by more.
+# A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
+# more.
 _PSD_TOLERANCE = 1e-9
 
 
@@ -31,9 +32,9 @@ class FrequencyUncertainty:
     """G(e^{j omega dt}) ~ N(centre, covariance) over (Re, Im), frequency by frequency.
 
     omega_rad_s (F,) strictly increasing, 0 <= omega <= pi / dt_s; centre (F,) complex; covariance (F,2,2) of
-    (real part, imaginary part), symmetric and positive semidefinite (zero = exactly known); level is the confidence
-    of each frequency's ellipse taken alone, not of all of them jointly; method says where the numbers come from.
-    Raises ValueError, naming the first frequency at fault.
+    (real part, imaginary part), symmetric and positive semidefinite (zero = exactly known); level is the
+    confidence of each frequency's ellipse taken alone, not of all of them jointly; method says where the
+    numbers come from. Raises ValueError, naming the first frequency at fault.
     """
 
     omega_rad_s: RealArray
@@ -106,8 +107,8 @@ class FrequencyUncertainty:
     def offset_disc(self, nominal_response: npt.ArrayLike) -> tuple[ComplexArray, RealArray]:
         """Offset m_n = centre - G_nom (F,) and radius rho (F,) with P(|G - G_nom| <= rho) = level.
 
-        For a nominal model of lower order than the identified one: the set around the nominal is an ellipse off
-        centre, and rho is the magnitude of an additive weight that covers it (design 4.5).
+        For a nominal model of lower order than the identified one: the set around the nominal is an ellipse
+        off centre, and rho is the magnitude of an additive weight that covers it (design 4.5).
         """
         offset = self.centre - self._matching(nominal_response)
         return offset, offset_disc_radius(offset, self.covariance, self.level)
@@ -147,8 +148,9 @@ class FrequencyUncertainty:
     def from_csv(cls, path: str | Path, dt_s: float, *, level: float = 0.95) -> Self:
         """A user's own frequency response with covariances.
 
-        One header line; columns `omega_rad_s` or `frequency_Hz`, `real`, `imag`, `variance_real`, `variance_imag` and,
-        if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming file, line and column.
+        One header line; columns `omega_rad_s` or `frequency_Hz`, `real`, `imag`, `variance_real`,
+        `variance_imag` and, if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming
+        file, line and column.
         """
         path = Path(path)
         omega, centre, covariance = read_frequency_table(path)
@@ -174,13 +176,14 @@ class FrequencyUncertainty:
     ) -> Self:
         """Mean and covariance of the mean from repeated measurements of a frequency response.
 
-        omega_rad_s (K,) and response (K,): one entry per measured point in any order; points of equal frequency are
-        repeats. Few repeats know their own scatter badly, so the covariance is widened until the ellipse of the
-        chi-square quantile at `level` equals Hotelling's T-square ellipse at that level (variance x 1.7 with 10
-        repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative covariances over m frequencies on either
-        side first, which suits a scatter that varies slowly with frequency and few repeats. outlier_threshold = t
-        drops points farther than t robust standard deviations from the median of their frequency.
-        Raises ValueError where a frequency is left with too few repeats.
+        omega_rad_s (K,) and response (K,): one entry per measured point in any order; points of equal
+        frequency are repeats. Few repeats know their own scatter badly, so the covariance is widened until
+        the ellipse of the chi-square quantile at `level` equals Hotelling's T-square ellipse at that level
+        (variance x 1.7 with 10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative
+        covariances over m frequencies on either side first, which suits a scatter that varies slowly with
+        frequency and few repeats. outlier_threshold = t drops points farther than t robust standard
+        deviations from the median of their frequency. Raises ValueError where a frequency is left with too
+        few repeats.
         """
         omega, centre, covariance = mean_of_repeats(
             np.asarray(omega_rad_s, dtype=np.float64),

@@ -8,22 +8,24 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 from ident.arrays import ComplexArray, RealArray
-from ident.basis import basis_response
+from ident.basis import basis_response, regressor
 from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.poles import Poles
+from ident.structure import filter_input
 
 
 @dataclass(frozen=True, eq=False)
 class EmbeddingReport:
     """How a posterior came about, in numbers a reader can judge.
 
-    noise_std is that of the (whitened, if ar_coefficients is not empty) output noise in output units; alpha and
-    lam are the kernel's scale (relative to the noise variance) and decay per sample at the largest weight;
-    probability_no_remainder the posterior probability that the poles explain everything (prior 1/2);
-    log_evidence the gain in restricted log likelihood of the best kernel over none; n_rows the samples used after
-    nuisance columns; ar_coefficients (a_1 .. a_n) of the noise filter 1 / (1 + a_1 q^-1 + ...).
+    noise_std is that of the (whitened, if ar_coefficients is not empty) output noise in output units; alpha
+    and lam are the kernel's scale (relative to the noise variance) and decay per sample at the largest
+    weight; probability_no_remainder the posterior probability that the poles explain everything (prior 1/2);
+    log_evidence the gain in restricted log likelihood of the best kernel over none; n_rows the samples used
+    after nuisance columns; ar_coefficients (a_1 .. a_n) of the noise filter 1 / (1 + a_1 q^-1 + ...).
     """
 
     method: str
@@ -101,7 +103,8 @@ class ResponsePosterior:
         if self.has_feedthrough:
             parts.append(np.ones((omega.size, 1), dtype=np.complex128))
         parts.append(np.exp(-1j * self.dt_s * np.outer(omega, np.arange(1, self.fir_length + 1))))
-        # 1 - z^-1 written with sin, which keeps its digits near omega = 0 where the difference would lose them.
+        # 1 - z^-1 written with sin, which keeps its digits near omega = 0 where the difference would lose
+        # them.
         half = 0.5 * omega * self.dt_s
         common = np.exp(-1j * omega * self.dt_s * self.input_delay_samples)
         if self.integrators:
@@ -135,13 +138,28 @@ class ResponsePosterior:
         """Responses (n_draws, F) of coefficient draws (n_draws, P)."""
         return np.asarray(draws @ self.frequency_rows(omega_rad_s).T)
 
+    def simulate(self, u: RealArray, coefficients: RealArray | None = None) -> RealArray:
+        """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,)."""
+        values = self.mean if coefficients is None else np.asarray(coefficients, dtype=np.float64)
+        if values.shape != self.mean.shape:
+            raise ValueError(f"need coefficients {self.mean.shape}; got {values.shape}")
+        filtered = filter_input(u, self.integrators, self.input_delay_samples)
+        n_poles, n_direct = self.poles.order, int(self.has_feedthrough)
+        taps = np.concatenate([np.zeros(1), values[n_poles + n_direct :]])
+        if self.has_feedthrough:
+            taps[0] = values[n_poles]
+        return np.asarray(
+            regressor(self.poles, filtered) @ values[:n_poles] + lfilter(taps, np.ones(1), filtered)
+        )
+
     def joint_level(
         self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
     ) -> float:
         """Per-frequency level whose ellipses hold the whole response over omega (F,) with probability `level`.
 
-        The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses, as a
-        per-frequency level; the sampling error of the joint probability is sqrt(level (1 - level) / n_draws).
+        The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses,
+        as a per-frequency level; the sampling error of the joint probability is sqrt(level (1 - level) /
+        n_draws).
         """
         set_of_ellipses = self.at(omega_rad_s, level=0.5)
         responses = self.response_of(self.sample(rng, n_draws), omega_rad_s)

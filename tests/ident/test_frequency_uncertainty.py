@@ -1,0 +1,218 @@
+"""Ellipses, distances, offset discs, user's files and repeated measurements against known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import ncx2
+
+from ident.ellipses import offset_disc_radius
+from ident.uncertainty import FrequencyUncertainty
+
+DT = 0.01
+OMEGA = np.array([1.0, 2.0, 5.0])
+
+
+def covariance_of(s1, s2, angle):
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return turn @ np.diag([s1**2, s2**2]) @ turn.T
+
+
+def single(covariance, centre=1 + 2j, level=0.95):
+    return FrequencyUncertainty(np.array([1.0]), np.array([centre]), covariance[None], DT, level)
+
+
+@given(
+    major=st.floats(-12, 3),
+    ratio=st.floats(-6, 0),
+    angle=st.floats(0, np.pi),
+)
+def test_axes_come_back_from_any_covariance(major, ratio, angle):
+    s1, s2 = 10.0**major, 10.0 ** (major + ratio)
+    ellipse = single(covariance_of(s1, s2, angle)).ellipse()
+    radius = np.sqrt(-2 * np.log(0.05))
+    assert ellipse.semi_major[0] == pytest.approx(radius * s1, rel=1e-9)
+    # The covariance itself carries s2^2 to eps * s1^2 only.
+    assert abs(ellipse.semi_minor[0] ** 2 - (radius * s2) ** 2) <= 1e-14 * (radius * s1) ** 2
+    if ratio < -0.1:
+        cross = (ellipse.direction * np.exp(-1j * angle)).imag
+        assert abs(cross[0]) < 1e-9
+
+
+@given(angle=st.floats(0, np.pi), ratio=st.floats(-4, 0), inside=st.floats(0, 2 * np.pi))
+def test_distance_is_one_on_the_boundary_and_scales(angle, ratio, inside):
+    s1, s2 = 0.3, 0.3 * 10.0**ratio
+    record = single(covariance_of(s1, s2, angle))
+    radius = np.sqrt(-2 * np.log(0.05))
+    point = radius * np.exp(1j * angle) * (s1 * np.cos(inside) + 1j * s2 * np.sin(inside))
+    for stretch in (0.5, 0.999, 1.001, 3.0):
+        response = record.centre + stretch * point
+        assert record.normalised_distance(response)[0] == pytest.approx(stretch, rel=1e-6)
+        assert record.contains(response)[0] == (stretch < 1)
+
+
+def test_degenerate_ellipses_contain_themselves_and_nothing_else():
+    point = single(np.zeros((2, 2)))
+    assert point.contains(np.array([1 + 2j]))[0]
+    assert not point.contains(np.array([1 + 2j + 1e-12]))[0]
+    segment = single(covariance_of(1.0, 0.0, 0.4))
+    along = np.exp(0.4j)
+    assert segment.ellipse().semi_minor[0] <= 1e-7
+    assert segment.contains(np.array([1 + 2j + 2.0 * along]))[0]
+    assert not segment.contains(np.array([1 + 2j + 1e-3j * along]))[0]
+    tiny = single(np.eye(2) * 1e-300, centre=0j)
+    assert tiny.ellipse().semi_major[0] == pytest.approx(np.sqrt(-2 * np.log(0.05)) * 1e-150, rel=1e-12)
+
+
+def test_ellipse_holds_the_fraction_it_promises():
+    rng = np.random.default_rng(0)
+    covariance = covariance_of(1.0, 0.05, 1.0)
+    draws = rng.multivariate_normal([0, 0], covariance, size=20000)
+    for level in (0.5, 0.95):
+        record = FrequencyUncertainty(np.array([1.0]), np.zeros(1), covariance[None], DT, level)
+        inside = np.mean([record.contains(np.array([a + 1j * b]))[0] for a, b in draws[:4000]])
+        # 4 binomial standard deviations
+        assert abs(inside - level) < 4 * np.sqrt(level * (1 - level) / 4000)
+    assert record.enclosing_radius()[0] == record.ellipse().semi_major[0]
+
+
+def test_boundary_points_lie_at_distance_one():
+    record = FrequencyUncertainty(OMEGA, np.ones(3), np.stack([covariance_of(1, r, 0.3) for r in (1, 0.1, 1e-3)]), DT)
+    for column in record.ellipse().boundary(16).T:
+        np.testing.assert_allclose(record.normalised_distance(record.centre + column), 1.0, rtol=1e-8)
+
+
+def test_offset_disc_radius_against_the_noncentral_chi_square_and_against_sampling():
+    # Circular noise: |m + e|^2 / s^2 is noncentral chi-square with 2 degrees of freedom.
+    offset = np.array([0.0, 0.5, 3.0 + 4.0j, 1000.0])
+    circular = np.broadcast_to(np.eye(2) * 0.7**2, (4, 2, 2))
+    exact = 0.7 * np.sqrt(ncx2.ppf(0.95, 2, np.maximum(np.abs(offset) ** 2 / 0.7**2, 1e-300)))
+    np.testing.assert_allclose(offset_disc_radius(offset, circular, 0.95), exact, rtol=1e-6)
+    rng = np.random.default_rng(1)
+    for s2, angle, m in ((0.01, 0.3, 2 + 1j), (0.5, 2.0, -0.2j), (1e-6, 1.2, 0.1)):
+        covariance = covariance_of(1.0, s2, angle)
+        draws = rng.multivariate_normal([m.real, m.imag], covariance, size=200_000)
+        rho = offset_disc_radius(np.array([m]), covariance[None], 0.9)[0]
+        assert np.mean(np.hypot(*draws.T) <= rho) == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 200_000))
+    assert offset_disc_radius(np.array([3 - 4j]), np.zeros((1, 2, 2)), 0.95)[0] == pytest.approx(5.0, rel=1e-6)
+    with pytest.raises(ValueError, match="level"):
+        offset_disc_radius(np.array([1j]), np.zeros((1, 2, 2)), 1.0)
+
+
+def test_offset_disc_of_a_nominal_model_is_never_smaller_than_the_offset_at_high_level():
+    record = FrequencyUncertainty(OMEGA, np.array([1, 1j, -1]), np.stack([0.01 * np.eye(2)] * 3), DT)
+    offset, radius = record.offset_disc(np.array([1.0, 0.9j, 0.0]))
+    np.testing.assert_allclose(offset, [0, 0.1j, -1.0], atol=1e-15)
+    assert np.all(radius > np.abs(offset))
+
+
+def test_to_control_and_round_trip(tmp_path):
+    rng = np.random.default_rng(2)
+    factor = rng.standard_normal((3, 2, 2))
+    record = FrequencyUncertainty(
+        OMEGA, rng.standard_normal(3) + 1j, factor @ factor.transpose(0, 2, 1), DT, 0.9, "test"
+    )
+    response = record.to_control()
+    assert response.dt == DT
+    np.testing.assert_array_equal(response.frdata[0, 0], record.centre)
+    np.savez(tmp_path / "a.npz", **record.to_arrays())
+    with np.load(tmp_path / "a.npz") as stored:
+        again = FrequencyUncertainty.from_arrays(stored)
+    record.to_csv(tmp_path / "a.csv")
+    from_file = FrequencyUncertainty.from_csv(tmp_path / "a.csv", DT, level=0.9)
+    for other in (again, from_file):
+        for name in ("omega_rad_s", "centre", "covariance"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(record, name))
+        assert (other.dt_s, other.level) == (DT, 0.9)
+    assert again.method == "test"
+    with pytest.raises(ValueError, match="read-only"):
+        record.covariance[0, 0, 0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"omega_rad_s": [1.0, 3.0, 2.0]}, "strictly increasing.*omega = 2"),
+        ({"omega_rad_s": [1.0, 2.0, 400.0]}, r"above pi / dt_s.*omega = 400"),
+        ({"omega_rad_s": [-1.0, 2.0, 4.0]}, "negative"),
+        ({"omega_rad_s": [1.0, np.nan, 4.0]}, "not finite"),
+        ({"centre": [1.0, np.inf, 1.0]}, r"centre is not finite.*omega = 2"),
+        ({"covariance": [np.eye(2), np.diag([1.0, -1.0]), np.eye(2)]}, r"not positive semidefinite.*omega = 2"),
+        ({"covariance": [np.eye(2), [[1, 2], [2, 1]], np.eye(2)]}, "not positive semidefinite"),
+        ({"covariance": [np.eye(2), [[1, 0.2], [0, 1]], np.eye(2)]}, "not symmetric"),
+        ({"covariance": [np.eye(2)]}, "need omega"),
+        ({"dt_s": 0.0}, "dt_s"),
+        ({"level": 1.0}, "confidence level"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(change, message):
+    values = {"omega_rad_s": OMEGA, "centre": np.ones(3), "covariance": [np.eye(2)] * 3, "dt_s": DT} | change
+    with pytest.raises(ValueError, match=message) as caught:
+        FrequencyUncertainty(**values)
+    assert "\n" not in str(caught.value)
+
+
+HEADER = "omega_rad_s,real,imag,variance_real,variance_imag,covariance_real_imag\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (HEADER + "1,1,0,1,1,0\n2,1,x,1,1,0\n", "line 3, column imag: expected a number, found 'x'"),
+        (HEADER + "1,1,nan,1,1,0\n", "line 2, column imag: expected a finite number"),
+        (HEADER + "1,1,0,-1,1,0\n", "line 2: a variance is negative"),
+        (HEADER + "1,1,0,1,1,2\n", "not positive semidefinite"),
+        (HEADER + "2,1,0,1,1,0\n1,1,0,1,1,0\n", "strictly increasing"),
+        (HEADER + "1,1,0\n", "line 2: 3 cells where the header has 6"),
+        (HEADER, "no rows"),
+        ("omega_rad_s,real\n1,2\n", "missing column imag, variance_real"),
+        ("real,imag\n1,2\n", "exactly one of the columns"),
+    ],
+)
+def test_csv_errors_name_file_and_place(tmp_path, text, message):
+    path = tmp_path / "frf.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        FrequencyUncertainty.from_csv(path, DT)
+    assert "frf.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_csv_in_hertz_and_without_cross_covariance(tmp_path):
+    path = tmp_path / "frf.csv"
+    path.write_text("frequency_Hz,real,imag,variance_real,variance_imag,note\n1,0.5,-1,4,9,a\n")
+    record = FrequencyUncertainty.from_csv(path, DT)
+    assert record.omega_rad_s[0] == pytest.approx(2 * np.pi)
+    np.testing.assert_array_equal(record.covariance[0], np.diag([4.0, 9.0]))
+    with pytest.raises(ValueError, match="there is no such file"):
+        FrequencyUncertainty.from_csv(tmp_path / "absent.csv", DT)
+
+
+@pytest.mark.parametrize(("repeats", "pool"), [(10, 0), (4, 0), (3, 2)])
+def test_ellipse_from_repeats_covers_the_truth_at_its_level(repeats, pool):
+    rng = np.random.default_rng(3)
+    omega = np.arange(1.0, 201.0)
+    truth = (2 + np.sin(omega)) * np.exp(1j * omega)
+    factor = np.linalg.cholesky(covariance_of(0.1, 0.02, 0.5))
+    noise = rng.standard_normal((repeats, omega.size, 2)) @ factor.T
+    # Scatter fixed relative to the response, so that pooling over neighbours is right.
+    points = truth * (1 + noise[..., 0] + 1j * noise[..., 1])
+    record = FrequencyUncertainty.from_frf_repeats(
+        np.tile(omega, repeats), points.ravel(), 0.001, pool_neighbours=pool
+    )
+    hits = record.contains(truth).sum()
+    # Hotelling is exact without pooling; 4 binomial standard deviations of 200 at 0.95 are 12.
+    assert abs(hits - 190) <= 12
+
+
+def test_repeats_need_three_points_and_outliers_can_be_dropped():
+    with pytest.raises(ValueError, match=r"omega = 2 rad/s there are 2 repeats"):
+        FrequencyUncertainty.from_frf_repeats([1, 1, 1, 2, 2], [1, 2, 3, 1, 2], DT)
+    rng = np.random.default_rng(4)
+    points = 1 + 0.01 * (rng.standard_normal(20) + 1j * rng.standard_normal(20))
+    points[7] = 5.0
+    kept = FrequencyUncertainty.from_frf_repeats(np.ones(20), points, DT, outlier_threshold=5.0)
+    assert abs(kept.centre[0] - 1) < 0.02
+    assert kept.enclosing_radius()[0] < 0.02
