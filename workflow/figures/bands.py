@@ -82,3 +82,18 @@ def outline(time_s: Real, signal: Real, bins: int = 700) -> tuple[Real, Real]:
     ).ravel()
     index = np.unique(np.concatenate([index, [signal.size - 1]]))
     return time_s[index], signal[index]
+
+
+def envelope(time_s: Real, signals: Real, bins: int = 250) -> tuple[Real, Real, Real]:
+    """Time, smallest and largest value of several signals (R, T); over equal parts where T is much larger
+    than `bins`."""
+    low, high = signals.min(axis=0), signals.max(axis=0)
+    length = time_s.size // bins
+    if length < 2:
+        return time_s, low, high
+    at = np.arange(0, time_s.size, length)
+    # Each value holds for a part: drawn from its middle, and the ends kept, so that the band spans all of the
+    # time.
+    middle = np.minimum(at + length // 2, time_s.size - 1)
+    middle[0], middle[-1] = 0, time_s.size - 1
+    return time_s[middle], np.minimum.reduceat(low, at), np.maximum.reduceat(high, at)

@@ -46,7 +46,7 @@ def draw_bode(
         if empirical is not None:
             inside = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
             at, response = empirical.omega_rad_s[inside], empirical.response[inside]
-            dots = {"color": style.MEASURED, "ls": "none", "marker": ".", "ms": 2.6, "alpha": 0.65, "mew": 0}
+            dots = {"color": style.MEASURED, "ls": "none", "marker": ".", "ms": 4.0, "alpha": 0.55, "mew": 0}
             label = "straight from the records, no model"
             gain.plot(at, np.maximum(np.abs(response), floor), **dots, label=label)
             target = np.interp(at, omega, band.phase_deg)
@@ -72,7 +72,7 @@ def draw_bode(
         gain.set_ylabel(f"gain [{style.plain(style.ratio_unit(output_label[1], input_label[1]), 36)}]")
         phase.set_ylabel("phase [deg]")
         span = np.ptp(band.phase_deg)
-        phase.yaxis.set_major_locator(MultipleLocator(90 if span < 500 else 180 if span < 1000 else 360))
+        phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
         low, high = style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15)
         phase.set_ylim(low, high)
         relative = 100 * uncertainty.ellipse().semi_major[uncertainty.omega_rad_s > 0] / band.gain

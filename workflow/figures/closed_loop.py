@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workflow.figures import style
-from workflow.figures.bands import Real
+from workflow.figures.bands import Real, envelope, outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +69,8 @@ def draw_closed_loop(
         grid = figure.subplots(len(rows), len(windows), squeeze=False, sharex="col", sharey="row")
         for (kind, label), axes_row in zip(rows, grid, strict=True):
             for axes, (start, stop, _) in zip(axes_row, windows, strict=True):
-                part = slice(
-                    int(np.searchsorted(scene.time_s, start)), int(np.searchsorted(scene.time_s, stop)) + 1
-                )
+                first, last = np.searchsorted(scene.time_s, [start, stop])
+                part = slice(int(first), int(last) + (stop == scene.time_s[-1]))
                 _draw_row(axes, scene, kind, predicted, achieved, spread, machine, part)
                 axes.set_xlim(start, stop)
                 if onset is not None and start <= onset <= stop:
@@ -133,9 +132,7 @@ def _draw_row(
     if spread is not None and getattr(spread, kind) is not None:
         many = getattr(spread, kind)[:, part]
         axes.fill_between(
-            time,
-            many.min(axis=0),
-            many.max(axis=0),
+            *envelope(time, many),
             **style.BAND,
             label=f"{many.shape[0]} plants from the uncertainty",
         )
@@ -143,19 +140,16 @@ def _draw_row(
     if done is not None:
         if done.shape[0] > 1:
             axes.fill_between(
-                time,
-                done[:, part].min(axis=0),
-                done[:, part].max(axis=0),
+                *envelope(time, done[:, part]),
                 color=style.ACHIEVED,
                 alpha=0.22,
                 lw=0,
                 label=f"{machine}: all {done.shape[0]} runs",
             )
         first = f"{machine}: first run" if done.shape[0] > 1 else machine
-        axes.plot(time, done[0, part], **style.ACHIEVED_LINE, **hold, label=first)
+        axes.plot(*outline(time, done[0, part], 180), **style.ACHIEVED_LINE, **hold, label=first)
     axes.plot(
-        time,
-        getattr(predicted, kind)[0, part],
+        *outline(time, getattr(predicted, kind)[0, part], 180),
         **style.PREDICTED_LINE,
         **hold,
         label="predicted, nominal model",

@@ -28,7 +28,7 @@ class ErrorSurface:
     frozen: str = "the other poles held at the optimum"
 
 
-def draw_error_surface(surface: ErrorSurface, *, name: str, evaluations: int | None = None) -> Figure:
+def draw_error_surface(surface: ErrorSurface, *, name: str) -> Figure:
     """Filled contours of the residual's root mean square relative to the optimum, on log axes."""
     with style.house_style():
         figure = style.new_figure(4.9)
@@ -52,7 +52,7 @@ def draw_error_surface(surface: ErrorSurface, *, name: str, evaluations: int | N
                 surface.searched[:, 1],
                 ls="none",
                 marker=".",
-                ms=3,
+                ms=5,
                 color="white",
                 mec="black",
                 mew=0.3,
@@ -76,9 +76,13 @@ def draw_error_surface(surface: ErrorSurface, *, name: str, evaluations: int | N
         left.set_title(f"Error surface: {style.plain(name, 34)}")
         bar = figure.colorbar(filled, ax=left, pad=0.01, aspect=30)
         bar.set_label("residual RMS / its minimum [1]")
-        # log colour bars of contours carry minor ticks that overlap; a handful of round values is readable.
-        ticks = [t for t in (1, 1.02, 1.05, 1.1, 1.2, 1.5, 2, 3, 5, 10, 20, 50, 100, 1e3) if t <= levels[-1]]
-        bar.set_ticks(ticks[-9:], labels=[f"{t:g}" for t in ticks[-9:]])
+        # Round values at least a fifteenth of the bar apart: its own log ticks run into each other.
+        ticks: list[float] = []
+        step = np.log(levels[-1] / levels[0]) / 15
+        for value in (1, 1.02, 1.05, 1.1, 1.2, 1.5, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000):
+            if levels[0] <= value <= levels[-1] and (not ticks or np.log(value / ticks[-1]) > step):
+                ticks.append(value)
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
         bar.ax.minorticks_off()
         lowest = np.nanmin(cost, axis=0)
         right.plot(surface.omega_rad_s, lowest, **style.MODEL_LINE, label="best over damping")
@@ -89,5 +93,6 @@ def draw_error_surface(surface: ErrorSurface, *, name: str, evaluations: int | N
         right.set_title("Along frequency")
         right.set_xlabel("frequency of the pair [rad/s]")
         right.set_ylabel("residual RMS / its minimum [1]")
+        style.plain_log(right.yaxis)
         style.legend_below(figure, (left, right), columns=4)
     return figure

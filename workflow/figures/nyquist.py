@@ -121,8 +121,8 @@ def _draw_loop(
             list(polygons),
             facecolors=style.UNCERTAIN,
             edgecolors=style.MODEL,
-            linewidths=0.35,
-            alpha=0.32,
+            linewidths=0.4,
+            alpha=0.2,
             label=f"{100 * level:.4g} % ellipses",
             rasterized=dense,
         )

@@ -86,7 +86,7 @@ def draw_poles(
         corner = _near_corner(np.concatenate([identified, known]))
         near.set_xlim(1 - corner, 1 + 0.12 * corner)
         near.set_ylim(-0.12 * corner, corner)
-        near.set_title(f"Near z = 1: {corner / dt_s:.3g} rad/s across")
+        near.set_title("Near z = 1")
         _frequency_arcs(near, corner, dt_s)
         _name_dampings(near, corner)
         style.legend_below(figure, whole, columns=5)

@@ -60,6 +60,7 @@ def draw_repeat_scatter(curves: ScatterCurves, *, name: str) -> Figure:
         if ratio.size and np.any(ratio > 0):
             low, high = float(ratio[ratio > 0].min()), float(ratio.max())
             lower.set_ylim(min(0.3, low / 1.3), max(3.0, high * 1.3))
+        style.plain_log(lower.yaxis)
         lower.set_ylabel("measured /\npredicted [1]")
         lower.set_xlabel("frequency [rad/s]")
         upper.set_xlim(curves.omega_rad_s[0], curves.omega_rad_s[-1])

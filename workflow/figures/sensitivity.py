@@ -80,7 +80,7 @@ def sensitivity_curves(
     worst_t = np.abs(gain) * worst_gs_own
     symbol, where = ("|G S|", "output") if performance is None else ("|Gp S|", "performance output")
     to_error, to_output = "reference or disturbance to error", "reference to output"
-    to_command, from_input = "measurement noise to command", f"input disturbance to {where}"
+    to_command, from_input = "measurement noise to command", f"input to {where}"
     return (
         SensitivityCurve("|S|", to_error, "1", omega, centre_s, worst_s, ceiling(tracking)),
         SensitivityCurve("|K S|", to_command, effort_unit, omega, centre_ks, worst_ks, ceiling(effort)),
@@ -102,7 +102,6 @@ def draw_sensitivities(
         for axes in grid.ravel()[len(curves) :]:
             axes.set_visible(False)
         for axes, curve in zip(grid.ravel(), curves, strict=False):
-            word = "worst case" if curve.exact else "upper bound"
             finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
             axes.fill_between(curve.omega_rad_s, curve.nominal, finite, **style.BAND)
             axes.plot(
@@ -121,7 +120,18 @@ def draw_sensitivities(
                 )
             axes.set_xscale("log")
             axes.set_yscale("log")
-            axes.set_title(f"{curve.symbol}: {curve.meaning} ({word})", fontsize=9.5)
+            axes.set_title(f"{curve.symbol}: {curve.meaning}", fontsize=9.5)
+            if not curve.exact:
+                axes.text(
+                    0.98,
+                    0.97,
+                    "band: an upper bound",
+                    transform=axes.transAxes,
+                    ha="right",
+                    va="top",
+                    fontsize=8.5,
+                    color="#555555",
+                )
             axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 34)}]")
             axes.set_ylim(*_range(curve))
             axes.set_xlim(curve.omega_rad_s[0], curve.omega_rad_s[-1])

@@ -36,7 +36,7 @@ def draw_validation(check: ModelCheck, *, zoom_samples: int = 400) -> Figure:
     with style.house_style():
         figure = style.new_figure(4.7)
         grid = figure.subplots(2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
-        length = min(zoom_samples, check.time_s.size)
+        length = min(zoom_samples, max(check.time_s.size // 4, min(100, check.time_s.size)))
         energy = np.concatenate([[0.0], np.cumsum((check.measured - check.measured.mean()) ** 2)])
         start = int(np.argmax(energy[length:] - energy[:-length]))
         close = slice(start, start + length)
@@ -44,7 +44,9 @@ def draw_validation(check: ModelCheck, *, zoom_samples: int = 400) -> Figure:
             time = check.time_s[part]
             upper, lower = grid[0, column], grid[1, column]
             upper.plot(
-                *outline(time, check.measured[part]), **(style.MEASURED_LINE | {"lw": 1.3}), label="measured"
+                *outline(time, check.measured[part]),
+                **(style.MEASURED_LINE | {"lw": 2.4, "alpha": 0.6}),
+                label="measured",
             )
             upper.plot(
                 *outline(time, check.modelled[part]), **(style.MODEL_LINE | {"lw": 0.9}), label="model"
