@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from control_design.biquads import Cascade, tustin_frequency
 from control_design.ellipses import Complex, Ellipses, Real
@@ -67,10 +69,15 @@ class AngleProgram:
         self.plants = tuple(plants)
         x = ca.SX.sym("x", cascade.parameters)
         g = ca.SX.sym("g")
-        variables, lower, upper = [x, g], [-np.inf] * cascade.parameters + [1e-4], [np.inf] * cascade.parameters + [1e4]
+        variables, lower, upper = (
+            [x, g],
+            [-np.inf] * cascade.parameters + [1e-4],
+            [np.inf] * cascade.parameters + [1e4],
+        )
         bound = _parameter_bounds(cascade)
         lower[: cascade.parameters], upper[: cascade.parameters] = list(bound[0]), list(bound[1])
         rows: list[ca.SX] = []
+        s_lemma: list[tuple[Rows, ca.SX, ca.SX, ca.SX, ca.SX]] = []
         row_lower: list[Real] = []
         row_upper: list[Real] = []
 
@@ -115,7 +122,28 @@ class AngleProgram:
                 use = np.flatnonzero(plant.w4 > 0).tolist()
                 if plant.gp_max is not None:
                     add((margin - g * (scale * plant.w4 * plant.gp_max))[use], 0.0, np.inf)
-        self._x0_size = cascade.parameters
+                else:
+                    s_lemma.append((plant, k_re, k_im, c_re, c_im))
+        self._damped: list[tuple[int, npt.NDArray[np.int64]]] = []
+        for plant, k_re, k_im, c_re, c_im in s_lemma:
+            use_at = np.flatnonzero(plant.w4 > 0)
+            pick = use_at.tolist()
+            self._damped.append((self.plants.index(plant), use_at))
+            tau = ca.SX.sym("tau", use_at.size)
+            variables.append(tau)
+            lower += [0.0] * use_at.size
+            upper += [np.inf] * use_at.size
+            first, second, value = _s_lemma_terms(
+                plant.ellipses.subset(use_at),
+                plant.row_scale[use_at],
+                (g * plant.w4[use_at]) ** 2,
+                (k_re[pick], k_im[pick]),
+                (c_re[pick], c_im[pick]),
+            )
+            p1, p2 = first[0] + tau, second[0] + tau
+            add(p1, 0.0, np.inf)
+            add(p2, 0.0, np.inf)
+            add(value - tau - first[1] ** 2 / (p1 + 1e-14) - second[1] ** 2 / (p2 + 1e-14), 0.0, np.inf)
         self._nlp = {"x": ca.vertcat(*variables), "f": -ca.log(g), "g": ca.vertcat(*rows)}
         self._bounds = np.array(lower), np.array(upper)
         self._row_bounds = np.concatenate(row_lower), np.concatenate(row_upper)
@@ -148,6 +176,12 @@ class AngleProgram:
                 w2, w1, w0 = (v / size) ** 2, v / size**2, 1 / size**2
                 num = -n2 * w2 + n0 * w0, n1 * w1
                 den = -w2 + ca.exp(b) * w0, ca.exp(a) * w1
+            elif kind == "notch":
+                c, a, b = x[at], x[at + 1], x[at + 2]
+                at += 3
+                w2, w1, w0 = (v / size) ** 2, v / size**2, 1 / size**2
+                num = -w2 + ca.exp(b) * w0, ca.exp(c) * w1
+                den = -w2 + ca.exp(b) * w0, ca.exp(a) * w1
             else:
                 n1, n0 = x[at], x[at + 1]
                 at += 2
@@ -164,8 +198,22 @@ class AngleProgram:
             re, im = re * f_re - im * f_im, re * f_im + im * f_re
         return re, im
 
+    def _multipliers(self, start: NlpPoint) -> list[Real]:
+        """Best multipliers of the S-lemma rows at a start, so that only g decides its feasibility."""
+        values = []
+        for index, use in self._damped:
+            plant = self.plants[index]
+            e = plant.ellipses.subset(use)
+            k = self.cascade.response(start.parameters, e.omega_rad_s) * plant.delay[use]
+            c = 1 + e.centre * k
+            first, second, _ = _s_lemma_terms(
+                e, plant.row_scale[use], (start.g * plant.w4[use]) ** 2, (k.real, k.imag), (c.real, c.imag)
+            )
+            values.append(best_multiplier(first[0], first[1], second[0], second[1]))
+        return values
+
     def solve(self, start: NlpPoint) -> NlpPoint:
-        initial = np.concatenate([start.parameters, [start.g], *start.angles])
+        initial = np.concatenate([start.parameters, [start.g], *start.angles, *self._multipliers(start)])
         initial = np.clip(initial, self._bounds[0], self._bounds[1])
         answer = self._solver(
             x0=initial,
@@ -182,20 +230,53 @@ class AngleProgram:
             size = plant.ellipses.omega_rad_s.size
             angles.append(values[at : at + size])
             at += size
-        return NlpPoint(values[:n], float(values[n]), tuple(angles), str(stats["return_status"]), int(stats["iter_count"]))
+        return NlpPoint(
+            values[:n], float(values[n]), tuple(angles), str(stats["return_status"]), int(stats["iter_count"])
+        )
+
+
+def _s_lemma_terms(
+    e: Ellipses, scale: Real, weight: Any, k: tuple[Any, Any], c: tuple[Any, Any]
+) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
+    """((A1, B1), (A2, B2), C) of |c + k e|^2 - weight |G + e|^2 on the ellipse; numbers or symbols.
+
+    All rows are multiplied by scale^2. With k e free of 1/K: kappa (G + 1/K) conj(u1) = conj(k) c conj(u1).
+    """
+    k_re, k_im = k
+    c_re, c_im = c
+    u_re, u_im = e.direction.real, e.direction.imag
+    h = e.centre * np.conj(e.direction)
+    kappa = k_re**2 + k_im**2
+    y_re, y_im = k_re * c_re + k_im * c_im, k_re * c_im - k_im * c_re
+    z_re, z_im = y_re * u_re + y_im * u_im, y_im * u_re - y_re * u_im
+    s2 = scale**2
+    a1 = (kappa - weight) * (s2 * e.semi_major**2)
+    a2 = (kappa - weight) * (s2 * e.semi_minor**2)
+    b1 = (z_re - weight * h.real) * (s2 * e.semi_major)
+    b2 = (z_im - weight * h.imag) * (s2 * e.semi_minor)
+    value = (c_re**2 + c_im**2 - weight * np.abs(h) ** 2) * s2
+    return (a1, b1), (a2, b2), value
+
+
+def best_multiplier(a1: Real, b1: Real, a2: Real, b2: Real) -> Real:
+    """tau >= max(0, -A_i) that maximises -tau - sum B_i^2/(A_i + tau) (concave): bisection on its derivative, (F,)."""
+    floor = np.maximum(0.0, np.maximum(-a1, -a2))
+    low, high = floor, floor + np.abs(b1) + np.abs(b2) + 1e-12
+    for _ in range(60):
+        mid = 0.5 * (low + high)
+        rising = (b1 / (a1 + mid + 1e-300)) ** 2 + (b2 / (a2 + mid + 1e-300)) ** 2 > 1.0
+        low, high = np.where(rising, mid, low), np.where(rising, high, mid)
+    return np.asarray(0.5 * (low + high), dtype=np.float64)
 
 
 def _parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:
-    """Log denominators kept within ten decades of the scale: exp() never overflows in a wild step."""
-    low, high = [], []
+    """Logarithms kept within a few decades of the scale: exp() never overflows in a wild step."""
+    low: list[float] = []
     for kind in cascade.sections:
-        n = 3 if kind == "second_order" else 2
-        low += [-np.inf] * n
-        high += [np.inf] * n
-        if kind == "first_order":
-            low += [-12.0]
-            high += [12.0]
-        elif kind == "second_order":
-            low += [-12.0, -20.0]
-            high += [12.0, 20.0]
-    return np.array(low), np.array(high)
+        low += {
+            "integrator": [-np.inf] * 2,
+            "first_order": [-np.inf] * 2 + [-12.0],
+            "second_order": [-np.inf] * 3 + [-12.0, -20.0],
+            "notch": [-12.0, -12.0, -20.0],
+        }[kind]
+    return np.array(low), -np.array(low)

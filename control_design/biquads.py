@@ -2,7 +2,7 @@
 
 With p = (2/dt)(z - 1)/(z + 1)/scale (on the circle p = j (2/dt) tan(omega dt/2)/scale) the controller is
 K = prod (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b) times, for odd orders, (n1 p + n0)/(p + e^a), times (n1 p + n0)/p for an
-integrator. Every parameter vector is a stable controller (apart from the wanted integrator), whatever the optimiser tries.
+integrator, times notches (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b). Every parameter vector is a stable controller (apart from the wanted integrator), whatever the optimiser tries.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 from control_design.ellipses import Complex, Real
 
-SectionKind = Literal["integrator", "first_order", "second_order"]
-_NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3}
-_DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2}
+SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
+_NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}
+_DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2, "notch": 2}
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,9 @@ class Cascade:
     dt_s: float
     scale_rad_s: float
 
-    @classmethod
-    def of_order(cls, order: int, *, integrator: bool, dt_s: float, scale_rad_s: float) -> Cascade:
-        """Integrator first (if asked for), a real section where the rest is odd, then biquads."""
-        rest = order - int(integrator)
-        sections: list[SectionKind] = ["integrator"] if integrator else []
-        sections += ["first_order"] * (rest % 2) + ["second_order"] * (rest // 2)
-        return cls(tuple(sections), dt_s, scale_rad_s)
-
     @property
     def order(self) -> int:
-        return sum(2 if kind == "second_order" else 1 for kind in self.sections)
+        return sum(2 if kind in ("second_order", "notch") else 1 for kind in self.sections)
 
     @property
     def parameters(self) -> int:
@@ -57,6 +49,8 @@ class Cascade:
             numerator = values[at : at + n_num]
             logs = values[at + n_num : at + n_num + n_den]
             tail = np.zeros(1) if kind == "integrator" else np.exp(logs)
+            if kind == "notch":  # parameters: log of the numerator's damping term, then the log denominator
+                numerator = np.array([1.0, np.exp(values[at]), tail[1]])
             pairs.append((numerator, np.concatenate([[1.0], tail])))
             at += n_num + n_den
         return pairs

@@ -1,0 +1,53 @@
+"""From an uncertain frequency response to a certified controller."""
+
+from control_design.certificate import Certificate, PlantVerdict, SpecificationItem, certify
+from control_design.closed_loop import (
+    ClosedLoopTrajectory,
+    LinearMachine,
+    SampledMachine,
+    StepMetrics,
+    simulate,
+    step_metrics,
+)
+from control_design.controller import Controller, ControllerStepper
+from control_design.ellipses import Ellipses
+from control_design.margins import Margins
+from control_design.plant_set import Channel, Mode, UncertainPlant
+from control_design.specification import RationalWeight, Specification, SpecificationError
+from control_design.synthesis import (
+    BlockingPoint,
+    Outcome,
+    SynthesisError,
+    SynthesisOptions,
+    SynthesisResult,
+    synthesise,
+)
+
+__all__ = [
+    "BlockingPoint",
+    "Certificate",
+    "Channel",
+    "ClosedLoopTrajectory",
+    "Controller",
+    "ControllerStepper",
+    "Ellipses",
+    "LinearMachine",
+    "Margins",
+    "Mode",
+    "Outcome",
+    "PlantVerdict",
+    "RationalWeight",
+    "SampledMachine",
+    "Specification",
+    "SpecificationError",
+    "SpecificationItem",
+    "StepMetrics",
+    "SynthesisError",
+    "SynthesisOptions",
+    "SynthesisResult",
+    "UncertainPlant",
+    "certify",
+    "simulate",
+    "step_metrics",
+    "synthesise",
+]

@@ -1,0 +1,336 @@
+"""The certificate: what was checked about a controller, independently of the optimiser that made it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from control_design.controller import Controller
+from control_design.ellipses import Complex, Real
+from control_design.frequency_grid import frequency_grid, plant_grid
+from control_design.margins import Margins, ellipse_margins, nominal_margins
+from control_design.plant_set import Mode, UncertainPlant, modes_of
+from control_design.specification import Specification
+from control_design.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
+from control_design.worst_case import WorstCase, worst_case
+
+
+@dataclass(frozen=True)
+class SpecificationItem:
+    """One requirement on one plant: met or not, with the number that decides it and where."""
+
+    requirement: str
+    plant: str
+    required: float
+    achieved: float
+    unit: str
+    met: bool
+    omega_rad_s: float | None = None
+
+    def sentence(self) -> str:
+        """One line for a report."""
+        where = "" if self.omega_rad_s is None else f" at {self.omega_rad_s:.4g} rad/s"
+        verdict = "met" if self.met else "NOT met"
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.plant}: {self.requirement}: {self.achieved:.4g} against {self.required:.4g}{unit}{where}: {verdict}"
+
+
+@dataclass(frozen=True)
+class PlantVerdict:
+    """Everything checked on one plant.
+
+    closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted value over the ellipses (<= 1 met,
+    0 = not asked), frequency of the largest. bandwidth_rad_s: up to here every member has |S| below -3 dB. own_grid_rad_s: range of a
+    user's own frequency grid, None if the uncertainty is known everywhere.
+    """
+
+    plant: str
+    stable: bool
+    pole_radius: float
+    closed_loop_modes: tuple[Mode, ...]
+    nyquist: NyquistCount
+    nominal_margins: Margins
+    worst_margins: Margins
+    worst_margin_omega_rad_s: float
+    worst_weighted: float
+    worst_weighted_kind: str
+    worst_weighted_omega_rad_s: float
+    worst_peak_sensitivity: float
+    bandwidth_rad_s: float
+    frequencies: int
+    own_grid_rad_s: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Verdict on a controller for a set of uncertain plants.
+
+    certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches -1, and every item of
+    the specification is met, all on the grids named in `checked`. gamma: largest weighted worst case (<= 1 met).
+    """
+
+    certified: bool
+    gamma: float
+    plants: tuple[PlantVerdict, ...]
+    items: tuple[SpecificationItem, ...]
+    checked: tuple[str, ...]
+    not_checked: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; infinities become None inside margins and the string "inf" elsewhere."""
+        data = asdict(self)
+        for verdict, plain in zip(self.plants, data["plants"], strict=True):
+            plain["nominal_margins"] = verdict.nominal_margins.to_dict()
+            plain["worst_margins"] = verdict.worst_margins.to_dict()
+        cleaned: dict[str, Any] = _plain(data)
+        return cleaned
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Certificate:
+        """Inverse of `to_dict`."""
+        plants = []
+        for plain in data["plants"]:
+            values = {key: _number(value) for key, value in plain.items()}
+            values["closed_loop_modes"] = tuple(Mode(**mode) for mode in plain["closed_loop_modes"])
+            values["nyquist"] = NyquistCount(**plain["nyquist"])
+            values["nominal_margins"] = Margins.from_dict(plain["nominal_margins"])
+            values["worst_margins"] = Margins.from_dict(plain["worst_margins"])
+            own = plain["own_grid_rad_s"]
+            values["own_grid_rad_s"] = None if own is None else tuple(own)
+            plants.append(PlantVerdict(**values))
+        items = [
+            SpecificationItem(**{key: _number(value) for key, value in item.items()})
+            for item in data["items"]
+        ]
+        return cls(
+            certified=bool(data["certified"]),
+            gamma=_number(data["gamma"]),
+            plants=tuple(plants),
+            items=tuple(items),
+            checked=tuple(data["checked"]),
+            not_checked=tuple(data["not_checked"]),
+        )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return "inf" if value > 0 else "-inf" if value < 0 else "nan"
+    return value
+
+
+def _number(value: Any) -> Any:
+    return float(value) if value in ("inf", "-inf", "nan") else value
+
+
+def certify(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    *,
+    omega_min_rad_s: float = 1e-4,
+    n_dense: int = 6000,
+) -> Certificate:
+    """Check a controller from any source against plants and specification.
+
+    The grid is built here from the poles of plants, controller and closed loop and refined where the checks are worst; the optimiser's grid plays no
+    part.
+
+    Raises
+    ------
+    ValueError
+        If the plants are none, sampling times or computational delays do not match, or the loop is algebraic.
+    """
+    if not plants:
+        raise ValueError("certify needs at least one plant")
+    if controller.computational_delay_samples != specification.computational_delay_samples:
+        raise ValueError(
+            f"the controller has {controller.computational_delay_samples} samples of computational delay, "
+            f"the specification {specification.computational_delay_samples}"
+        )
+    verdicts: list[PlantVerdict] = []
+    items: list[SpecificationItem] = []
+    for plant in plants:
+        verdict, found = _check_plant(controller, plant, specification, omega_min_rad_s, n_dense)
+        verdicts.append(verdict)
+        items += found
+    if specification.integrator:
+        items.append(_integrator_item(controller, plants[0]))
+    robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
+    return Certificate(
+        certified=bool(robust and all(item.met for item in items)),
+        gamma=max(v.worst_weighted for v in verdicts),
+        plants=tuple(verdicts),
+        items=tuple(items),
+        checked=_checked_words(verdicts, specification),
+        not_checked=_not_checked_words(plants, verdicts),
+    )
+
+
+def _check_plant(
+    controller: Controller,
+    plant: UncertainPlant,
+    specification: Specification,
+    omega_min_rad_s: float,
+    n_dense: int,
+) -> tuple[PlantVerdict, list[SpecificationItem]]:
+    poles = closed_loop_poles(controller, plant)
+    radius = float(np.max(np.abs(poles))) if poles.size else 0.0
+    loop_modes = modes_of(poles, plant.dt_s, zeta_below=1.0)
+    own_modes = modes_of(np.linalg.eigvals(controller.A), plant.dt_s) if controller.order else ()
+    near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
+    light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
+    wanted = frequency_grid(
+        plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=n_dense, n_mode=120 * len(light)
+    )
+    grid = plant_grid(plant, wanted) if plant.own_grid is None else _with_own_grid(plant, wanted)
+
+    def response(omega: Real) -> Complex:
+        return controller.response(omega, with_delay=False)
+
+    worst = worst_case(response, plant, specification, grid)
+    refinable = plant.own_grid is None
+
+    def loop_gain(omega: Real) -> Complex:
+        return controller.response(omega) * plant.at(omega).centre
+
+    integrators, unstable = loop_integrators(controller, plant)
+    if refinable:
+        count = nyquist_count(loop_gain, worst.omega_rad_s, integrators=integrators, unstable_poles=unstable)
+        nominal = nominal_margins(loop_gain, worst.omega_rad_s)
+    else:
+        count = nyquist_count(
+            loop_gain, grid, integrators=integrators, unstable_poles=unstable, refinable=False
+        )
+        nominal = nominal_margins(loop_gain, grid, refinable=False)
+    distance = worst.values["distance"]
+    margins = ellipse_margins(worst.loop_factor, worst.ellipses, distance).worse(nominal)
+    at = int(np.argmin(distance))
+    kinds = [(*worst.peak(kind), kind) for kind in ("tracking", "modulus", "effort", "mode damping")]
+    weighted, where, kind = max(kinds, key=lambda entry: entry[0])
+    stable = bool(radius < 1.0)
+    below = np.flatnonzero(distance < np.sqrt(2.0))
+    bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
+    verdict = PlantVerdict(
+        plant=plant.name,
+        stable=stable,
+        pole_radius=radius,
+        closed_loop_modes=tuple(m for m in loop_modes if m.zeta < 1.0),
+        nyquist=count,
+        nominal_margins=nominal,
+        worst_margins=margins,
+        worst_margin_omega_rad_s=float(worst.omega_rad_s[at]),
+        worst_weighted=weighted if margins.modulus > 0 else float("inf"),
+        worst_weighted_kind=kind,
+        worst_weighted_omega_rad_s=where,
+        worst_peak_sensitivity=1.0 / margins.modulus if margins.modulus > 0 else float("inf"),
+        bandwidth_rad_s=bandwidth,
+        frequencies=int(worst.omega_rad_s.size),
+        own_grid_rad_s=None
+        if plant.own_grid is None
+        else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
+    )
+    return verdict, _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]))
+
+
+def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
+    """Every frequency of the user's grid, and `wanted` outside its range."""
+    own = plant.own_grid
+    assert own is not None
+    outside = wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
+    inside = own[own > 0]
+    return np.asarray(np.unique(np.concatenate([inside, outside])), dtype=np.float64)
+
+
+def _items(
+    plant: UncertainPlant, specification: Specification, worst: WorstCase, margins: Margins, omega: float
+) -> list[SpecificationItem]:
+    items = [
+        SpecificationItem(
+            "modulus margin, worst case",
+            plant.name,
+            specification.modulus_margin,
+            margins.modulus,
+            "",
+            bool(margins.modulus >= specification.modulus_margin),
+            omega,
+        )
+    ]
+    asked = {
+        "tracking": specification.bandwidth_rad_s is not None or specification.sensitivity_weight is not None,
+        "effort": specification.effort_limit is not None or specification.effort_weight is not None,
+        "mode damping": specification.mode_peak_ratio is not None,
+    }
+    words = {
+        "tracking": "tracking, largest |W1 S|",
+        "effort": "effort, largest |W3 K S|",
+        "mode damping": "damping of the mode, largest |W4 Gp S|",
+    }
+    for kind, wanted in asked.items():
+        if wanted:
+            value, place = worst.peak(kind)
+            items.append(
+                SpecificationItem(words[kind], plant.name, 1.0, value, "", bool(value <= 1.0), place)
+            )
+    if specification.delay_margin_s is not None:
+        items.append(
+            SpecificationItem(
+                "delay margin, worst case",
+                plant.name,
+                specification.delay_margin_s,
+                margins.delay_s,
+                "s",
+                bool(margins.delay_s >= specification.delay_margin_s),
+            )
+        )
+    return items
+
+
+def _integrator_item(controller: Controller, plant: UncertainPlant) -> SpecificationItem:
+    own = loop_integrators(controller, plant)[0] - plant.n_integrators
+    return SpecificationItem(
+        "integrators in the controller", "controller", 1.0, float(own), "", bool(own >= 1)
+    )
+
+
+def _checked_words(verdicts: Sequence[PlantVerdict], specification: Specification) -> tuple[str, ...]:
+    words = [
+        "nominal closed-loop poles of the full state space (plant, controller, computational delay)",
+        "Nyquist count of the uncertainty centre against the count a stable loop needs",
+        "distance of every ellipse from -1 and every weighted worst case, exact on the ellipse, on a dense grid of "
+        + ", ".join(f"{v.frequencies} frequencies ({v.plant})" for v in verdicts)
+        + ", refined around the maxima",
+        "gain, phase, delay and modulus margins, nominal and worst case over the ellipses on that grid",
+    ]
+    if specification.mode_peak_ratio is not None:
+        words.append("damping of the flexible mode as the peak of |Gp S| in its band")
+    return tuple(words)
+
+
+def _not_checked_words(plants: Sequence[UncertainPlant], verdicts: Sequence[PlantVerdict]) -> tuple[str, ...]:
+    words = [
+        "between grid points: not proved, a dense grid is a grid",
+        "joint level: the ellipses hold at their level at each frequency, not at all frequencies together",
+        "nonlinear effects (friction, saturation, quantisation, backlash) and anything outside the ellipses",
+        "that the true plant has as many unstable poles and integrators as the nominal",
+    ]
+    for plant, verdict in zip(plants, verdicts, strict=True):
+        if verdict.own_grid_rad_s is not None:
+            low, high = verdict.own_grid_rad_s
+            words.append(
+                f"{plant.name}: the uncertainty is known on its own grid only; between its points nothing is known, and below "
+                f"{low:.4g} and above {high:.4g} rad/s the nominal alone was used, without uncertainty"
+            )
+        elif plant.uncertainty is None:
+            words.append(f"{plant.name}: no uncertainty was given; only the nominal plant was checked")
+        if plant.performance is not None:
+            words.append(
+                f"{plant.name}: correlation between measured and performance channel is not used (any pair of members allowed)"
+            )
+    return tuple(words)

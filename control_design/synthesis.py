@@ -1,0 +1,569 @@
+"""Structured robust synthesis: several starts of the angle programme, then exchange of violated frequencies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from control_design.angle_program import AngleProgram, NlpPoint, Rows
+from control_design.biquads import Cascade
+from control_design.controller import Controller
+from control_design.ellipses import Complex, Real
+from control_design.frequency_grid import frequency_grid, local_maxima, plant_grid
+from control_design.plant_set import Mode, UncertainPlant
+from control_design.specification import Specification, performance_modes
+from control_design.stability import closed_loop_poles
+from control_design.worst_case import KINDS, PlantData, worst_of
+
+Progress = Callable[[float, str], None]
+
+_DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
+_STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
+
+
+class Outcome(Enum):
+    MET_ON_GRID = "every requirement is met at every frequency of the dense grid for every plant"
+    NOT_MET = "the solver converged to a stable loop, but some requirement is exceeded"
+    NOT_CONVERGED = "no start led to a stable loop; the controller means nothing"
+
+
+class SynthesisError(Exception):
+    """The synthesis did not meet the specification; `result` holds the best point found."""
+
+    def __init__(self, message: str, result: SynthesisResult) -> None:
+        super().__init__(message)
+        self.result = result
+
+
+class SynthesisOptions(BaseModel):
+    """How hard to search; the defaults solve an order-5 design in a few seconds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    starts: int = Field(default=8, ge=1, le=100, description="low-gain starts")
+    agreeing_starts: int = Field(
+        default=3, ge=1, description="stop early when so many starts reach the best value within 0.1 %"
+    )
+    exchange_rounds: int = Field(default=4, ge=0, le=20, description="rounds of adding violated frequencies")
+    exchange_tolerance: float = Field(
+        default=5e-4,
+        gt=0,
+        lt=0.1,
+        description="accepted relative excess of the dense check over the programme",
+    )
+    grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
+    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
+    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
+    iterations: int = Field(default=250, ge=10, le=5000, description="IPOPT iterations per start and round")
+    scale_rad_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="frequency scale of controller parameters and starts; none = from the specification",
+    )
+
+
+@dataclass(frozen=True)
+class BlockingPoint:
+    """A frequency at which a weight keeps gamma from getting smaller."""
+
+    plant: str
+    weight: str
+    omega_rad_s: float
+    value: float
+
+
+@dataclass(frozen=True)
+class StartReport:
+    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid (None = unstable)."""
+
+    start: int
+    status: str
+    iterations: int
+    gamma_grid: float
+    gamma_dense: float | None
+
+
+@dataclass(frozen=True)
+class SynthesisResult:
+    """Best controller found and how good it is.
+
+    gamma: largest weighted worst case over plants, ellipses and the dense grid (<= 1: met; 1.2: requirements exceeded by 20 %). blocking: where
+    and which weight, worst first. gamma_history: dense gamma of the best point after the starts and each exchange round. grid_points: final size of
+    the programme's grids. outcome says what gamma means; certify with `certificate.certify` before use.
+    """
+
+    outcome: Outcome
+    controller: Controller
+    gamma: float
+    blocking: tuple[BlockingPoint, ...]
+    starts: tuple[StartReport, ...]
+    gamma_history: tuple[float, ...]
+    grid_points: int
+
+    def explain(self) -> str:
+        """One line: met, or how far and which frequency and requirement block it."""
+        if self.outcome is Outcome.NOT_CONVERGED:
+            return self.outcome.value
+        first = self.blocking[0] if self.blocking else None
+        where = (
+            ""
+            if first is None
+            else f"; {first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} rad/s blocks"
+        )
+        if self.outcome is Outcome.MET_ON_GRID:
+            return f"{self.outcome.value} (gamma {self.gamma:.4g}{where} more)"
+        return (
+            f"{self.outcome.value} (gamma {self.gamma:.4g}, {100 * (self.gamma - 1):.3g} % too much{where})"
+        )
+
+    def controller_or_raise(self) -> Controller:
+        """The controller if the specification is met on the grid.
+
+        Raises
+        ------
+        SynthesisError
+            Otherwise, with this result attached.
+        """
+        if self.outcome is not Outcome.MET_ON_GRID:
+            raise SynthesisError(self.explain(), self)
+        return self.controller
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        data = asdict(self) | {"outcome": self.outcome.name, "controller": self.controller.to_dict()}
+        data["gamma"] = self.gamma if np.isfinite(self.gamma) else None
+        data["gamma_history"] = [g if np.isfinite(g) else None for g in self.gamma_history]
+        data["blocking"] = [
+            asdict(b) | {"value": b.value if np.isfinite(b.value) else None} for b in self.blocking
+        ]
+        data["starts"] = [asdict(start) for start in self.starts]
+        return data
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> SynthesisResult:
+        """Inverse of `to_dict`."""
+
+        def number(value: float | None) -> float:
+            return float("inf") if value is None else value
+
+        return cls(
+            outcome=Outcome[data["outcome"]],
+            controller=Controller.from_dict(data["controller"]),
+            gamma=number(data["gamma"]),
+            blocking=tuple(BlockingPoint(**(b | {"value": number(b["value"])})) for b in data["blocking"]),
+            starts=tuple(StartReport(**start) for start in data["starts"]),
+            gamma_history=tuple(number(g) for g in data["gamma_history"]),
+            grid_points=int(data["grid_points"]),
+        )
+
+
+def synthesise(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: SynthesisOptions | None = None,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> SynthesisResult:
+    """Design one controller for all plants: smallest gamma over every ellipse.
+
+    Parameters
+    ----------
+    plants : at least one; several loads, operating points or identified models at once.
+    rng : the starts are drawn from it; same generator state, same result.
+    progress : called with (fraction, message).
+
+    Raises
+    ------
+    SpecificationError
+        If specification and plants contradict each other (before optimising).
+
+    Notes
+    -----
+    Design: W1 and W3 (and W4 with an independent performance channel) in angle form, W4 of the measured output itself in S-lemma
+    form, from the best starts of the programme without W4. After the starts the dense check adds its violated local maxima and the
+    programme is solved again from the best point; a point is accepted only if all nominal loops are stable and gamma is not worse.
+    """
+    options = options or SynthesisOptions()
+    specification.check_against(plants)
+    return _Search(
+        tuple(plants), specification, options, rng, progress or (lambda fraction, message: None)
+    ).run()
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    point: NlpPoint
+    gamma: float
+
+
+class _Search:
+    """State of one synthesis: grids, dense data, best candidate."""
+
+    def __init__(
+        self,
+        plants: tuple[UncertainPlant, ...],
+        specification: Specification,
+        options: SynthesisOptions,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> None:
+        self.plants, self.spec, self.options, self.rng, self.progress = (
+            plants,
+            specification,
+            options,
+            rng,
+            progress,
+        )
+        self.scale = options.scale_rad_s or _frequency_scale(plants, specification)
+        self.cascade = Cascade(specification.sections(), plants[0].dt_s, self.scale)
+        self.grids: list[Real] = []
+        self.dense: list[PlantData] = []
+        for plant in plants:
+            modes = _grid_modes(plant, specification)
+            extra = () if (band := specification.mode_band(plant)) is None else band
+            lean = frequency_grid(
+                plant.nyquist_rad_s,
+                modes,
+                omega_min_rad_s=options.omega_min_rad_s,
+                n_log=options.grid_points,
+                n_mode=options.mode_points,
+                extra=extra,
+            )
+            dense = frequency_grid(
+                plant.nyquist_rad_s,
+                modes,
+                omega_min_rad_s=options.omega_min_rad_s,
+                n_log=int(0.7 * options.dense_points),
+                n_mode=int(0.3 * options.dense_points),
+                extra=lean,
+            )
+            if plant.own_grid is not None:
+                own = plant.own_grid
+                outside = dense[(dense < own[0] * (1 - 1e-9)) | (dense > own[-1] * (1 + 1e-9))]
+                dense = np.unique(np.concatenate([own[own > 0], outside]))
+            self.grids.append(plant_grid(plant, lean))
+            self.dense.append(PlantData.build(plant, specification, dense))
+
+    def run(self) -> SynthesisResult:
+        first = self._program(with_damping=False)
+        reports: list[StartReport] = []
+        found: list[_Candidate] = []
+        needs_second = self._s_lemma_needed()
+        share = 0.5 if needs_second else 0.7
+        for number in range(self.options.starts):
+            self.progress(
+                share * number / self.options.starts, f"start {number + 1} of {self.options.starts}"
+            )
+            point = first.solve(self._start(first.plants))
+            gamma = self.gamma(point.parameters, without_damping=needs_second)
+            reports.append(
+                StartReport(
+                    number + 1,
+                    point.status,
+                    point.iterations,
+                    1.0 / point.g,
+                    gamma if np.isfinite(gamma) else None,
+                )
+            )
+            if np.isfinite(gamma):
+                found.append(_Candidate(point, gamma))
+            best = min((c.gamma for c in found), default=np.inf)
+            if sum(c.gamma <= best * 1.001 for c in found) >= self.options.agreeing_starts:
+                break
+        found.sort(key=lambda c: c.gamma)
+        if needs_second and found:
+            found = self._with_damping(_distinct(found, 3), share)
+        if not found:
+            return self._nothing_stable(tuple(reports))
+        return self._exchange(found[0], tuple(reports))
+
+    def _with_damping(self, candidates: Sequence[_Candidate], share: float) -> list[_Candidate]:
+        """Add the S-lemma rows, starting from solutions without them (cold starts rarely converge with ellipses)."""
+        program = self._program(with_damping=True)
+        found = []
+        for number, candidate in enumerate(candidates):
+            self.progress(
+                share + 0.2 * number / len(candidates), f"damping of the mode {number + 1}/{len(candidates)}"
+            )
+            gamma = self.gamma(candidate.point.parameters)
+            start = self._at(candidate.point.parameters, program.plants, gamma)
+            point = program.solve(start)
+            reached = self.gamma(point.parameters)
+            found.append(_Candidate(point, reached) if reached < gamma else _Candidate(start, gamma))
+        found = [c for c in found if np.isfinite(c.gamma)]
+        return sorted(found, key=lambda c: c.gamma)
+
+    def _exchange(self, best: _Candidate, reports: tuple[StartReport, ...]) -> SynthesisResult:
+        history = [best.gamma]
+        current = best
+        for number in range(self.options.exchange_rounds):
+            done = 0.7 + 0.3 * number / max(1, self.options.exchange_rounds)
+            self.progress(done, f"exchange {number + 1}: gamma {best.gamma:.4g}")
+            added = self._add_violated(current)
+            if added == 0:
+                break
+            program = self._program(with_damping=True)
+            start = self._at(best.point.parameters, program.plants, best.gamma)
+            point = program.solve(start)
+            gamma = self.gamma(point.parameters)
+            current = _Candidate(point, gamma)
+            if gamma < best.gamma:
+                best = current
+            history.append(best.gamma)
+            if not np.isfinite(gamma):
+                break
+        self.progress(1.0, f"gamma {best.gamma:.4g}")
+        outcome = Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET
+        return SynthesisResult(
+            outcome=outcome,
+            controller=self._controller(best.point.parameters),
+            gamma=best.gamma,
+            blocking=self._blocking(best),
+            starts=reports,
+            gamma_history=tuple(history),
+            grid_points=sum(grid.size for grid in self.grids),
+        )
+
+    def _nothing_stable(self, reports: tuple[StartReport, ...]) -> SynthesisResult:
+        zero = np.zeros((1, 1))
+        nothing = Controller(
+            np.zeros((0, 0)),
+            np.zeros((0, 1)),
+            np.zeros((1, 0)),
+            zero,
+            self.cascade.dt_s,
+            computational_delay_samples=self.spec.computational_delay_samples,
+            name="none: no stable design found",
+        )
+        return SynthesisResult(
+            Outcome.NOT_CONVERGED,
+            nothing,
+            float("inf"),
+            (),
+            reports,
+            (),
+            sum(grid.size for grid in self.grids),
+        )
+
+    def _controller(self, parameters: Real) -> Controller:
+        a, b, c, d = self.cascade.state_space(parameters)
+        return Controller(
+            a,
+            b,
+            c,
+            d,
+            self.cascade.dt_s,
+            computational_delay_samples=self.spec.computational_delay_samples,
+            input_limit=self.spec.input_limit,
+            rate_limit=self.spec.rate_limit,
+        )
+
+    def gamma(self, parameters: Real, *, without_damping: bool = False) -> float:
+        """Weighted worst case on the dense grids; inf if some nominal loop is unstable or an ellipse reaches -1."""
+        try:
+            controller = self._controller(parameters)
+        except ValueError:
+            return float("inf")  # no anti-windup gain: numerically degenerate
+        if any(
+            not np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1.0
+            for plant in self.plants
+        ):
+            return float("inf")
+        worst = 0.0
+        for data in self.dense:
+            values = data.weighted(self.cascade.response(parameters, data.ellipses.omega_rad_s))
+            kinds = KINDS[:3] if without_damping else KINDS
+            worst = max(worst, float(np.max([np.max(values[kind]) for kind in kinds])))
+        return worst
+
+    def _blocking(self, best: _Candidate) -> tuple[BlockingPoint, ...]:
+        points = []
+        for data in self.dense:
+            values = data.weighted(self.cascade.response(best.point.parameters, data.ellipses.omega_rad_s))
+            for kind in KINDS:
+                for index in local_maxima(values[kind])[:10]:
+                    value = float(values[kind][index])
+                    if value >= _STILL_BLOCKING * best.gamma:
+                        points.append(
+                            BlockingPoint(
+                                data.plant.name, kind, float(data.ellipses.omega_rad_s[index]), value
+                            )
+                        )
+        return tuple(sorted(points, key=lambda p: -p.value))
+
+    def _add_violated(self, candidate: _Candidate, most: int = 12) -> int:
+        """Put local maxima of the dense check that exceed the programme's gamma on the grids; how many were new."""
+        limit = (1.0 / candidate.point.g) * (1.0 + self.options.exchange_tolerance)
+        added = 0
+        for position, data in enumerate(self.dense):
+            omega = data.ellipses.omega_rad_s
+            values = data.weighted(self.cascade.response(candidate.point.parameters, omega))
+            worst = worst_of(values)
+            index = [i for i in local_maxima(worst) if worst[i] > limit][:most]
+            new = np.setdiff1d(omega[index], self.grids[position])
+            self.grids[position] = np.union1d(self.grids[position], new)
+            added += new.size
+        return added
+
+    def _s_lemma_needed(self) -> bool:
+        return any(data.gp_max is None and bool(np.any(data.w4 > 0)) for data in self.dense)
+
+    def _program(self, *, with_damping: bool) -> AngleProgram:
+        rows: list[Rows] = []
+        for plant, grid in zip(self.plants, self.grids, strict=True):
+            data = PlantData.build(plant, self.spec, grid)
+            rows.append(self._rows(data, data.delay, with_damping=with_damping))
+            if self.spec.delay_margin_s is not None:
+                late = data.delay * np.exp(-1j * grid * self.spec.delay_margin_s)
+                rows.append(self._delay_copy(data, late))
+        return AngleProgram(self.cascade, rows, max_iterations=self.options.iterations)
+
+    def _rows(self, data: PlantData, delay: Complex, *, with_damping: bool) -> Rows:
+        omega = data.ellipses.omega_rad_s
+        keep_w4 = with_damping or data.gp_max is not None
+        return Rows(
+            ellipses=data.ellipses,
+            delay=delay,
+            w1=np.maximum(data.w1, data.modulus),
+            w3=data.w3,
+            w4=data.w4 if keep_w4 else np.zeros(omega.size),
+            gp_max=data.gp_max,
+            row_scale=self._row_scale(data),
+            start_window=self._start_window(data.plant),
+            reaches_nyquist=True,
+        )
+
+    def _delay_copy(self, data: PlantData, delay: Complex) -> Rows:
+        zero = np.zeros(data.ellipses.omega_rad_s.size)
+        return Rows(
+            ellipses=data.ellipses,
+            delay=delay,
+            w1=zero + _DELAY_COPY_MODULUS,
+            w3=zero,
+            w4=zero,
+            gp_max=None,
+            row_scale=self._row_scale(data),
+            start_window=self._start_window(data.plant),
+            # A fractional delay makes the loop complex at Nyquist: its phase there is not tied to zero.
+            reaches_nyquist=False,
+        )
+
+    def _row_scale(self, data: PlantData) -> Real:
+        """Positive factors that keep rows of one size where 1 + L grows: integrators and steep tracking weights.
+
+        A positive factor on |D_L + N_L| instead of |1 + L| leaves the angles alone; (omega/scale)^i is |D_L| of i integrators.
+        """
+        integrators = data.plant.n_integrators + int(self.spec.integrator)
+        slope = np.minimum(1.0, data.ellipses.omega_rad_s / self.scale) ** integrators
+        return np.minimum(slope, 1.0 / np.maximum(data.w1, 1.0))
+
+    def _start_window(self, plant: UncertainPlant) -> tuple[float, float]:
+        """Range of the first angle: arg(1 + L) of a stable loop starts at -pi (P + i/2), see `stability.nyquist_count`.
+
+        The angle of a supporting normal may differ from arg(1 + L) by up to pi/2; windows are narrower than pi, so that they cannot
+        take the next branch. With integrators there is more room towards lead: at the lowest frequency the loop may have come
+        some way from its limit already.
+        """
+        integrators = plant.n_integrators + int(self.spec.integrator)
+        centre = -np.pi * (plant.unstable_poles + integrators / 2.0)
+        return (centre - 1.4, centre + 1.4) if integrators == 0 else (centre - 0.63, centre + 1.87)
+
+    def _at(self, parameters: Real, rows: Sequence[Rows], gamma: float) -> NlpPoint:
+        """Programme point for given controller parameters: angles along the nearest unwrapped phase of 1 + L."""
+        angles = []
+        for plant in rows:
+            loop = self.cascade.response(parameters, plant.ellipses.omega_rad_s) * plant.delay
+            phase = np.unwrap(np.angle(1.0 + plant.ellipses.centre * loop))
+            middle = 0.5 * (plant.start_window[0] + plant.start_window[1])
+            angles.append(phase - 2 * np.pi * np.round((phase[0] - middle) / (2 * np.pi)))
+        return NlpPoint(np.asarray(parameters), 1.0 / min(max(gamma, 1e-3), 1e3), tuple(angles))
+
+    def _start(self, rows: Sequence[Rows]) -> NlpPoint:
+        """A random low-gain cascade, its gain halved until every nominal loop is stable."""
+        double = max(plant.n_integrators for plant in self.plants) + int(self.spec.integrator) >= 2
+        x: list[float] = []
+        for position, kind in enumerate(self.cascade.sections):
+            corner = 10 ** self.rng.uniform(-0.7, 0.7)
+            damping = self.rng.uniform(0.3, 1.0)
+            jitter = 1.0 + 0.3 * self.rng.standard_normal(3)
+            if kind == "integrator":
+                # PI with its corner low: slow integral action, proportional part first.
+                x += [jitter[0], 0.1 * corner * abs(jitter[1])]
+            elif kind == "first_order":
+                lead = 0.15 if double else 1.0  # two integrators need lead for any stable start
+                x += [
+                    1.0 * jitter[0],
+                    lead * corner * abs(jitter[1]),
+                    np.log(corner * (3.0 if double else 1.0)),
+                ]
+            elif kind == "notch":
+                x += [np.log(2 * damping * corner), np.log(2 * corner), 2 * np.log(corner)]
+            else:
+                lead = 0.15 if double and position == self.cascade.sections.index("second_order") else 1.0
+                numerator = np.array([1.0, 2 * damping * corner, lead * corner**2]) * jitter
+                x += [*numerator, np.log(2 * damping * corner), 2 * np.log(corner)]
+        parameters = np.array(x)
+        lead_size = {"integrator": 2, "first_order": 2, "second_order": 3}[self.cascade.sections[0]]
+        parameters[:lead_size] *= self._low_gain(parameters)
+        for _ in range(12):
+            gamma = self.gamma(parameters, without_damping=True)
+            if np.isfinite(gamma):
+                break
+            parameters[:lead_size] *= 0.5
+        return self._at(parameters, rows, gamma)
+
+    def _low_gain(self, parameters: Real) -> float:
+        """Signed factor that puts the centre's loop gain at a random crossover below the scale."""
+        data = self.dense[0]
+        omega = data.ellipses.omega_rad_s
+        crossover = self.scale * 10 ** self.rng.uniform(-1.5, -0.3)
+        k = self.cascade.response(parameters, omega)
+        index = int(np.argmin(np.abs(omega - crossover)))
+        size = float(np.abs(k[index] * data.ellipses.centre[index]))
+        # Sign: the residue at zero frequency must be positive, arg L(0+) = -i pi/2 (see `_start_window`).
+        order = data.plant.n_integrators + int(self.spec.integrator)
+        low = k[0] * data.ellipses.centre[0] * 1j**order
+        sign = 1.0 if low.real >= 0 else -1.0
+        if self.spec.bandwidth_rad_s is None and self.spec.sensitivity_weight is None and order == 0:
+            sign = 1.0 if self.rng.uniform() < 0.5 else -1.0  # pure damping knows no sign
+        return sign / max(size, 1e-12)
+
+
+def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specification) -> float:
+    """Frequency around which the controller has to act: bandwidth and lowest mode, or a tenth of Nyquist."""
+    candidates = [mode.omega_rad_s for plant in plants for mode in plant.modes[:1]]
+    if specification.bandwidth_rad_s is not None:
+        candidates.append(3.0 * specification.bandwidth_rad_s)
+    if not candidates:
+        return 0.1 * plants[0].nyquist_rad_s
+    return float(np.exp(np.mean(np.log(candidates))))
+
+
+def _grid_modes(plant: UncertainPlant, specification: Specification) -> tuple[Mode, ...]:
+    """Modes that deserve dense points: the plant's, and the performance channel's where damping is asked for."""
+    modes = list(plant.modes)
+    if specification.mode_peak_ratio is not None:
+        modes += [
+            m
+            for m in performance_modes(plant)
+            if all(abs(m.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
+        ]
+    return tuple(modes)
+
+
+def _distinct(candidates: Sequence[_Candidate], most: int) -> list[_Candidate]:
+    """Best candidates that differ in gamma by more than 0.2 %: the same optimum twice teaches nothing."""
+    kept: list[_Candidate] = []
+    for candidate in candidates:
+        if all(abs(candidate.gamma / other.gamma - 1) > 2e-3 for other in kept):
+            kept.append(candidate)
+        if len(kept) == most:
+            break
+    return kept
