@@ -1,7 +1,7 @@
 """The command line: every command parses, makes one library call, prints, and leaves an exit code.
 
-0 ok; 1 internal error; 2 something given is wrong (one line on standard error, nothing half-written); 3 the result
-is not certified or misses its specification (the report is written all the same).
+0 ok; 1 internal error; 2 something given is wrong (one line on standard error, nothing half-written); 3 the
+result is not certified or misses its specification (the report is written all the same).
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def run(
         Path | None, typer.Option(help="TOML file; without it the built-in default arm.", show_default=False)
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Run directory [default: runs/<name>-<date>-<time>]", show_default=False)
+        Path | None,
+        typer.Option(help="Run directory [default: runs/<name>-<date>-<time>]", show_default=False),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Delete an earlier run in --out first.")] = False,
@@ -83,7 +84,8 @@ def run(
 def simulate(
     out: Annotated[Path, typer.Option(help="Directory for one CSV file per record; new or empty.")],
     config: Annotated[
-        Path | None, typer.Option(help="TOML file with [source] kind = 'simulated'; without it the default arm.")
+        Path | None,
+        typer.Option(help="TOML file with [source] kind = 'simulated'; without it the default arm."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -104,12 +106,18 @@ def identify(
     input_name: Annotated[str, typer.Option("--input", help="Input column.")],
     output_name: Annotated[str, typer.Option("--output", help="Output column.")],
     time: Annotated[str | None, typer.Option(help="Time column [s].", show_default=False)] = None,
-    dt_s: Annotated[float | None, typer.Option(help="Sampling period, if no --time.", show_default=False)] = None,
+    dt_s: Annotated[
+        float | None, typer.Option(help="Sampling period, if no --time.", show_default=False)
+    ] = None,
     validation: Annotated[
         list[Path] | None, typer.Option(help="Log kept for validation (repeatable).", show_default=False)
     ] = None,
-    pairs: Annotated[int | None, typer.Option(help="Pole pairs [default: from the data]", show_default=False)] = None,
-    real: Annotated[int | None, typer.Option(help="Real poles [default: from the data]", show_default=False)] = None,
+    pairs: Annotated[
+        int | None, typer.Option(help="Pole pairs [default: from the data]", show_default=False)
+    ] = None,
+    real: Annotated[
+        int | None, typer.Option(help="Real poles [default: from the data]", show_default=False)
+    ] = None,
     integrators: Annotated[int, typer.Option(help="Known poles at z = 1.")] = 0,
     level: Annotated[float, typer.Option(help="Confidence of the ellipses.")] = 0.95,
     out: Annotated[
@@ -142,9 +150,12 @@ def identify(
 
 @app.command()
 def design(
-    source: Annotated[Path, typer.Argument(help="Run directory, or npz written by `flexlink identify --out`.")],
+    source: Annotated[
+        Path, typer.Argument(help="Run directory, or npz written by `flexlink identify --out`.")
+    ],
     specification: Annotated[
-        Path | None, typer.Option(help="TOML with the keys of [specification]; for a run directory its own if left out.")
+        Path | None,
+        typer.Option(help="TOML with the keys of [specification]; for a run directory its own if left out."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Write the controller here (JSON).", show_default=False)

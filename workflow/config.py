@@ -1,4 +1,5 @@
-"""`RunConfig`: everything a run depends on, from one TOML file; every key has a default where one makes sense."""
+"""`RunConfig`: everything a run depends on, from one TOML file; every key has a default where one makes
+sense."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from control_design.specification import Specification
+from control_design.synthesis import SynthesisOptions
 from ident.embedding import EmbeddingOptions
 from ident.options import IdentOptions
 from workflow.excitations import Excitation
@@ -33,7 +35,8 @@ class RunSection(Section):
     seed: int = Field(2006, ge=0, description="root of every random stream of the run")
 
 
-# -- where records come from -----------------------------------------------------------------------------------
+# -- where records come from
+# -----------------------------------------------------------------------------------
 
 
 class SimulatedRecord(Section):
@@ -49,8 +52,12 @@ class SimulatedRecord(Section):
 class SimulatedSource(Section):
     kind: Literal["simulated"]
     rig: RigChoice = Field("paper_link", description="preset 'paper_link', or the path of a rig TOML file")
-    modes: int | None = Field(None, ge=1, le=20, description="flexible modes; default: all below Nyquist, at least 3")
-    effects: tuple[EffectTable, ...] = Field((), description="what the nominal rig does not have, e.g. coulomb_friction")
+    modes: int | None = Field(
+        None, ge=1, le=20, description="flexible modes; default: all below Nyquist, at least 3"
+    )
+    effects: tuple[EffectTable, ...] = Field(
+        (), description="what the nominal rig does not have, e.g. coulomb_friction"
+    )
     encoder_step_rad: float = Field(0.0, ge=0, description="resolution of the hub encoder; 0 is none")
     records: tuple[SimulatedRecord, ...] = Field(min_length=1)
 
@@ -58,7 +65,9 @@ class SimulatedSource(Section):
 class FileRecord(Section):
     """One log file; keys left out are taken from [source]."""
 
-    path: InputPath = Field(description="csv, npz or mat; relative to this file; ${FLEXLINK_DATA} is expanded")
+    path: InputPath = Field(
+        description="csv, npz or mat; relative to this file; ${FLEXLINK_DATA} is expanded"
+    )
     name: Name | None = Field(None, description="default: the file name without its ending")
     role: Role = "estimation"
     condition: str | None = None
@@ -68,7 +77,9 @@ class FileRecord(Section):
     references: tuple[str, ...] | None = None
     start_sample: int = Field(0, ge=0, description="first row used, counted from 0")
     stop_sample: int | None = Field(None, ge=1, description="row after the last one used")
-    mirrored: bool = Field(False, description="take every signal with its sign changed (all of them, so G is the same)")
+    mirrored: bool = Field(
+        False, description="take every signal with its sign changed (all of them, so G is the same)"
+    )
 
 
 class FileSource(Section):
@@ -76,7 +87,9 @@ class FileSource(Section):
     time: str | None = Field(None, description="name of the time column [s]; give this or dt_s")
     dt_s: float | None = Field(None, gt=0, description="sampling period [s]; give this or time")
     references: tuple[str, ...] = Field((), description="reference columns of logs made in closed loop")
-    units: Mapping[str, str] = Field(default_factory=dict, description="unit of a column, for axes: {theta_rad = 'rad'}")
+    units: Mapping[str, str] = Field(
+        default_factory=dict, description="unit of a column, for axes: {theta_rad = 'rad'}"
+    )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -101,14 +114,17 @@ class FileSource(Section):
 Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
 
 
-# -- what is made of them --------------------------------------------------------------------------------------
+# -- what is made of them
+# --------------------------------------------------------------------------------------
 
 
 class UncertaintyOptions(EmbeddingOptions):
     """How the ellipses around an identified response are made (design 4.5)."""
 
-    method: Literal["tangent", "classical"] = Field(
-        "tangent", description="tangent covers; classical is the published recipe, for comparison"
+    method: Literal["tangent", "conditions", "classical"] = Field(
+        "tangent",
+        description="tangent: covers; conditions: tangent per condition plus the scatter between conditions; "
+        "classical: the published recipe, for comparison",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each frequency's ellipse taken alone")
 
@@ -120,8 +136,9 @@ class Channel(Section):
     output: str = Field(min_length=1, description="column or signal name")
     name: Name | None = Field(None, description="default: the output's name")
     purpose: Literal["control", "performance"] | None = Field(
-        None, description="'control' is measured and fed back, 'performance' is what should not swing; "
-        "default: control for the first channel, performance for the others"
+        None,
+        description="'control' is measured and fed back, 'performance' is what should not swing; "
+        "default: control for the first channel, performance for the others",
     )
     identification: IdentOptions = Field(default_factory=IdentOptions)
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
@@ -135,30 +152,34 @@ class ClosedLoopData(Section):
     """How logs made under feedback are used."""
 
     method: Literal["direct", "two_stage"] = Field(
-        "direct", description="direct: the logged input as it is; two_stage: the input explained by the reference"
+        "direct",
+        description="direct: the logged input as it is; two_stage: the input explained by the reference",
     )
-
-
-class SynthesisOptions(Section):
-    starts: int = Field(6, ge=1, le=40, description="low-gain starts; the best result is kept")
-    exchange_rounds: int = Field(5, ge=0, le=20, description="rounds of adding violated frequencies")
 
 
 class ClosedLoopOptions(Section):
     """The check in closed loop."""
 
     machine: Literal["simulated", "identified"] | None = Field(
-        None, description="'simulated': the nonlinear arm of [source]; 'identified': plants drawn from the identified "
-        "uncertain model; default: simulated where the records are"
+        None,
+        description="'simulated': the nonlinear arm of [source]; 'identified': plants drawn from the identified "
+        "uncertain model; default: simulated where the records are",
     )
-    effects: tuple[EffectTable, ...] = Field((), description="further effects on the simulated arm, e.g. tip_payload")
+    effects: tuple[EffectTable, ...] = Field(
+        (), description="further effects on the simulated arm, e.g. tip_payload"
+    )
     reference_step: float | None = Field(
-        None, gt=0, description="in units of the measured output; default: half its spread in the estimation records"
+        None,
+        gt=0,
+        description="in units of the measured output; default: half its spread in the estimation records",
     )
     disturbance: float | None = Field(
-        None, description="step at the plant's input half-way, in its units; default: a tenth of the input's spread"
+        None,
+        description="step at the plant's input half-way, in its units; default: a tenth of the input's spread",
     )
-    quantisation: float = Field(0.0, ge=0, description="step of the converter at the plant's input, in its units")
+    quantisation: float = Field(
+        0.0, ge=0, description="step of the converter at the plant's input, in its units"
+    )
     duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
 
@@ -190,7 +211,9 @@ class RunConfig(Section):
                 raise ValueError(f"two channels are called {label!r}: give them different names")
         control = [label for index, label in enumerate(labels) if self.purpose_of(index) == "control"]
         if len(control) != 1:
-            raise ValueError(f"exactly one channel has purpose 'control' (the one fed back); found {len(control)}")
+            raise ValueError(
+                f"exactly one channel has purpose 'control' (the one fed back); found {len(control)}"
+            )
         if len({channel.input for channel in self.channels}) > 1:
             raise ValueError("all channels must have the same input: the controller drives one actuator")
         names = self.record_names
@@ -204,7 +227,9 @@ class RunConfig(Section):
         if self.closed_loop.effects and self.machine != "simulated":
             raise ValueError("closed_loop.effects act on the simulated arm only")
         if self.closed_loop_data.method == "two_stage" and not self._has_references:
-            raise ValueError("closed_loop_data.method = 'two_stage' needs references in [source] for every record")
+            raise ValueError(
+                "closed_loop_data.method = 'two_stage' needs references in [source] for every record"
+            )
         return self
 
     @property
@@ -225,15 +250,22 @@ class RunConfig(Section):
     @property
     def control_channel(self) -> Channel:
         """The channel that is fed back."""
-        return next(c for index, c in enumerate(self.channels) if self.purpose_of(index) == "control")
+        return self.channels[self.control_index]
 
     def purpose_of(self, index: int) -> Literal["control", "performance"]:
         """Purpose of a channel with the default filled in."""
         return self.channels[index].purpose or ("control" if index == 0 else "performance")
 
     @property
-    def performance_channels(self) -> tuple[Channel, ...]:
-        return tuple(c for index, c in enumerate(self.channels) if self.purpose_of(index) == "performance")
+    def control_index(self) -> int:
+        """Position of the control channel."""
+        return next(index for index in range(len(self.channels)) if self.purpose_of(index) == "control")
+
+    @property
+    def performance_index(self) -> int | None:
+        """Position of the first performance channel, the one the damping requirement is about."""
+        found = [index for index in range(len(self.channels)) if self.purpose_of(index) == "performance"]
+        return found[0] if found else None
 
     @property
     def input_files(self) -> list[Path]:
@@ -254,11 +286,11 @@ class RunConfig(Section):
 
 def record_name(record: SimulatedRecord | FileRecord) -> str:
     """Name of a record with the default filled in."""
-    return record.name if record.name is not None else record.path.stem  # type: ignore[union-attr]
+    return record.name if record.name is not None else record.path.stem
 
 
 def load_config(path: Path) -> tuple[RunConfig, str]:
-    """Configuration and its text. Raises InputError: one line naming file, dotted key and what was expected."""
+    """Configuration and its text. Raises InputError: one line naming file, dotted key and what was
+    expected."""
     text, document = read_toml(path)
     return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
-

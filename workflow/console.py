@@ -26,7 +26,8 @@ class _Remaining(ProgressColumn):
 
 
 class TerminalProgress:
-    """Progress with remaining time on standard error; silent when that is no terminal. Use as a context manager."""
+    """Progress with remaining time on standard error; silent when that is no terminal. Use as a context
+    manager."""
 
     def __init__(self) -> None:
         console = Console(stderr=True)
@@ -102,7 +103,9 @@ def print_summary(summary: RunSummary) -> None:
     for section in summary.sections:
         for index, row in enumerate(section.rows):
             label = escape(section.title) if index == 0 else ""
-            table.add_row(label, escape(row.label), escape(row.value), end_section=index == len(section.rows) - 1)
+            table.add_row(
+                label, escape(row.label), escape(row.value), end_section=index == len(section.rows) - 1
+            )
     console.print(table)
     console.print(f"{escape(summary.verdict)}", highlight=False, soft_wrap=True)
     if summary.report_path:

@@ -29,13 +29,15 @@ def run_from_files(
 ) -> RunSummary:
     """Load a configuration and run it; see `run_pipeline`.
 
-    Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`; without
-    `out` a new directory below runs/ is made. Raises InputError.
+    Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
+    without `out` a new directory below runs/ is made. Raises InputError.
     """
     if resume and replace:
         raise InputError("--resume and --replace contradict each other")
     if (resume or replace) and out is None:
-        raise InputError(f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run")
+        raise InputError(
+            f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
+        )
     if config_path is not None:
         config, text = load_config(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():

@@ -44,7 +44,9 @@ class Multisine(_Table):
     phase_draws: int = Field(1, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
-        lines = excitation.multisine_lines(self.period_samples, dt_s, (self.from_Hz, self.to_Hz), self.grid, rng)
+        lines = excitation.multisine_lines(
+            self.period_samples, dt_s, (self.from_Hz, self.to_Hz), self.grid, rng
+        )
         return excitation.multisine(
             lines, self.period_samples, self.rms_V, rng, periods=self.periods, draws=self.phase_draws
         )

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from workflow import storage
 from workflow.config import RunConfig
@@ -28,9 +26,9 @@ def run_pipeline(
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
-    `config_text` is kept as config.toml (the file as the user wrote it); `resume` takes up a run that is there,
-    `replace` starts it afresh. A result that is not certified is no error: the report is written all the same and
-    `RunSummary.certified` says so.
+    `config_text` is kept as config.toml (the file as the user wrote it); `resume` takes up a run that is
+    there, `replace` starts it afresh. A result that is not certified is no error: the report is written all
+    the same and `RunSummary.certified` says so.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -95,7 +93,11 @@ def _perform(
 ) -> None:
     input_hash = stage_input_hash(stage, config, run, inputs)
     progress.start(stage.name)
-    if not always and run.is_done(stage.name, input_hash) and all(p.is_file() for p in stage.also_writes(run)):
+    if (
+        not always
+        and run.is_done(stage.name, input_hash)
+        and all(p.is_file() for p in stage.also_writes(run))
+    ):
         progress.finish(stage.name, 0.0, taken_up=True)
         return
     started = time.monotonic()
@@ -108,9 +110,7 @@ def _perform(
     progress.finish(stage.name, seconds, taken_up=False)
 
 
-def stage_input_hash(
-    stage: Stage, config: RunConfig, run: RunDirectory, inputs: Mapping[str, str]
-) -> str:
+def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs: Mapping[str, str]) -> str:
     """SHA-256 over all that a stage's result depends on."""
     return hash_of(
         {

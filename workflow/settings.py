@@ -34,8 +34,11 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
         raise InputError(f"{path}: not valid TOML: {error}") from error
 
 
-def check(model: type[ModelT], document: Any, *, source: str, context: Mapping[str, Any] | None = None) -> ModelT:
-    """`document` as a `model`. Raises InputError: one line with `source`, the dotted key and what was expected."""
+def check(
+    model: type[ModelT], document: Any, *, source: str, context: Mapping[str, Any] | None = None
+) -> ModelT:
+    """`document` as a `model`. Raises InputError: one line with `source`, the dotted key and what was
+    expected."""
     try:
         return model.model_validate(document, context=dict(context or {}))
     except ValidationError as error:
@@ -84,7 +87,8 @@ def _short(value: object) -> str:
 def _walk(model: type[BaseModel], location: Iterable[int | str]) -> tuple[str, list[str]]:
     """Dotted key as the user wrote it, and the keys known where it stands.
 
-    pydantic puts the tag of a discriminated union into the location; the user never wrote it, so it is left out.
+    pydantic puts the tag of a discriminated union into the location; the user never wrote it, so it is left
+    out.
     """
     parts: list[str] = []
     here: list[type[BaseModel]] = [model]
@@ -127,7 +131,9 @@ def expand(text: str) -> str:
         name = match.group(1)
         found = os.environ.get(name)
         if not found:
-            raise ValueError(f"environment variable {name} is not set; set it to the folder meant by {text!r}")
+            raise ValueError(
+                f"environment variable {name} is not set; set it to the folder meant by {text!r}"
+            )
         return found
 
     return _VARIABLE.sub(value, text)

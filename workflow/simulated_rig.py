@@ -29,7 +29,9 @@ PRESETS: dict[str, Callable[[], Rig]] = {"paper_link": paper_link}
 def _choose_rig(value: Any, info: ValidationInfo) -> str | Path:
     """A preset's name, or a rig file that is there and can be read."""
     if not isinstance(value, (str, Path)):
-        raise ValueError(f"expected the name of a preset ({', '.join(PRESETS)}) or the path of a rig file, got {value!r}")
+        raise ValueError(
+            f"expected the name of a preset ({', '.join(PRESETS)}) or the path of a rig file, got {value!r}"
+        )
     text = str(value)
     if text in PRESETS:
         return text
@@ -63,7 +65,8 @@ def rig_of(source: SimulatedSource) -> Rig:
 
 
 def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> SimulatedExperiment:
-    """Run one experiment; excitation and sensor noise have streams of their own, keyed by the record's name."""
+    """Run one experiment; excitation and sensor noise have streams of their own, keyed by the record's
+    name."""
     rig = rig_of(source)
     voltage = entry.excitation.signal(rig.sampling.dt_s, stage_rng(seed, "records", entry.name, "excitation"))
     trajectory = simulate(
@@ -97,7 +100,8 @@ def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.N
 
 
 class EncodedArm:
-    """The simulated arm behind its encoder: `plant.SampledArm` with the measured hub angle in encoder steps."""
+    """The simulated arm behind its encoder: `plant.SampledArm` with the measured hub angle in encoder
+    steps."""
 
     output_names = OUTPUT_NAMES
 
@@ -129,5 +133,5 @@ class EncodedArm:
     def measure(self) -> npt.NDArray[np.float64]:
         return quantised(self._arm.measure(), self._step)
 
-    def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
-        self._arm.advance(voltage_V, hub_torque_Nm, tip_force_N)
+    def advance(self, voltage_V: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        self._arm.advance(voltage_V, hub_torque_Nm)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from workflow.config import RunConfig
+from workflow.run_directory import RunDirectory
 
 
 @dataclass(frozen=True)
@@ -25,8 +29,8 @@ class Section:
 class RunSummary:
     """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.
 
-    `certified` is False when the specification is missed or the certificate fails; the verdict then says by how
-    much and at which frequencies.
+    `certified` is False when the specification is missed or the certificate fails; the verdict then says by
+    how much and at which frequencies.
     """
 
     title: str
@@ -50,3 +54,238 @@ class RunSummary:
                 for row in section.rows
             ],
         }
+
+
+def summarise(run: RunDirectory, config: RunConfig) -> RunSummary:
+    """The table of a run whose stages are all there."""
+    documents = {
+        name: run.load_stage(name).document
+        for name in ("records", "identify", "uncertainty", "design", "certify", "closed_loop")
+    }
+    channels = []
+    for found, spread in zip(
+        documents["identify"]["channels"], documents["uncertainty"]["channels"], strict=True
+    ):
+        channels.append(
+            Section(f"channel {found['name']}", (*channel_rows(found), *uncertainty_rows(spread)))
+        )
+    design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
+    unit = _unit(documents["records"], config.control_channel.output)
+    sections = (
+        Section("records", record_rows(documents["records"])),
+        *channels,
+        Section("design", design_rows(design)),
+        Section("certificate", certificate_rows(certify)),
+        Section("closed loop", closed_loop_rows(loop, unit)),
+    )
+    certified = (
+        bool(certify["certified"]) and loop["skipped"] is None and loop["settled_draws"] == loop["draws"]
+    )
+    return RunSummary(
+        title=config.run.title or config.run.name,
+        sections=sections,
+        numbers={
+            "channels": [
+                _numbers_of(f, s)
+                for f, s in zip(
+                    documents["identify"]["channels"], documents["uncertainty"]["channels"], strict=True
+                )
+            ],
+            "design": {"met": design["met"], "reason": design["reason"], **_gamma(design)},
+            "certificate": certify["certificate"],
+            "closed_loop": loop,
+        },
+        certified=certified,
+        verdict=verdict_of(design, certify, loop),
+        report_path=str(run.report_path) if run.report_path.is_file() else None,
+    )
+
+
+def verdict_of(design: Mapping[str, Any], certify: Mapping[str, Any], loop: Mapping[str, Any]) -> str:
+    """One line: certified, or what is missed, by how much and at which frequency."""
+    if not design["met"]:
+        return f"specification not met: {design['reason']}"
+    if not certify["certified"]:
+        return f"not certified: {certify['reason']}"
+    if loop["skipped"] is not None:
+        return f"not checked in closed loop: {loop['skipped']}"
+    if loop["settled_draws"] != loop["draws"]:
+        return (
+            f"closed loop did not settle in {loop['draws'] - loop['settled_draws']} of {loop['draws']} runs"
+        )
+    return f"certified: every item is met, and all {loop['draws']} closed-loop runs settle"
+
+
+def record_rows(document: Mapping[str, Any]) -> tuple[Row, ...]:
+    """How many records of each role."""
+    rows = []
+    for role in ("estimation", "validation", "repeat"):
+        chosen = [record for record in document["records"] if record["role"] == role]
+        if chosen:
+            seconds = sum(record["duration_s"] for record in chosen)
+            samples = sum(record["samples"] for record in chosen)
+            rows.append(Row(role, f"{len(chosen)} records, {samples} samples, {seconds:.4g} s"))
+    return tuple(rows)
+
+
+def channel_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
+    """Structure, modes and fits of one channel."""
+    extras = [f"{found['integrators']} integrator(s)"] if found["integrators"] else []
+    extras += [f"delay {found['input_delay_samples']}"] if found["input_delay_samples"] else []
+    extras += ["direct term"] if found["feedthrough"] else []
+    rows = [Row("order", ", ".join([str(found["order"]), *extras]))]
+    rows += [
+        Row("mode", f"{mode['frequency_Hz']:.4g} Hz, damping {mode['damping']:.3g}")
+        for mode in found["modes"]
+    ]
+    if found["real_poles_per_s"]:
+        rows.append(
+            Row("real poles", ", ".join(f"{rate:.4g}" for rate in found["real_poles_per_s"]) + " 1/s")
+        )
+    for role in ("estimation", "validation", "repeat"):
+        fits = list(found[f"fit_{role}_percent"].values())
+        if fits:
+            rows.append(Row(f"fit, {role}", _range(fits, "%")))
+    return tuple(rows)
+
+
+def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:
+    """Ellipse sizes by band, verdicts of the residual tests, repeat scatter."""
+    rows = [
+        Row(
+            f"{100 * spread['level']:g} % radius",
+            ", ".join(
+                f"{band['median_radius_percent']:.2g} % ({band['from_rad_s']:.3g}-{band['to_rad_s']:.3g} rad/s)"
+                for band in spread["bands"]
+            ),
+        )
+    ]
+    for test in spread["tests"]:
+        if test["data"] == "estimation":
+            rows.append(
+                Row(
+                    f"residuals, {test['name']}", f"{'pass' if test['passed'] else 'FAIL'}: {test['verdict']}"
+                )
+            )
+    if spread["repeat_scatter"]:
+        ratios = [row["ratio"] for row in spread["repeat_scatter"]]
+        rows.append(Row("repeat scatter", f"{_range(ratios, '')} times the predicted (by band)"))
+    return tuple(rows)
+
+
+def design_rows(design: Mapping[str, Any]) -> tuple[Row, ...]:
+    """Outcome and controller."""
+    synthesis = design["synthesis"]
+    rows = [Row("outcome", design["reason"])]
+    if synthesis is not None:
+        rows.insert(
+            0,
+            Row(
+                "controller", f"order {len(synthesis['controller']['A'])}, gamma {_text(synthesis['gamma'])}"
+            ),
+        )
+    return tuple(rows)
+
+
+def certificate_rows(certify: Mapping[str, Any]) -> tuple[Row, ...]:
+    """Margins, nominal and worst over the ellipses, and the items."""
+    certificate = certify["certificate"]
+    if certificate is None:
+        return (Row("none", certify["reason"]),)
+    rows = [Row("verdict", "certified" if certify["certified"] else f"NOT certified: {certify['reason']}")]
+    for verdict in certificate["plants"]:
+        for label, key in (("margins, nominal", "nominal_margins"), ("margins, worst case", "worst_margins")):
+            rows.append(Row(label, margin_text(verdict[key])))
+        rows.append(
+            Row(
+                "bandwidth",
+                f"{_text(verdict['bandwidth_rad_s'])} rad/s (|S| below -3 dB up to here, worst case)",
+            )
+        )
+        for mode in verdict["closed_loop_modes"]:
+            if mode["zeta"] < 0.4:
+                rows.append(
+                    Row(
+                        "closed-loop mode",
+                        f"{mode['omega_rad_s'] / (2 * math.pi):.4g} Hz, damping {mode['zeta']:.3g}",
+                    )
+                )
+    for item in certificate["items"]:
+        where = "" if item["omega_rad_s"] is None else f" at {_text(item['omega_rad_s'])} rad/s"
+        state = "met" if item["met"] else "NOT met"
+        value = f"{_text(item['achieved'])} against {_text(item['required'])} {item['unit']}".rstrip()
+        rows.append(Row(item["requirement"], f"{value}{where}: {state}"))
+    return tuple(rows)
+
+
+def margin_text(margins: Mapping[str, Any]) -> str:
+    """Gain, phase, modulus and delay margin in one line; None means unlimited."""
+    gain = "unlimited" if margins["gain_up"] is None else f"{20 * math.log10(margins['gain_up']):.2f} dB"
+    phase = "unlimited" if margins["phase_rad"] is None else f"{math.degrees(margins['phase_rad']):.1f} deg"
+    delay = "unlimited" if margins["delay_s"] is None else f"{1e3 * margins['delay_s']:.1f} ms"
+    return f"gain {gain}, phase {phase}, modulus {_text(margins['modulus'])}, delay {delay}"
+
+
+def closed_loop_rows(loop: Mapping[str, Any], unit: str) -> tuple[Row, ...]:
+    """Prediction beside what the machine did (median and range over the runs)."""
+    if loop["skipped"] is not None:
+        return (Row("not run", loop["skipped"]),)
+    machine = {"simulated": "simulated nonlinear arm", "identified": "plants drawn from the identified model"}
+    rows = [
+        Row("machine", f"{machine[loop['machine']]}, {loop['draws']} runs, {loop['settled_draws']} settle"),
+        Row("reference step", f"{loop['reference_step']:.4g} {unit}".rstrip()),
+    ]
+    for label, key, suffix in (
+        ("rise time", "rise_time_s", "s"),
+        ("overshoot", "overshoot_percent", "%"),
+        ("settling time", "settling_time_s", "s"),
+        ("steady error", "steady_error", unit),
+        ("peak command", "peak_command", ""),
+        ("disturbance peak", "disturbance_peak", unit),
+    ):
+        achieved = [row[key] for row in loop["achieved"] if row[key] is not None]
+        never = len(loop["achieved"]) - len(achieved)
+        text = _range(achieved, suffix) if achieved else "never"
+        if achieved and never:
+            text += f" ({never} never)"
+        rows.append(Row(label, f"predicted {_text(loop['predicted'][key], suffix)}, achieved {text}"))
+    return tuple(rows)
+
+
+def _numbers_of(found: Mapping[str, Any], spread: Mapping[str, Any]) -> dict[str, Any]:
+    kept = ("name", "order", "modes", "real_poles_per_s", "noise_std", "tangent_optimality")
+    fits = ("fit_estimation_percent", "fit_validation_percent", "fit_repeat_percent")
+    tests = [
+        {key: test[key] for key in ("data", "name", "probability", "passed")} for test in spread["tests"]
+    ]
+    return {
+        **{key: found[key] for key in (*kept, *fits)},
+        "bands": spread["bands"],
+        "tests": tests,
+        "repeat_scatter": spread["repeat_scatter"],
+    }
+
+
+def _gamma(design: Mapping[str, Any]) -> dict[str, Any]:
+    synthesis = design["synthesis"]
+    if synthesis is None:
+        return {"gamma": None, "outcome": "IMPOSSIBLE", "blocking": []}
+    return {key: synthesis[key] for key in ("gamma", "outcome", "blocking")}
+
+
+def _unit(records: Mapping[str, Any], signal: str) -> str:
+    return str(records["records"][0]["units"].get(signal, ""))
+
+
+def _text(value: float | str | None, suffix: str = "") -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, str):
+        return value
+    return f"{value:.4g} {suffix}".rstrip()
+
+
+def _range(values: Sequence[float], suffix: str) -> str:
+    low, high = min(values), max(values)
+    text = f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
+    return f"{text} {suffix}".rstrip()

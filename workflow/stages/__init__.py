@@ -1,51 +1,104 @@
 """The stages of a run, in order, and what each leaves in `stages/`.
 
-Every stage reads typed objects of the stages before it (`workflow.stages.results` loads them), makes one library
-call per channel, and saves typed objects. All files are read with `RunDirectory.load_stage(name)`, which gives a
-`StageData`: `.arrays` (flat names, parts separated by '/') and `.document` (JSON-able). k counts channels in the order
-of the configuration, i records in the order of the configuration. Complex numbers stay complex arrays; in documents
-non-finite floats survive.
+Every stage reads typed results of the stages before it, makes one library call per channel, and saves typed
+results. Read them back with `workflow.stages.results` (load_records, load_identification, load_posterior,
+load_frequency, load_empirical, load_plant, load_synthesis, load_certificate), or raw with
+`RunDirectory.load_stage(name)`, which gives a `StageData`: `.arrays` (flat names, parts separated by '/') and
+`.document` (JSON-able; non-finite floats survive). Below, k counts channels and i records, both from 0 in the
+order of the configuration unless said otherwise.
 
 records.npz
-    document  records: list of {name, role (estimation|validation|repeat), condition|null, remark, kind (prbs ... |
-              file), file|null, samples, dt_s, duration_s, closed_loop: bool, units: {signal: unit}}
-              source: "simulated"|"files"; effects: list of effect tables as in the configuration
-    arrays    record/<i>/...          ident.Record.to_arrays(): the record as measured, all columns
-              noise_free/<i>/output   (T, Y), simulated source only
+    document  source "simulated"|"files"; effects: list of effect tables as in the configuration
+              records: list of {name, role "estimation"|"validation"|"repeat", condition|null, remark, kind
+              (prbs, multisine, log_chirp, doublet, bang_bang, file), file|null, samples, dt_s, duration_s,
+              closed_loop (has a reference), units {signal: unit}}
+    arrays    record/<i>/...               ident.Record, as measured, all columns
+              noise_free/<i>/output        (T, Y) before sensor effects and noise, simulated source only
 
 identify.npz
-    document  channels: list of {name, input, output, purpose, fit_estimation_percent: {record: %},
-              fit_validation_percent: {record: %}, fit_repeat_percent, modes: list of {frequency_Hz, damping},
-              real_poles_rad_s: list (decay rates), order, integrators, feedthrough: bool, input_delay_samples,
-              noise_std, tangent_optimality, warnings: list of str, order_table: list of {...}}
-              two_stage: null or the report of the first stage
-    arrays    channel/<k>/identification/...        ident.Identification.to_arrays()
-              channel/<k>/used/<i>/...              Record.to_arrays() of the SISO records the fit used (after the
-                                                    two-stage step and cut to this channel), estimation records only
+    document  channels: list of {name, input, output, purpose "control"|"performance", n_used, n_fresh,
+              fit_estimation_percent {record: %}, fit_validation_percent {record: %}, fit_repeat_percent
+              {record: %}, order, integrators, input_delay_samples, feedthrough, modes: list of {frequency_Hz,
+              omega_rad_s, damping} ascending, real_poles_per_s: list of decay rates, noise_std (output
+              units), tangent_optimality, warnings: list of str, verdicts: list of str, order_table: list of
+              {n_real, n_pairs, rss, criterion}, search_evaluations, two_stage: null|sentence}
+    arrays    channel/<k>/identification/...   ident.identify.Identification (model, residuals, search trace)
+              channel/<k>/used/<i>/...         ident.Record, SISO: what the fit saw; i counts estimation
+              records channel/<k>/fresh/<i>/...        ident.validation.FreshFit; i counts the other records
+              in order
 
 uncertainty.npz
-    document  channels: list of {name, method, level, report (embedding report), bands: list of {from_rad_s, to_rad_s,
-              median_radius_percent (major semi-axis over |G|)}, verdicts: list of str, whiteness / independence
-              tests as dicts, repeat_scatter: null or dict}
-    arrays    channel/<k>/posterior/...             ident.ResponsePosterior.to_arrays()
-              channel/<k>/frequency/...             ident.FrequencyUncertainty.to_arrays() on the display grid
-              channel/<k>/tests/<i>/...             residual test curves of validation (or estimation) records
-              channel/<k>/empirical/omega_rad_s, response   non-parametric response from the records
+    document  channels: list of {name, method, level, report: EmbeddingReport.to_dict()|null, bands: list of
+              {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis over
+              |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()}, repeat_scatter:
+              null or list of ScatterRow.to_dict()}
+    arrays    channel/<k>/posterior/...        ident.ResponsePosterior
+              channel/<k>/frequency/...        ident.FrequencyUncertainty on the display grid
+              channel/<k>/empirical/...        ident.FrequencyUncertainty straight from the records; may be
+              absent
 
-design.npz
-    document  outcome, gamma, met: bool, blocking: list of {omega_rad_s, item, excess}, controller: Controller JSON
-              document, starts: list of dicts
-    arrays    synthesis/...                         control_design.SynthesisResult.to_arrays()
+design.json
+    document  synthesis: SynthesisResult.to_dict() or null (specification impossible from the start), met
+    (bool), reason
+              (one line: met, or how far and which frequency and requirement block it)
 
 certify.json
-    document  Certificate.to_dict()
+    document  certificate: Certificate.to_dict() or null (nothing to certify), certified (bool), reason (one
+    line)
 
-closed_loop.npz
-    document  machine, reference_step, disturbance, draws, metrics predicted / achieved, verdict lines
-    arrays    time_s (T,), reference (T,), disturbance (T,)
-              predicted/output, predicted/command, predicted/performance
-              achieved/output (draws, T), achieved/command (draws, T), achieved/performance (draws, T)
+closed_loop.npz, or closed_loop.json when there was nothing to run
+    document  skipped: null or the reason, machine "simulated"|"identified"; if not skipped also draws,
+    reference_step,
+              disturbance, quantisation, input_limit|null, settled_draws, predicted: {StepMetrics.to_dict(),
+              disturbance_peak, disturbance_left, settled}, achieved: list of the same, one per draw
+    arrays    time_s, reference, disturbance (T,); the disturbance is added to the plant's input from T // 2
+    on
+              predicted/output, /command, /limited, /performance (1, T): posterior mean of the identified
+              model achieved/...  (R, T): R runs on the machine; performance is absent without a performance
+              channel
 
 report.json
-    document  sha256 of report.html
+    document  report_sha256
 """
+
+from __future__ import annotations
+
+from workflow.stages import certify, closed_loop, design, identify, records, report, uncertainty
+from workflow.stages.base import Stage, StageInput
+
+__all__ = ["STAGES", "Stage", "StageInput"]
+
+STAGES: tuple[Stage, ...] = (
+    Stage("records", (), records.settings, records.make_records, expected_s=1.0),
+    Stage("identify", ("records",), identify.settings, identify.identify_channels, expected_s=5.0),
+    Stage(
+        "uncertainty",
+        ("records", "identify"),
+        uncertainty.settings,
+        uncertainty.find_uncertainty,
+        expected_s=4.0,
+    ),
+    Stage("design", ("identify", "uncertainty"), design.settings, design.design_controller, expected_s=20.0),
+    Stage(
+        "certify",
+        ("identify", "uncertainty", "design"),
+        certify.settings,
+        certify.certify_controller,
+        expected_s=4.0,
+    ),
+    Stage(
+        "closed_loop",
+        ("records", "identify", "uncertainty", "design", "certify"),
+        closed_loop.settings,
+        closed_loop.run_closed_loop,
+        expected_s=5.0,
+    ),
+    Stage(
+        "report",
+        ("records", "identify", "uncertainty", "design", "certify", "closed_loop"),
+        report.settings,
+        report.write_page,
+        expected_s=8.0,
+        also_writes=report.page,
+    ),
+)

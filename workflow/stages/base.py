@@ -34,6 +34,14 @@ class StageInput:
         """The random stream of these names: the same whatever else ran before."""
         return stage_rng(self.config.run.seed, *names)
 
+    def part_of_progress(self, name: str, index: int, count: int, label: str) -> Callable[[float, str], None]:
+        """A library's progress callback for part `index` of `count` equal parts of stage `name`."""
+
+        def report(fraction: float, message: str) -> None:
+            self.progress.update(name, (index + fraction) / count, f"{label}: {message}")
+
+        return report
+
 
 def _nothing(run: RunDirectory) -> tuple[Path, ...]:
     return ()
@@ -43,9 +51,9 @@ def _nothing(run: RunDirectory) -> tuple[Path, ...]:
 class Stage:
     """One step of a run.
 
-    `settings` gives the JSON-able part of the configuration the result depends on, `after` the stages whose files
-    it reads: with the seed and the input files these make the input hash. `expected_s` (two cores, warm) only
-    shapes the progress bar. `also_writes` names files outside `stages/` that belong to the result.
+    `settings` gives the JSON-able part of the configuration the result depends on, `after` the stages whose
+    files it reads: with the seed and the input files these make the input hash. `expected_s` (two cores,
+    warm) only shapes the progress bar. `also_writes` names files outside `stages/` that belong to the result.
     """
 
     name: str

@@ -31,15 +31,15 @@ def make_records(stage: StageInput) -> StageData:
     source = stage.config.source
     arrays: dict[str, AnyArray] = {}
     if isinstance(source, SimulatedSource):
-        records, kinds, files = [], [], []
-        for index, entry in enumerate(source.records):
-            stage.progress.update("records", index / len(source.records), entry.name)
-            with naming(f"source.records[{index}] ({entry.name})"):
-                simulated = simulate_record(source, entry, stage.config.run.seed)
+        records = []
+        for index, experiment in enumerate(source.records):
+            stage.progress.update("records", index / len(source.records), experiment.name)
+            with naming(f"source.records[{index}] ({experiment.name})"):
+                simulated = simulate_record(source, experiment, stage.config.run.seed)
             records.append(simulated.record)
-            kinds.append(entry.excitation.kind)
-            files.append(None)
             arrays[f"noise_free/{index}/output"] = simulated.noise_free_output
+        kinds: list[str] = [experiment.excitation.kind for experiment in source.records]
+        files: list[str | None] = [None] * len(records)
         effects = [dict(effect) for effect in source.effects]
     else:
         records = [read_record(source, entry, stage.config.channels) for entry in source.records]
@@ -71,8 +71,11 @@ def make_records(stage: StageInput) -> StageData:
 
 def units_of(record: Record) -> dict[str, str]:
     """Units of the signals a record knows the units of."""
-    known = {}
-    for names, units in ((record.input_names, record.input_units), (record.output_names, record.output_units)):
+    known: dict[str, str] = {}
+    for names, units in (
+        (record.input_names, record.input_units),
+        (record.output_names, record.output_units),
+    ):
         known |= dict(zip(names, units, strict=False))
     return known
 
@@ -82,7 +85,8 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
     inputs = list(dict.fromkeys(channel.input for channel in channels))
     outputs = list(dict.fromkeys(channel.output for channel in channels))
     references = entry.references if entry.references is not None else source.references
-    # A record's own time base replaces the common one altogether: dt_s here must not meet a time column there.
+    # A record's own time base replaces the common one altogether: dt_s here must not meet a time column
+    # there.
     own = entry.time is not None or entry.dt_s is not None
     record = read_log(
         entry.path,
@@ -104,7 +108,9 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
         dt_s=record.dt_s,
         input_names=record.input_names,
         output_names=record.output_names,
-        reference=None if record.reference is None else (-record.reference if entry.mirrored else record.reference),
+        reference=None
+        if record.reference is None
+        else (-record.reference if entry.mirrored else record.reference),
         reference_names=record.reference_names,
         input_units=tuple(unit.get(name, "") for name in record.input_names),
         output_units=tuple(unit.get(name, "") for name in record.output_names),
@@ -123,7 +129,12 @@ def read_log(
     name: str | None = None,
 ) -> Record:
     """A csv, npz or mat file by its ending; constant inputs are refused. Raises InputError, one line."""
-    readers = {".csv": Record.from_csv, ".txt": Record.from_csv, ".npz": Record.from_npz, ".mat": Record.from_mat}
+    readers = {
+        ".csv": Record.from_csv,
+        ".txt": Record.from_csv,
+        ".npz": Record.from_npz,
+        ".mat": Record.from_mat,
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: unknown kind of file {path.suffix!r}; expected .csv, .npz or .mat")
@@ -149,7 +160,8 @@ def refuse_constant_input(record: Record) -> None:
 def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
     """The records with the first one's sampling time. Raises InputError where they really differ.
 
-    Time stamps are written with a few digits, so that the mean interval of equal clocks differs in its last digits.
+    Time stamps are written with a few digits, so that the mean interval of equal clocks differs in its last
+    digits.
     """
     first = records[0]
     for other in records[1:]:
