@@ -119,6 +119,8 @@ def identify(
         int | None, typer.Option(help="Real poles [default: from the data]", show_default=False)
     ] = None,
     integrators: Annotated[int, typer.Option(help="Known poles at z = 1.")] = 0,
+    delay: Annotated[int, typer.Option(help="Known delay of the input in samples.")] = 0,
+    feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
     level: Annotated[float, typer.Option(help="Confidence of the ellipses.")] = 0.95,
     out: Annotated[
         Path | None, typer.Option(help="Write model and posterior here (npz).", show_default=False)
@@ -126,9 +128,12 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, fit, residual tests."""
+    from ident.options import IdentOptions
     from workflow.console import print_summary
     from workflow.entry import identify_logs
+    from workflow.settings import check
 
+    chosen = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "feedthrough": feedthrough}
     summary = identify_logs(
         log,
         input_name,
@@ -136,9 +141,7 @@ def identify(
         time=time,
         dt_s=dt_s,
         validation=validation or [],
-        n_pairs=pairs,
-        n_real=real,
-        integrators=integrators,
+        options=check(IdentOptions, {**chosen, "input_delay_samples": delay}, source="options"),
         level=level,
         out=out,
     )

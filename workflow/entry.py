@@ -2,15 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from workflow.config import RunConfig, load_config
-from workflow.errors import InputError
+import numpy as np
+
+from control_design.certificate import certify
+from control_design.plant_set import UncertainPlant
+from control_design.specification import Specification
+from control_design.synthesis import Outcome, synthesise
+from ident.embedding import tangent
+from ident.identify import identify
+from ident.model import GobfModel
+from ident.options import IdentOptions
+from ident.record import Record
+from ident.uncertainty import ResponsePosterior
+from ident.validation import fit_on_fresh_data
+from workflow import storage
+from workflow.config import RunConfig, SimulatedSource, load_config
+from workflow.errors import InputError, naming
 from workflow.pipeline import config_of, run_pipeline
 from workflow.progress import Progress
+from workflow.randomness import stage_rng
 from workflow.run_directory import RunDirectory, default_directory
-from workflow.summary import RunSummary
+from workflow.settings import check, read_toml
+from workflow.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
+from workflow.stages.identify import describe_model
+from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
+from workflow.stages.results import ChannelResult, load_plant
+from workflow.stages.uncertainty import band_row, bands_of, display_grid, residual_tests
+from workflow.storage import AnyArray
+from workflow.summary import (
+    RunSummary,
+    Section,
+    certificate_rows,
+    channel_rows,
+    design_rows,
+    uncertainty_rows,
+)
 
 
 def built_in_config() -> tuple[RunConfig, str]:
@@ -51,4 +81,170 @@ def run_from_files(
         resume=resume,
         replace=replace,
         progress=progress,
+    )
+
+
+def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
+    """Simulate the experiments of a configuration; one CSV per record, named after it.
+
+    Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises InputError.
+    """
+    config, _ = load_config(config_path) if config_path is not None else built_in_config()
+    if not isinstance(config.source, SimulatedSource):
+        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
+    out = Path(out)
+    RunDirectory.check_free(out)
+    records = []
+    for index, entry in enumerate(config.source.records):
+        with naming(f"source.records[{index}] ({entry.name})"):
+            records.append(simulate_record(config.source, entry, config.run.seed).record)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write {out}: {error.strerror or error}") from error
+    files = []
+    for number, record in enumerate(records, start=1):
+        path = out / f"{number:02d}_{'_'.join(record.name.split())}.csv"
+        storage.write_text(path, csv_text(record))
+        files.append(path)
+    return files
+
+
+def csv_text(record: Record) -> str:
+    """The record as CSV with one header line; nine digits, far below any sensor's noise."""
+    lines = [",".join(("time_s", INPUT_NAME, *OUTPUT_NAMES))]
+    table = np.column_stack([record.time_s, record.input, record.output])
+    lines += [",".join(f"{value:.9g}" for value in row) for row in table]
+    return "\n".join(lines) + "\n"
+
+
+def identify_logs(
+    logs: Sequence[Path],
+    input_name: str,
+    output_name: str,
+    *,
+    time: str | None = None,
+    dt_s: float | None = None,
+    validation: Sequence[Path] = (),
+    options: IdentOptions | None = None,
+    level: float = 0.95,
+    out: Path | None = None,
+) -> RunSummary:
+    """Identify one channel from log files (tangent uncertainty); with `out` write model and posterior as npz.
+
+    Raises InputError: one line naming file, column or line.
+    """
+    if not 0.5 < level < 1:
+        raise InputError(f"--level must lie between 0.5 and 1, got {level}")
+    if out is not None:
+        storage.check_writable(out)
+    used = [read_log(Path(path), [input_name], [output_name], time=time, dt_s=dt_s) for path in logs]
+    fresh_logs = [
+        read_log(Path(path), [input_name], [output_name], time=time, dt_s=dt_s) for path in validation
+    ]
+    for record in used:
+        refuse_constant_input(record)
+    common = with_common_sampling_time([*used, *fresh_logs])
+    used, fresh_logs = common[: len(used)], common[len(used) :]
+    with naming("identify"):
+        found = identify(used, options)
+        fresh = tuple(fit_on_fresh_data(found.model, record) for record in fresh_logs)
+        posterior = tangent(used, found.model)
+        omega = display_grid(found.model, used)
+        frequency = posterior.at(omega, level)
+    about = {
+        "name": output_name,
+        **describe_model(found),
+        "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),
+        "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
+        "fit_repeat_percent": {},
+    }
+    tests = residual_tests(ChannelResult(output_name, found, tuple(used), fresh))
+    spread = {
+        "level": level,
+        "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
+        "tests": tests,
+        "repeat_scatter": None,
+    }
+    if out is not None:
+        storage.write_npz(out, plant_arrays(found.model, posterior, level))
+    return RunSummary(
+        title=f"{input_name} to {output_name}",
+        sections=(Section("model", channel_rows(about)), Section("uncertainty", uncertainty_rows(spread))),
+        numbers={**about, "uncertainty": spread, "file": None if out is None else str(out)},
+        verdict="; ".join(found.warnings) or "no warnings",
+    )
+
+
+def plant_arrays(model: GobfModel, posterior: ResponsePosterior, level: float) -> dict[str, AnyArray]:
+    """What `flexlink identify --out` writes and `flexlink design` reads."""
+    return {
+        **{f"model/{key}": value for key, value in model.to_arrays().items()},
+        **{f"posterior/{key}": value for key, value in posterior.to_arrays().items()},
+        "level": np.array(level),
+    }
+
+
+def load_plant_file(path: Path) -> UncertainPlant:
+    """The uncertain plant in a file of `plant_arrays`. Raises InputError."""
+    arrays = storage.read_npz(path)
+
+    def under(prefix: str) -> dict[str, AnyArray]:
+        return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+
+    try:
+        model = GobfModel.from_arrays(under("model/"))
+        posterior = ResponsePosterior.from_arrays(under("posterior/"))
+        level = float(arrays["level"])
+    except KeyError as error:
+        raise InputError(
+            f"{path}: not written by flexlink identify --out: {error.args[0]!r} is missing"
+        ) from error
+    return UncertainPlant(model.output_name, model.to_control(), posterior, level=level)
+
+
+def design_controller(
+    source: Path, specification_path: Path | None, *, out: Path | None = None, seed: int = 2006
+) -> RunSummary:
+    """Design and certify a controller for a run's identified plant, or for a file of `flexlink identify --out`.
+
+    With `out` the controller is written as JSON. Raises InputError.
+    """
+    source = Path(source)
+    if out is not None:
+        storage.check_writable(out)
+    if source.is_dir():
+        run = RunDirectory.open(source)
+        config = config_of(run)
+        plant, specification = load_plant(run, config), config.specification
+    else:
+        plant = load_plant_file(source)
+        if specification_path is None:
+            raise InputError(f"{source} holds no specification: give --specification FILE")
+    if specification_path is not None:
+        _, document = read_toml(specification_path)
+        specification = check(
+            Specification, document.get("specification", document), source=str(specification_path)
+        )
+    with naming("design"):
+        result = synthesise([plant], specification, rng=stage_rng(seed, "design"))
+        design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": result.explain()}
+        if result.outcome is Outcome.NOT_CONVERGED:
+            certificate = None
+        else:
+            certificate = certify(result.controller, [plant], specification)
+            if out is not None:
+                storage.write_text(out, result.controller.to_json())
+    certified = certificate is not None and certificate.certified
+    verdict = {
+        "certificate": None if certificate is None else certificate.to_dict(),
+        "certified": certified,
+        "reason": result.explain(),
+    }
+    return RunSummary(
+        title=f"controller for {plant.name}",
+        sections=(Section("design", design_rows(design)), Section("certificate", certificate_rows(verdict))),
+        numbers={"design": design, **verdict, "file": str(out) if out is not None and certificate else None},
+        certified=certified,
+        verdict=result.explain(),
     )

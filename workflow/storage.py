@@ -48,6 +48,17 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise InputError(f"cannot write {path}: {describe_os_error(error)}") from error
 
 
+def check_writable(path: Path) -> None:
+    """Refuse an output file before the work is done: its directory must be there and take new files."""
+    parent = path.absolute().parent
+    if path.is_dir():
+        raise InputError(f"cannot write {path}: it is a directory")
+    if not parent.is_dir():
+        raise InputError(f"cannot write {path}: {parent} is not a directory")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write {path}: no permission in {parent}")
+
+
 def write_text(path: Path, content: str) -> None:
     """Atomic UTF-8 text."""
     write_bytes(path, content.encode("utf-8"))

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from ident.record import Record
-from workflow.config import Channel, FileRecord, FileSource, RunConfig, SimulatedSource, record_name
+from workflow.config import (
+    Channel,
+    FileRecord,
+    FileSource,
+    RunConfig,
+    SimulatedRecord,
+    SimulatedSource,
+    record_name,
+)
 from workflow.errors import InputError, naming
 from workflow.run_directory import StageData
 from workflow.simulated_rig import simulate_record
@@ -47,7 +55,8 @@ def make_records(stage: StageInput) -> StageData:
         effects = []
     records = with_common_sampling_time(records)
     about = []
-    for index, (record, entry) in enumerate(zip(records, source.records, strict=True)):
+    entries: Sequence[SimulatedRecord | FileRecord] = source.records
+    for index, (record, entry) in enumerate(zip(records, entries, strict=True)):
         if entry.role == "estimation":
             refuse_constant_input(record)
         arrays |= {f"record/{index}/{key}": value for key, value in record.to_arrays().items()}
