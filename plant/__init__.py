@@ -1,8 +1,10 @@
 """The machine: rig, beam modes, motor, effects, sensors, excitation signals, simulation."""
 
 from plant.effects import EFFECTS, Effect, parse_effect, parse_effects, without
+from plant.excitation import bang_bang, crest_factor, doublet, log_chirp, multisine, multisine_lines, prbs
 from plant.modal import LinearArm, linear_arm
-from plant.rig import Rig
+from plant.presets import paper_example, paper_example_rig, paper_link
+from plant.rig import Rig, parameter_keys
 from plant.simulate import SampledArm, Trajectory, simulate
 
 __all__ = [
@@ -12,9 +14,20 @@ __all__ = [
     "Rig",
     "SampledArm",
     "Trajectory",
+    "bang_bang",
+    "crest_factor",
+    "doublet",
     "linear_arm",
+    "log_chirp",
+    "multisine",
+    "multisine_lines",
+    "paper_example",
+    "paper_example_rig",
+    "paper_link",
+    "parameter_keys",
     "parse_effect",
     "parse_effects",
+    "prbs",
     "simulate",
     "without",
 ]

@@ -15,8 +15,8 @@ Linearised; shear, rotary inertia of the section, air and motor inductance are n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
@@ -24,6 +24,9 @@ from scipy.linalg import expm
 from plant.beam import BeamModes, clamped_free_modes
 from plant.machine import Machine
 from plant.rig import Rig
+
+if TYPE_CHECKING:
+    import control
 
 Real = npt.NDArray[np.float64]
 
@@ -230,6 +233,8 @@ class LinearArm:
 
     def to_control(self, dt_s: float | None = None) -> control.StateSpace:
         """The arm in python-control: continuous, or with held inputs sampled at dt_s."""
+        import control  # here, because it brings a plotting library with it
+
         a, b = self.A, self.B
         if dt_s is not None:
             if not 0 < dt_s < np.inf:

@@ -42,7 +42,7 @@ class ActuatorDeadZone(Effect):
     id = "actuator_dead_zone"
     group = "actuator"
     neutral = MappingProxyType({"width_V": 0.0})
-    smooth = False
+    dependence = "continuous"
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
 
@@ -56,7 +56,7 @@ class ActuatorSaturation(Effect):
     id = "actuator_saturation"
     group = "actuator"
     neutral = MappingProxyType({"limit_V": 1e6})
-    smooth = False
+    dependence = "continuous"
 
     limit_V: Positive = Field(description="largest voltage the driver delivers")
 

@@ -33,8 +33,8 @@ class Effect(BaseModel, ABC):
         Where it acts: actuator, joint, link or sensor.
     neutral : mapping or None
         Parameter values at which the effect vanishes exactly; None if there are none within the bounds.
-    smooth : bool
-        Whether the outputs are a differentiable function of the parameters.
+    dependence : str
+        How the outputs depend on the parameters: smooth (differentiable), continuous, or jagged.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -42,7 +42,7 @@ class Effect(BaseModel, ABC):
     id: ClassVar[str]
     group: ClassVar[Group]
     neutral: ClassVar[Mapping[str, float] | None]
-    smooth: ClassVar[bool] = True
+    dependence: ClassVar[Literal["smooth", "continuous", "jagged"]] = "smooth"
 
     @abstractmethod
     def modify(self, machine: Machine) -> Machine:

@@ -1,4 +1,4 @@
-"""Effects at motor, gear and hub; torques act between housing and shaft, sizes at the hub side of the gear."""
+"""Effects at motor, gear and hub; torques act from housing to shaft, sizes at the hub side of the gear."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class CoulombFriction(Effect):
     id = "coulomb_friction"
     group = "joint"
     neutral = MappingProxyType({"torque_Nm": 0.0})
-    smooth = False
+    dependence = "continuous"
 
     torque_Nm: NotNegative = Field(description="friction level Tc")
 
@@ -34,7 +34,7 @@ class StribeckFriction(Effect):
     neutral = MappingProxyType(
         {"static_torque_Nm": 0.0, "coulomb_torque_Nm": 0.0, "stribeck_velocity_rad_s": 0.1}
     )
-    smooth = False
+    dependence = "continuous"
 
     static_torque_Nm: NotNegative = Field(description="break-away level Ts, at least Tc")
     coulomb_torque_Nm: NotNegative = Field(description="level Tc at speed")
@@ -131,7 +131,8 @@ class HardeningSpring(Effect):
 class JointCompliance(Effect):
     """Torsion spring and damper, coaxial with the hub and without inertia, between hub and link root.
 
-    The clamp, at the hub radius, turns about the hub axis by an extra angle; the hub angle stays the encoder's.
+    The clamp, at the hub radius, turns about the hub axis by an extra angle; the hub angle stays the
+    encoder's.
     """
 
     id = "joint_compliance"
@@ -148,8 +149,8 @@ class JointCompliance(Effect):
 class BaseCompliance(Effect):
     """Hub axis and motor housing sit on a base that turns about the same axis, sprung and damped to ground.
 
-    Motor torque, back-EMF, friction and ripple act between base and hub. The encoder reads hub minus base, tip_m uses
-    the absolute hub angle.
+    Motor torque, back-EMF, friction and ripple act between base and hub. The encoder reads hub minus base,
+    tip_m uses the absolute hub angle.
     """
 
     id = "base_compliance"
@@ -169,15 +170,15 @@ class BaseCompliance(Effect):
 class Backlash(Effect):
     """Play between motor side (30 % of J, friction, back-EMF, motor torque) and hub (70 % of J, link).
 
-    They touch at a relative angle of +-gap/2 and start in the middle. The contact is a damped spring that only
-    pushes: torque max(kc p + cc dp/dt, 0) at the penetration p, kc = 0.21 J (2 pi 180)^2, cc = 0.8 sqrt(0.3 J kc).
-    The encoder is on the hub.
+    They touch at a relative angle of +-gap/2 and start in the middle. The contact is a damped spring that
+    only pushes: torque max(kc p + cc dp/dt, 0) at the penetration p, kc = 0.21 J (2 pi 180)^2, cc = 0.8
+    sqrt(0.3 J kc). The encoder is on the hub.
     """
 
     id = "backlash"
     group = "joint"
     neutral = None  # without play the contact is still elastic
-    smooth = False
+    dependence = "jagged"
 
     gap_rad: Positive = Field(description="total play")
 

@@ -42,7 +42,7 @@ class Quantisation(Effect):
     id = "quantisation"
     group = "sensor"
     neutral = MappingProxyType({"step_m": 0.0})
-    smooth = False
+    dependence = "jagged"
 
     step_m: NotNegative = Field(description="resolution of the tip sensor; 0 is none")
 

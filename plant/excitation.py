@@ -1,0 +1,193 @@
+"""Excitation signals: voltages (T,) for experiments.
+
+Random phases, lines and start states come from a `numpy.random.Generator` that the caller passes in.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import max_len_seq
+
+Real = npt.NDArray[np.float64]
+Integer = npt.NDArray[np.int64]
+Grid = Literal["full", "odd", "odd_random"]
+
+
+def prbs(
+    register_length: int,
+    hold_samples: int,
+    amplitude_V: float,
+    n_samples: int,
+    start: np.random.Generator | npt.ArrayLike | None = None,
+) -> Real:
+    """Pseudo-random binary sequence +-amplitude of maximum length, every value held for hold_samples.
+
+    The period is (2^register_length - 1) * hold_samples; the sequence s of one period (unheld, unit
+    amplitude) has the circular autocorrelation sum_k s_k s_(k+l) = -1 for every l but 0.
+
+    Parameters
+    ----------
+    start
+        Register at the start: bits (register_length,) that are not all zero, or a generator that draws them
+        (the first bit is then set to 1); None starts with all ones.
+
+    Raises
+    ------
+    ValueError
+        For a register length outside 2..20, a hold or length below 1, a bad amplitude or register.
+    """
+    if not 2 <= register_length <= 20:
+        raise ValueError(f"register_length must be 2..20; got {register_length}")
+    if not (hold_samples >= 1 and n_samples >= 1):
+        raise ValueError(f"need hold_samples >= 1 and n_samples >= 1; got {hold_samples} and {n_samples}")
+    _check_positive(amplitude_V=amplitude_V)
+    if start is None:
+        register = np.ones(register_length, dtype=np.int8)
+    elif isinstance(start, np.random.Generator):
+        register = start.integers(0, 2, register_length).astype(np.int8)
+        register[0] = 1
+    else:
+        register = np.array(start, dtype=np.int8)
+    if (
+        register.shape != (register_length,)
+        or not np.all((register == 0) | (register == 1))
+        or not register.any()
+    ):
+        raise ValueError(
+            f"the register needs {register_length} bits that are not all zero; got {register.tolist()}"
+        )
+    bits, _ = max_len_seq(register_length, state=register, length=-(-n_samples // hold_samples))
+    return amplitude_V * np.where(np.repeat(bits, hold_samples)[:n_samples] == 1, 1.0, -1.0)
+
+
+def multisine_lines(
+    period_samples: int,
+    dt_s: float,
+    band_Hz: tuple[float, float],
+    grid: Grid = "full",
+    rng: np.random.Generator | None = None,
+) -> Integer:
+    """Harmonics (of the frequency 1 / (period_samples * dt_s)) a multisine excites, ascending.
+
+    "full" takes every harmonic in the band, "odd" the odd ones, "odd_random" the odd ones less one drawn from
+    every group of four: even and odd distortions of a nonlinear machine then appear at lines that are not
+    excited.
+
+    Raises
+    ------
+    ValueError
+        If no line is left, the band is not 0 < low < high < Nyquist, or "odd_random" comes without a
+        generator.
+    """
+    if period_samples < 2:
+        raise ValueError(f"period_samples must be at least 2; got {period_samples}")
+    _check_positive(dt_s=dt_s)
+    low, high = band_Hz
+    if not 0 < low < high < 0.5 / dt_s:
+        raise ValueError(f"need 0 < low < high < {0.5 / dt_s} Hz (Nyquist); got {band_Hz}")
+    if grid not in ("full", "odd", "odd_random"):
+        raise ValueError(f"grid must be full, odd or odd_random; got {grid!r}")
+    spacing = 1.0 / (period_samples * dt_s)
+    # A band edge that is a line within rounding is meant as one.
+    lines = np.arange(np.ceil(low / spacing - 1e-9), np.floor(high / spacing + 1e-9) + 1).astype(np.int64)
+    if grid != "full":
+        lines = lines[lines % 2 == 1]
+    if grid == "odd_random":
+        if rng is None:
+            raise ValueError("grid odd_random draws lines and needs rng")
+        groups = np.arange(lines.size // 4) * 4
+        lines = np.delete(lines, groups + rng.integers(0, 4, groups.size))
+    if lines.size == 0:
+        raise ValueError(f"no {grid} line in {band_Hz} Hz with a line spacing of {spacing:.4g} Hz")
+    return lines
+
+
+def multisine(
+    lines: npt.ArrayLike,
+    period_samples: int,
+    rms_V: float,
+    rng: np.random.Generator,
+    *,
+    periods: int = 1,
+    draws: int = 1,
+) -> Real:
+    """Equal-amplitude multisine (period_samples * periods,) with uniform random phases.
+
+    Parameters
+    ----------
+    lines
+        Harmonics, from `multisine_lines`; 1 and up, below period_samples / 2.
+    rms_V
+        Root mean square.
+    draws
+        Number of phase draws, of which the one with the lowest crest factor is kept; 1 leaves the phases
+        uniform.
+    """
+    harmonics = np.asarray(lines, dtype=np.int64)
+    if harmonics.ndim != 1 or harmonics.size == 0 or len(set(harmonics.tolist())) != harmonics.size:
+        raise ValueError("lines must be distinct harmonics, shape (H,)")
+    if not (harmonics.min() >= 1 and 2 * harmonics.max() < period_samples):
+        raise ValueError(
+            f"lines must lie in 1..{(period_samples - 1) // 2}; got {harmonics.min()}..{harmonics.max()}"
+        )
+    _check_positive(rms_V=rms_V)
+    if not (periods >= 1 and draws >= 1):
+        raise ValueError(f"periods and draws must be at least 1; got {periods} and {draws}")
+    best = np.zeros(0)
+    for _ in range(draws):
+        spectrum = np.zeros(period_samples // 2 + 1, dtype=np.complex128)
+        spectrum[harmonics] = np.exp(2j * np.pi * rng.random(harmonics.size))
+        period = np.fft.irfft(spectrum, period_samples)
+        if best.size == 0 or crest_factor(period) < crest_factor(best):
+            best = period
+    best *= rms_V / np.sqrt(np.mean(best**2))
+    return np.tile(best, periods)
+
+
+def crest_factor(signal: Real) -> float:
+    """Peak over root mean square."""
+    return float(np.max(np.abs(signal)) / np.sqrt(np.mean(np.square(signal))))
+
+
+def log_chirp(
+    start_Hz: float, stop_Hz: float, amplitude_V: float, n_samples: int, dt_s: float, phase_rad: float = 0.0
+) -> Real:
+    """Sine (T,) whose frequency grows by the same factor every second, from start to stop over the record.
+
+    Phase 2 pi f0 T / ln(f1 / f0) ((f1 / f0)^(t / T) - 1).
+    """
+    _check_positive(dt_s=dt_s, amplitude_V=amplitude_V, n_samples=n_samples)
+    if not (0 < start_Hz < 0.5 / dt_s and 0 < stop_Hz < 0.5 / dt_s and start_Hz != stop_Hz):
+        raise ValueError(
+            f"need different frequencies between 0 and {0.5 / dt_s} Hz (Nyquist); "
+            f"got {start_Hz} and {stop_Hz}"
+        )
+    duration = n_samples * dt_s
+    rate = np.log(stop_Hz / start_Hz) / duration
+    time = np.arange(n_samples) * dt_s
+    return np.asarray(amplitude_V * np.sin(phase_rad + 2 * np.pi * start_Hz * np.expm1(rate * time) / rate))
+
+
+def doublet(amplitude_V: float, start_s: float, pulse_s: float, n_samples: int, dt_s: float) -> Real:
+    """Voltage (T,) of +amplitude for one pulse, -amplitude for the next, zero before and after."""
+    _check_positive(amplitude_V=amplitude_V, pulse_s=pulse_s, dt_s=dt_s, n_samples=n_samples)
+    if not start_s >= 0:
+        raise ValueError(f"start_s must not be negative; got {start_s}")
+    # Half a sample of rounding: switching times that are multiples of dt_s fall on them.
+    pulse = np.floor((np.arange(n_samples) * dt_s - start_s) / pulse_s + 1e-9)
+    return np.where(pulse == 0, amplitude_V, np.where(pulse == 1, -amplitude_V, 0.0))
+
+
+def bang_bang(amplitude_V: float, start_s: float, slew_s: float, n_samples: int, dt_s: float) -> Real:
+    """Slew (T,): accelerate with +amplitude for half of slew_s, brake with -amplitude for the other half."""
+    _check_positive(slew_s=slew_s)
+    return doublet(amplitude_V, start_s, slew_s / 2, n_samples, dt_s)
+
+
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} must be positive and finite; got {value}")
