@@ -14,9 +14,7 @@ DT_S = 0.01
 
 def model(output: str = "hub_angle_rad", *, integrators: int = 1) -> GobfModel:
     """A hub with one real pole and two lightly damped modes."""
-    poles = Poles.from_continuous(
-        decay_per_s=[6.0], omega_rad_s=[14.0, 62.0], zeta=[0.02, 0.015], dt_s=DT_S
-    )
+    poles = Poles.from_continuous(decay_per_s=[6.0], omega_rad_s=[14.0, 62.0], zeta=[0.02, 0.015], dt_s=DT_S)
     coefficients = np.array([0.02, 0.004, -0.006, 0.003, 0.002])
     return GobfModel(
         poles, coefficients, DT_S, integrators=integrators, input_name="voltage_V", output_name=output
@@ -29,14 +27,16 @@ def posterior(of: GobfModel, relative: float = 0.03) -> ResponsePosterior:
     mean = np.zeros(doubled.order)
     n_real = of.poles.real.size
     mean[:n_real] = 0.0
-    # A doubled basis orders real poles twice, then every pair twice; the first copy of each spans the model only
-    # together with what stands before it, so the mean is taken by projection on the circle.
+    # A doubled basis orders real poles twice, then every pair twice; the first copy of each spans the model
+    # only together with what stands before it, so the mean is taken by projection on the circle.
     omega = np.linspace(0.5, np.pi / DT_S, 600)
     from ident.basis import basis_response
 
     z = np.exp(1j * omega * DT_S)
     rows, wanted = basis_response(doubled, z), basis_response(of.poles, z) @ of.coefficients
-    mean = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.concatenate([wanted.real, wanted.imag]), rcond=None)[0]
+    mean = np.linalg.lstsq(
+        np.vstack([rows.real, rows.imag]), np.concatenate([wanted.real, wanted.imag]), rcond=None
+    )[0]
     factor = np.diag(np.full(mean.size, relative * np.abs(of.coefficients).max()))
     return ResponsePosterior(
         poles=doubled,
@@ -53,7 +53,13 @@ def posterior(of: GobfModel, relative: float = 0.03) -> ResponsePosterior:
 
 
 def record(
-    of: list[GobfModel], name: str, seed: int, *, samples: int = 900, units: bool = True, input_name: str = "voltage_V"
+    of: list[GobfModel],
+    name: str,
+    seed: int,
+    *,
+    samples: int = 900,
+    units: bool = True,
+    input_name: str = "voltage_V",
 ) -> Record:
     """Square-wave excitation, outputs of the models with a little white noise."""
     rng = np.random.default_rng(seed)

@@ -73,14 +73,12 @@ def outline(time_s: Real, signal: Real, bins: int = 700) -> tuple[Real, Real]:
     """
     if signal.size <= 3 * bins:
         return time_s, signal
-    length = signal.size // bins
-    used = length * bins
-    parts = signal[:used].reshape(bins, length)
-    first = np.arange(bins) * length
-    index = np.sort(
-        np.stack([first + parts.argmin(axis=1), first + parts.argmax(axis=1)], axis=1), axis=1
-    ).ravel()
-    index = np.unique(np.concatenate([index, [signal.size - 1]]))
+    length = -(-signal.size // bins)
+    first = np.arange(0, signal.size, length)
+    # The last part may be shorter: it is filled up with its last sample, which is no new extreme.
+    parts = np.pad(signal, (0, first.size * length - signal.size), mode="edge").reshape(-1, length)
+    both = np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), [0, signal.size - 1]])
+    index = np.unique(np.minimum(both, signal.size - 1))
     return time_s[index], signal[index]
 
 

@@ -88,7 +88,7 @@ def draw_bode(
         gain.set_xlim(omega[0], omega[-1])
         style.hertz_axis(gain)
         figure.align_ylabels()
-        style.legend_below(figure, (gain, size), columns=5)
+        style.finish(figure, (gain, size), columns=5)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,16 +48,16 @@ class LoopScene:
 def draw_closed_loop(
     scene: LoopScene,
     predicted: LoopTraces,
-    achieved: LoopTraces,
+    achieved: LoopTraces | None,
     *,
-    machine: str,
+    machine: str = "machine",
     spread: LoopTraces | None = None,
 ) -> Figure:
     """Rows: fed-back output, performance output (if any), command. Left: the reference step. Right: the
     disturbance.
 
-    `machine` says in words what 'achieved' ran on; `spread` are predictions for plants drawn from the
-    uncertainty.
+    `machine` says in words what 'achieved' ran on, if anything; `spread` are predictions for plants drawn
+    from the uncertainty.
     """
     rows: list[tuple[str, tuple[str, str]]] = [("output", scene.output)]
     if scene.performance is not None and predicted.performance is not None:
@@ -82,13 +83,13 @@ def draw_closed_loop(
                             f"disturbance {_disturbance_size(scene):.3g} {scene.command[1]}".rstrip(),
                         )
             axes_row[0].set_ylabel(style.axis_label(*label))
-            _room_for_limit(axes_row[0], scene, kind, predicted, achieved)
+            _limits(axes_row[0], scene, kind, predicted, (achieved, spread))
         for axes, (_, _, title) in zip(grid[0], windows, strict=True):
             axes.set_title(title)
         for axes in grid[-1]:
             axes.set_xlabel("time [s]")
         figure.align_ylabels()
-        style.legend_below(figure, grid.ravel(), columns=4)
+        style.finish(figure, grid.ravel(), columns=4)
     return figure
 
 
@@ -122,7 +123,7 @@ def _draw_row(
     scene: LoopScene,
     kind: str,
     predicted: LoopTraces,
-    achieved: LoopTraces,
+    achieved: LoopTraces | None,
     spread: LoopTraces | None,
     machine: str,
     part: slice,
@@ -136,7 +137,7 @@ def _draw_row(
             **style.BAND,
             label=f"{many.shape[0]} plants from the uncertainty",
         )
-    done = getattr(achieved, kind)
+    done = None if achieved is None else getattr(achieved, kind)
     if done is not None:
         if done.shape[0] > 1:
             axes.fill_between(
@@ -160,27 +161,47 @@ def _draw_row(
         )
 
 
-def _room_for_limit(
-    axes: Axes, scene: LoopScene, kind: str, predicted: LoopTraces, achieved: LoopTraces
+def _limits(
+    axes: Axes,
+    scene: LoopScene,
+    kind: str,
+    predicted: LoopTraces,
+    others: Sequence[LoopTraces | None],
 ) -> None:
-    """The command's limits, where they are near enough to matter to the picture; else they are said in
-    words."""
-    if kind != "command" or scene.command_limit is None:
-        return
-    largest = max(float(np.abs(predicted.command).max()), float(np.abs(achieved.command).max()))
-    if scene.command_limit <= 4 * largest:
-        for sign in (-1, 1):
-            for sibling in [axes, *axes.get_shared_y_axes().get_siblings(axes)]:
-                if sign * scene.command_limit > 0 or float(np.min(achieved.command)) < -0.15 * largest:
-                    sibling.axhline(sign * scene.command_limit, **style.LIMIT_LINE, label="saturation")
-    else:
+    """Height of a row, shared by its panels: all runs, but a run that leaves the scene does not flatten the
+    others.
+
+    The command's limits are drawn where they are near enough to matter to the picture, else said in words.
+    """
+    base = getattr(predicted, kind)
+    low, high = float(base.min()), float(base.max())
+    if kind == "output":
+        low, high = min(low, float(scene.reference.min())), max(high, float(scene.reference.max()))
+    span = high - low if high > low else max(abs(high), 1e-12)
+    for traces in others:
+        values = None if traces is None else getattr(traces, kind)
+        if values is not None:
+            low = max(min(low, float(values.min())), low - 3 * span)
+            high = min(max(high, float(values.max())), high + 3 * span)
+    limit = scene.command_limit if kind == "command" else None
+    siblings = axes.get_shared_y_axes().get_siblings(axes)
+    if limit is not None and limit <= 2.5 * max(abs(low), abs(high)):
+        for sibling in siblings:
+            for value in (-limit, limit):
+                sibling.axhline(value, **style.LIMIT_LINE, label="saturation")
+        # The nearer limit is shown; the other one only if the command comes anywhere near it.
+        high = max(high, limit) if high > 0.4 * limit else high
+        low = min(low, -limit) if low < -0.4 * limit else low
+    elif limit is not None:
         axes.text(
             0.985,
             0.95,
-            f"saturation at ±{scene.command_limit:.4g} {scene.command[1]}, far away",
+            f"saturation at ±{limit:.4g} {scene.command[1]} is beyond this axis",
             transform=axes.transAxes,
             ha="right",
             va="top",
             fontsize=8.5,
             color=style.LIMIT,
+            bbox={"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.8},
         )
+    axes.set_ylim(*style.pad_limits(low, high, 0.08))

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from ident.options import IdentOptions
+from ident.pole_search import PoleSearch
+from ident.poles import Poles
+from ident.regression import Regression
+from ident.search_trace import SearchStage
 from workflow.figures import style
 from workflow.figures.bands import Real
 
@@ -75,7 +81,7 @@ def draw_error_surface(surface: ErrorSurface, *, name: str) -> Figure:
         left.set_ylabel("damping ratio of the pair [1]")
         left.set_title(f"Error surface: {style.plain(name, 34)}")
         bar = figure.colorbar(filled, ax=left, pad=0.01, aspect=30)
-        bar.set_label("residual RMS / its minimum [1]")
+
         # Round values at least a fifteenth of the bar apart: its own log ticks run into each other.
         ticks: list[float] = []
         step = np.log(levels[-1] / levels[0]) / 15
@@ -90,9 +96,60 @@ def draw_error_surface(surface: ErrorSurface, *, name: str) -> Figure:
         right.set_xscale("log")
         right.set_yscale("log")
         right.set_xlim(surface.omega_rad_s[0], surface.omega_rad_s[-1])
-        right.set_title("Along frequency")
+        right.set_title("Along frequency, best damping")
         right.set_xlabel("frequency of the pair [rad/s]")
         right.set_ylabel("residual RMS / its minimum [1]")
-        style.plain_log(right.yaxis)
-        style.legend_below(figure, (left, right), columns=4)
+        style.finish(figure, (left, right), columns=4)
     return figure
+
+
+def surface_of_pair(
+    data: Regression,
+    options: IdentOptions,
+    found: Poles,
+    index: int,
+    rss: float,
+    stages: Sequence[SearchStage],
+    *,
+    size: tuple[int, int] = (64, 28),
+) -> ErrorSurface:
+    """Error over frequency and damping of pair `index` of `found`, the other poles held, coefficients
+    re-fitted.
+
+    `rss` is the residual sum of squares of the whole identification, `stages` its global searches: the points
+    of the one that looked at pairs last before this pair was found are shown, as far as they lie in the
+    picture.
+    """
+    kept = Poles(found.real, np.delete(found.pairs, index))
+    log_options = options.model_copy(update={"coordinates": "log"})
+    search = PoleSearch(data, log_options)
+    space = search.space(0, 1)
+    cost = search.candidate_cost(space, kept, kept)
+    first, second = np.linspace(0, 1, size[0]), np.linspace(0, 1, size[1])
+    logs = np.array([[cost(np.array([x, y])) for x in first] for y in second])
+    omega = 10.0 ** (space.low[1] + (space.high[1] - space.low[1]) * first) / data.dt_s
+    zeta = 10.0 ** (space.low[2] + (space.high[2] - space.low[2]) * second)
+    best = float(found.omega_rad_s(data.dt_s)[index]), float(found.zeta()[index])
+    others = found.order - 2
+    return ErrorSurface(
+        omega_rad_s=omega,
+        zeta=zeta,
+        cost=np.sqrt(np.exp(logs - np.log(rss))),
+        searched=_searched_pairs(stages, best[0]),
+        best=best,
+        frozen="no other poles" if others == 0 else f"the other {others} poles held where they were found",
+    )
+
+
+def _searched_pairs(stages: Sequence[SearchStage], omega_rad_s: float) -> Real:
+    """Points (E, 2) of the global search whose best point lies nearest in frequency; empty without one in log
+    coordinates."""
+    nearest: tuple[float, Real] = (np.inf, np.zeros((0, 2)))
+    for stage in stages:
+        columns = [i for i, name in enumerate(stage.coordinate_names) if name.startswith("log10(omega")]
+        for column in columns:
+            points = 10.0 ** stage.points[:, [column, column + 1]]
+            away = abs(float(np.log(points[int(np.argmin(stage.log_cost)), 0] / omega_rad_s)))
+            if away < nearest[0]:
+                nearest = (away, points)
+    return nearest[1]

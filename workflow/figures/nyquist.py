@@ -97,7 +97,7 @@ def draw_nyquist(
                 color="#555555",
                 bbox={"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1},
             )
-        style.legend_below(figure, (near, whole), columns=5)
+        style.finish(figure, (near, whole), columns=5)
     return figure
 
 

@@ -89,18 +89,21 @@ def draw_poles(
         near.set_title("Near z = 1")
         _frequency_arcs(near, corner, dt_s)
         _name_dampings(near, corner)
-        style.legend_below(figure, whole, columns=5)
+        style.finish(figure, whole, columns=5)
     return figure
 
 
 def _near_corner(poles: Complex) -> float:
-    """Side of the close-up: holds the poles of the lowest modes, never the whole circle."""
-    away = np.sort(np.abs(poles - 1.0))
+    """Side of the close-up: holds the slowest lightly damped pair with room around it, else the slowest
+    poles."""
+    upper = poles[(poles.imag > 1e-9) & (np.abs(poles) > 0.05)]
+    log = np.log(upper)
+    light = np.abs(upper[-log.real < 0.4 * np.abs(log)] - 1.0)
+    away = np.abs(poles - 1.0)
     away = away[away > 1e-9]
-    if not away.size:
-        return 0.5
-    middle = away[: max(1, -(-3 * away.size // 4))]
-    return float(np.clip(1.35 * middle.max(), 0.02, 0.9))
+    if light.size:
+        return float(np.clip(1.7 * light.min(), 0.02, 0.9))
+    return float(np.clip(1.7 * away.min(), 0.02, 0.9)) if away.size else 0.5
 
 
 def _damping_lines(axes: Axes) -> None:

@@ -1,70 +1,63 @@
-"""Repeated experiments: does their scatter agree with the ellipses?"""
+"""Repeated experiments: does their scatter agree with what the ellipses predict?"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from ident.validation import ScatterRow
 from workflow.figures import style
-from workflow.figures.bands import Real
 
 
-@dataclass(frozen=True, eq=False)
-class ScatterCurves:
-    """Over omega_rad_s (F,): |G|, the scatter predicted by the ellipses and the one measured between repeats.
-
-    Both scatters are RMS radii of one response estimate in the units of |G|.
-    """
-
-    omega_rad_s: Real
-    gain: Real
-    predicted: Real
-    measured: Real
-    repeats: int
-    gain_unit: str = ""
-
-
-def draw_repeat_scatter(curves: ScatterCurves, *, name: str) -> Figure:
-    """Predicted and measured scatter beside the response, and their ratio."""
+def draw_repeat_scatter(rows: Sequence[ScatterRow], *, name: str) -> Figure:
+    """Relative scatter per band, predicted and measured, and their ratio. Raises ValueError without a
+    band."""
+    if not rows:
+        raise ValueError("there is no band of repeat scatter to draw")
     with style.house_style():
-        figure = style.new_figure(4.8)
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.6, 1.0])
-        upper.plot(curves.omega_rad_s, curves.gain, **style.MODEL_LINE, label="gain of the response")
-        upper.plot(
-            curves.omega_rad_s,
-            curves.predicted,
-            color=style.UNCERTAIN,
-            lw=1.8,
-            label="scatter predicted by the ellipses",
-        )
-        upper.plot(
-            curves.omega_rad_s,
-            curves.measured,
-            color=style.MEASURED,
-            ls="none",
-            marker=".",
-            ms=4,
-            label=f"scatter measured between {curves.repeats} repeats",
-        )
+        figure = style.new_figure(4.4)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1.0])
+        edges = [(row.omega_low_rad_s, row.omega_high_rad_s) for row in rows]
+        series: list[tuple[str, str, dict[str, Any]]] = [
+            ("predicted", "one repeat, predicted by the ellipses", {"color": style.MODEL, "lw": 3.0}),
+            ("measured", "measured between repeats", {"color": style.MEASURED, "lw": 3.0}),
+        ]
+        if any(np.isfinite(row.between) for row in rows):
+            series.append(
+                ("between", "between conditions (amplitude, day)", {"color": style.HIGHLIGHT, "lw": 3.0})
+            )
+        for field, label, how in series:
+            for number, (row, (low, high)) in enumerate(zip(rows, edges, strict=True)):
+                value = 100 * getattr(row, field)
+                if np.isfinite(value) and value > 0:
+                    upper.plot(
+                        [low * 1.02, high / 1.02],
+                        [value, value],
+                        **how,
+                        solid_capstyle="butt",
+                        label=label if number == 0 else None,
+                    )
+        for row, (low, high) in zip(rows, edges, strict=True):
+            for field, color in (("ratio", style.MEASURED), ("between_ratio", style.HIGHLIGHT)):
+                value = getattr(row, field)
+                if np.isfinite(value) and value > 0:
+                    lower.plot(
+                        [low * 1.02, high / 1.02], [value, value], color=color, lw=3, solid_capstyle="butt"
+                    )
         upper.set_xscale("log")
         upper.set_yscale("log")
         upper.set_title(f"Repeat scatter: {style.plain(name, 40)}")
-        upper.set_ylabel(f"gain [{style.plain(curves.gain_unit or 'as logged', 34)}]")
-        positive = curves.predicted > 0
-        ratio = curves.measured[positive] / curves.predicted[positive]
-        lower.plot(curves.omega_rad_s[positive], ratio, color=style.MEASURED, ls="none", marker=".", ms=4)
-        lower.axhline(1.0, color=style.UNCERTAIN, lw=1.6)
+        upper.set_ylabel("scatter / gain [%]")
+        lower.axhline(1.0, color=style.MODEL, lw=1.2)
         lower.set_yscale("log")
-        if ratio.size and np.any(ratio > 0):
-            low, high = float(ratio[ratio > 0].min()), float(ratio.max())
-            lower.set_ylim(min(0.3, low / 1.3), max(3.0, high * 1.3))
-        style.plain_log(lower.yaxis)
+        low_ratio, high_ratio = lower.get_ylim()
+        lower.set_ylim(min(0.4, low_ratio), max(2.5, high_ratio))
         lower.set_ylabel("measured /\npredicted [1]")
         lower.set_xlabel("frequency [rad/s]")
-        upper.set_xlim(curves.omega_rad_s[0], curves.omega_rad_s[-1])
         style.hertz_axis(upper)
         figure.align_ylabels()
-        style.legend_below(figure, upper, columns=3)
+        style.finish(figure, upper, columns=3)
     return figure

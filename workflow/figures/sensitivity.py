@@ -142,7 +142,7 @@ def draw_sensitivities(
         for axes in grid[-1]:
             axes.set_xlabel("frequency [rad/s]")
         figure.align_ylabels()
-        style.legend_below(figure, grid.ravel()[: len(curves)], columns=4)
+        style.finish(figure, grid.ravel()[: len(curves)], columns=4)
     return figure
 
 

@@ -1,0 +1,100 @@
+"""The report: one self-contained page and its pictures, from what the stages left in the run directory."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from workflow import storage
+from workflow.config import RunConfig
+from workflow.figures.style import Picture, inline_svg, render
+from workflow.report.data import RunData, load
+from workflow.report.page import Plot, Section, Table
+from workflow.report.pictures import pictures_of
+from workflow.report.sections import (
+    closed_loop_section,
+    design_section,
+    identification_section,
+    margins_section,
+    notes_section,
+    records_section,
+    uncertainty_section,
+)
+from workflow.report.verdict import reproducibility_section, verdict_of
+from workflow.run_directory import RunDirectory
+from workflow.summary import summarise
+
+__all__ = ["write_report"]
+
+
+def write_report(run: RunDirectory, config: RunConfig) -> Path:
+    """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
+
+    Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
+    Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
+    """
+    data = load(run, config)
+    pictures = {name: render(draw()) for name, draw in pictures_of(data).items()}
+    run.figures_path.mkdir(exist_ok=True)
+    written = set()
+    for name, picture in pictures.items():
+        path = run.figures_path / f"{name}.{picture.kind}"
+        storage.write_bytes(path, picture.content)
+        written.add(path.name)
+    for stale in sorted(run.figures_path.iterdir()):
+        if stale.suffix in (".svg", ".png") and stale.name not in written:
+            stale.unlink()
+    storage.write_text(run.report_path, page_of(run, data, pictures))
+    return run.report_path
+
+
+def page_of(run: RunDirectory, data: RunData, pictures: Mapping[str, Picture]) -> str:
+    """The page as HTML. Everything that comes from the user is escaped by the template engine."""
+    summary = summarise(run, data.config)
+    sections = [
+        records_section(data),
+        identification_section(data),
+        uncertainty_section(data),
+        design_section(data),
+        margins_section(data),
+        closed_loop_section(data),
+        notes_section(data),
+        reproducibility_section(data),
+    ]
+    rows = [
+        (section.title if number == 0 else "", row.label, row.value)
+        for section in summary.sections
+        for number, row in enumerate(section.rows)
+    ]
+    overview = Section("summary", "Summary", "Summary", (Table(("", "quantity", "value"), tuple(rows)),))
+    environment = Environment(
+        loader=PackageLoader("workflow", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.j2").render(
+        title=data.config.run.title or data.config.run.name,
+        verdict=verdict_of(data, certified=summary.certified),
+        sections=[overview, *sections],
+        drawn={plot.name: _embedded(plot, pictures[plot.name]) for plot in _plots(sections)},
+    )
+
+
+def _plots(sections: list[Section]) -> list[Plot]:
+    return [block for section in sections for block in section.blocks if isinstance(block, Plot)]
+
+
+def _embedded(plot: Plot, picture: Picture) -> Markup:
+    """The picture inside the page: SVG elements with ids of their own, or a base64 image."""
+    label = html.escape(plot.caption, quote=True)
+    if picture.kind == "svg":
+        return Markup(inline_svg(picture.content, f"{plot.name}-", label))
+    content = base64.b64encode(picture.content).decode("ascii")
+    return Markup(f'<img src="data:image/png;base64,{content}" alt="{label}">')

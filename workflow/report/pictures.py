@@ -1,0 +1,263 @@
+"""Which pictures a run has, and how each is drawn from the run's results."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from control_design.frequency_grid import frequency_grid
+from control_design.plant_set import Mode, modes_of
+from control_design.stability import closed_loop_poles
+from ident.regression import prepare
+from ident.uncertainty import ResponsePosterior
+from ident.validation import ResidualTest, ScatterRow, fit_on_fresh_data
+from workflow.figures.bands import Real
+from workflow.figures.bode import EmpiricalResponse, draw_bode
+from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
+from workflow.figures.error_surface import draw_error_surface, surface_of_pair
+from workflow.figures.nyquist import draw_nyquist, uncertain_loop
+from workflow.figures.poles import draw_poles
+from workflow.figures.records import ShownRecord, draw_records
+from workflow.figures.repeats import draw_repeat_scatter
+from workflow.figures.residuals import draw_residual_tests
+from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
+from workflow.figures.validation import draw_validation
+from workflow.report.data import ChannelData, RunData
+
+Drawer = Callable[[], Figure]
+
+MACHINE_WORDS = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
+
+
+def pictures_of(data: RunData) -> dict[str, Drawer]:
+    """Every picture of the run by the name of its file (without ending), in the order of the page."""
+    drawers: dict[str, Drawer] = {"records": lambda: _records(data)}
+    for index, channel in enumerate(data.channels):
+        drawers |= _of_channel(data, index, channel)
+    if data.has_controller and data.plant is not None:
+        drawers["nyquist"] = lambda: _nyquist(data)
+        drawers["sensitivities"] = lambda: _sensitivities(data)
+    if data.closed_loop is not None:
+        drawers["closed-loop"] = lambda: _closed_loop(data)
+    return drawers
+
+
+def channel_picture(family: str, index: int, label: str) -> str:
+    """File name of a channel's picture: letters, digits and dashes only, whatever the channel is called."""
+    slug = re.sub(r"[^A-Za-z0-9]+", "-", label).strip("-").lower()[:24]
+    return f"{family}-{index + 1}{'-' + slug if slug else ''}"
+
+
+def _of_channel(data: RunData, index: int, channel: ChannelData) -> dict[str, Drawer]:
+    found: dict[str, Drawer] = {}
+
+    def add(family: str, drawer: Drawer) -> None:
+        found[channel_picture(family, index, channel.label)] = drawer
+
+    pair = shown_pair(channel)
+    if pair is not None:
+        add("error-surface", lambda: _error_surface(data, index, channel, pair))
+    add("poles", lambda: _poles(data, channel, with_loop=index == data.config.control_index))
+    add("bode", lambda: _bode(data, channel))
+    add("validation", lambda: _validation(channel, fresh_index(data, channel)))
+    tests = residual_tests(channel)
+    if {"whiteness", "independence"} <= tests.keys():
+        add(
+            "residuals",
+            lambda: draw_residual_tests(tests["whiteness"], tests["independence"], name=channel.label),
+        )
+    if channel.uncertain["repeat_scatter"]:
+        rows = [ScatterRow(**row) for row in channel.uncertain["repeat_scatter"]]
+        add("repeats", lambda: draw_repeat_scatter(rows, name=channel.label))
+    return found
+
+
+def shown_pair(channel: ChannelData) -> int | None:
+    """Index of the pole pair whose error surface is shown: the slowest lightly damped one, else the
+    slowest."""
+    model = channel.result.identification.model
+    if model.poles.pairs.size == 0:
+        return None
+    omega, zeta = model.poles.omega_rad_s(model.dt_s), model.poles.zeta()
+    light = np.flatnonzero((zeta < 0.3) & (zeta > 5e-4))
+    candidates = light if light.size else np.arange(omega.size)
+    return int(candidates[np.argmin(omega[candidates])])
+
+
+def fresh_index(data: RunData, channel: ChannelData) -> int | None:
+    """Which free run is shown: the first validation record, else the first repeat, else None (a fitted
+    record)."""
+    role = {item.record.name: item.role for item in data.records}
+    for wanted in ("validation", "repeat"):
+        for i, fit in enumerate(channel.result.fresh):
+            if role[fit.name] == wanted:
+                return i
+    return None
+
+
+def residual_tests(channel: ChannelData) -> dict[str, ResidualTest]:
+    """The tests on the estimation records by name."""
+    found = {}
+    for document in channel.uncertain["tests"]:
+        if document["data"] == "estimation":
+            test = ResidualTest.from_dict({key: value for key, value in document.items() if key != "data"})
+            found[test.name] = test
+    return found
+
+
+def _records(data: RunData) -> Figure:
+    inputs = list(dict.fromkeys(channel.input for channel in data.config.channels))
+    outputs = list(dict.fromkeys(channel.output for channel in data.config.channels))
+    return draw_records([ShownRecord(item.record, item.role) for item in data.records], inputs, outputs)
+
+
+def _error_surface(data: RunData, index: int, channel: ChannelData, pair: int) -> Figure:
+    found, used = channel.result.identification, channel.result.used
+    surface = surface_of_pair(
+        prepare(used, found.structure),
+        data.config.channels[index].identification,
+        found.model.poles,
+        pair,
+        found.rss,
+        found.search.stages,
+    )
+    return draw_error_surface(surface, name=channel.label)
+
+
+def _poles(data: RunData, channel: ChannelData, *, with_loop: bool) -> Figure:
+    model = channel.result.identification.model
+    loop = None
+    if with_loop and data.has_controller and data.plant is not None and data.synthesis is not None:
+        loop = closed_loop_poles(data.synthesis.controller, data.plant)
+    return draw_poles(
+        model.dt_s,
+        identified=model.poles.values,
+        integrators=model.integrators,
+        closed_loop=loop,
+        name=channel.label,
+    )
+
+
+def _bode(data: RunData, channel: ChannelData) -> Figure:
+    model = channel.result.identification.model
+    empirical = None
+    if channel.empirical is not None:
+        empirical = EmpiricalResponse(channel.empirical.omega_rad_s, channel.empirical.centre)
+    return draw_bode(
+        channel.frequency,
+        name=channel.label,
+        input_label=(model.input_name, data.unit(model.input_name)),
+        output_label=(model.output_name, data.unit(model.output_name)),
+        model=model,
+        empirical=empirical,
+    )
+
+
+def _validation(channel: ChannelData, fresh: int | None) -> Figure:
+    found = channel.result.identification
+    if fresh is None:
+        record = channel.result.used[0]
+        fit = fit_on_fresh_data(found.model, record)
+    else:
+        record, fit = channel.fresh_record(fresh), channel.result.fresh[fresh]
+    return draw_validation(record, fit, fresh=fresh is not None, noise_std=found.noise_std)
+
+
+def _loop_grid(data: RunData) -> Real:
+    """Display frequencies, denser around the modes of controller and closed loop, with the certificate's
+    worst one.
+
+    A controller that notches a mode has features as narrow as the mode's own; the identified poles do not
+    show them.
+    """
+    omega = data.control.frequency.omega_rad_s
+    omega = omega[omega > 0]
+    assert data.plant is not None
+    assert data.synthesis is not None
+    if data.plant.own_grid is not None:
+        return omega
+    controller = data.synthesis.controller
+    poles = [closed_loop_poles(controller, data.plant)]
+    if controller.order:
+        poles.append(np.linalg.eigvals(controller.A).astype(np.complex128))
+    modes = [
+        Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4))
+        for mode in modes_of(np.concatenate(poles), data.plant.dt_s)
+        if omega[0] < mode.omega_rad_s < omega[-1]
+    ]
+    worst = [] if data.certificate is None else [v.worst_margin_omega_rad_s for v in data.certificate.plants]
+    dense = frequency_grid(
+        float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=41 * len(modes)
+    )
+    every = np.unique(np.concatenate([omega, dense, [w for w in worst if 0 < w <= omega[-1]]]))
+    return np.asarray(every[(every > 0) & (every <= omega[-1])])
+
+
+def _nyquist(data: RunData) -> Figure:
+    assert data.plant is not None
+    assert data.synthesis is not None
+    frequency = data.control.frequency
+    if isinstance(data.plant.uncertainty, ResponsePosterior):
+        frequency = data.plant.uncertainty.at(_loop_grid(data), data.plant.level)
+    loop = uncertain_loop(frequency, data.synthesis.controller.response(frequency.omega_rad_s))
+    margin = data.config.specification.modulus_margin
+    return draw_nyquist(loop, level=frequency.level, modulus_margin=margin, name=data.control.label)
+
+
+def _sensitivities(data: RunData) -> Figure:
+    assert data.plant is not None
+    assert data.synthesis is not None
+    config, performance = data.config, data.performance
+    curves = sensitivity_curves(
+        data.plant,
+        data.synthesis.controller,
+        config.specification,
+        _loop_grid(data),
+        input_unit=data.unit(config.control_channel.input),
+        output_unit=data.unit(config.control_channel.output),
+        performance_unit=""
+        if performance is None
+        else data.unit(performance.result.identification.model.output_name),
+    )
+    modes = [m for m in data.control.identified["modes"] if m["damping"] < 0.3]
+    marks = [(mode["omega_rad_s"], f"mode {number}") for number, mode in enumerate(modes[:4], 1)]
+    return draw_sensitivities(curves, level=data.plant.level, marks=marks)
+
+
+def _closed_loop(data: RunData) -> Figure:
+    assert data.closed_loop is not None
+    config, document = data.config, data.closed_loop.document
+    time, reference = data.loop_array("time_s"), data.loop_array("reference")
+    assert time is not None
+    assert reference is not None
+    performance = data.performance
+
+    def signal(name: str) -> tuple[str, str]:
+        return name, data.unit(name)
+
+    scene = LoopScene(
+        time_s=time,
+        reference=reference,
+        disturbance=data.loop_array("disturbance"),
+        output=signal(config.control_channel.output),
+        command=signal(config.control_channel.input),
+        performance=None
+        if performance is None
+        else signal(performance.result.identification.model.output_name),
+        command_limit=document["input_limit"],
+    )
+    predicted, runs = _traces(data, "predicted"), _traces(data, "achieved")
+    if document["machine"] == "simulated":
+        return draw_closed_loop(scene, predicted, runs, machine=MACHINE_WORDS["simulated"])
+    return draw_closed_loop(scene, predicted, None, spread=runs)
+
+
+def _traces(data: RunData, prefix: str) -> LoopTraces:
+    def array(name: str) -> Any:
+        return data.loop_array(f"{prefix}/{name}")
+
+    return LoopTraces(output=array("output"), command=array("command"), performance=array("performance"))
