@@ -85,7 +85,7 @@ def tangent(
 
     records: SISO, same sampling time as the model, each with its own initial state and offset; model gives
     poles, integrators and delay (its coefficients are not used). Raises ValueError when the records are too
-    short, have another sampling time, or do not excite the poles.
+    short, have another sampling time, or do not excite the poles at all.
     """
     options = options or EmbeddingOptions()
     return _embed(records, model, model.poles.doubled(), options, classical_recipe=False)
@@ -248,7 +248,7 @@ def _residuals(
 ) -> list[RealArray]:
     """y minus the posterior mean response and each record's nuisance, unwhitened, one array per record."""
     mean, _ = joint_factor(reduced, kernel)
-    p = reduced.n_regressors
+    p = reduced.n_columns
     residuals = []
     for block in regression.blocks():
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]

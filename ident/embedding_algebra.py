@@ -12,15 +12,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import qr, solve_triangular, svd
 
 from ident.arrays import RealArray
 
 # Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
 _NUISANCE_RANK = 1e-10
-# A diagonal entry of R11 (columns of unit length) below this says that the input does not excite that
-# direction.
-_EXCITATION = 1e-11
+# A diagonal entry of R11 (columns of unit length) below this says that these records cannot tell the column
+# from the earlier ones.
+_EXCITATION = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,9 @@ class ReducedRegression:
     """[F Psi y] after projecting the nuisance out and QR: the sufficient statistics.
 
     r11 (p,p) upper triangular in units of the original columns, r12 (p,L), r1 (p,), r22 (L,L), z (L,),
-    rest = squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank.
+    rest = squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank. kept (p,) are the
+    columns of F that stayed, of n_columns: one that these records cannot tell from the others (a pole nearly four
+    times in the doubled set) is left out, its coefficient zero, and changes the response at no excited frequency.
     """
 
     r11: RealArray
@@ -48,6 +51,8 @@ class ReducedRegression:
     z: RealArray
     rest: float
     n_rows: int
+    kept: npt.NDArray[np.intp]
+    n_columns: int
 
     @property
     def n_regressors(self) -> int:
@@ -125,23 +130,33 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
             f"{n_rows} usable samples do not determine {p} regressors and {length} kernel coefficients: "
             "give a longer record or a smaller fir_length"
         )
-    r11 = np.triu(triangle[:p, :p])
-    column_length = np.linalg.norm(r11, axis=0)
-    weak = np.abs(np.diag(r11)) <= _EXCITATION * column_length
-    if np.any(weak | (column_length == 0)):
-        raise ValueError(
-            f"the input does not excite regressor {int(np.argmax(weak | (column_length == 0))) + 1} of {p} apart from "
-            "the others: excite more frequencies or take fewer poles"
-        )
+    kept = _distinguishable(triangle[:p, :p])
+    if kept.size < p:
+        columns = np.concatenate([kept, np.arange(p, p + length + 1)])
+        (upper,) = qr(triangle[:, columns], mode="r", check_finite=False)
+        triangle = np.asarray(upper[: columns.size], dtype=np.float64)
+    q = kept.size
     return ReducedRegression(
-        r11=r11,
-        r12=triangle[:p, p:-1],
-        r1=triangle[:p, -1],
-        r22=np.triu(triangle[p:-1, p:-1]),
-        z=triangle[p:-1, -1],
+        r11=np.triu(triangle[:q, :q]),
+        r12=triangle[:q, q:-1],
+        r1=triangle[:q, -1],
+        r22=np.triu(triangle[q:-1, q:-1]),
+        z=triangle[q:-1, -1],
         rest=float(triangle[-1, -1] ** 2),
         n_rows=n_rows,
+        kept=kept,
+        n_columns=p,
     )
+
+
+def _distinguishable(r11: RealArray) -> npt.NDArray[np.intp]:
+    """Indices of the columns of an upper triangle that are not, to rounding, combinations of earlier ones."""
+    length = np.linalg.norm(r11, axis=0)
+    if np.any(length == 0):
+        raise ValueError(
+            f"the input does not excite regressor {int(np.argmax(length == 0)) + 1} of {length.size}"
+        )
+    return np.flatnonzero(np.abs(np.diag(r11)) > _EXCITATION * length)
 
 
 def tc_factor(lam: float, length: int) -> RealArray:
@@ -287,10 +302,9 @@ def prior_posterior(grid: KernelGrid) -> KernelPosterior:
 
 
 def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tuple[RealArray, RealArray]:
-    """Mean (p+L,) and covariance factor (p+L, P') of (theta, eta) of a KernelPosterior."""
-    p = reduced.n_regressors
+    """Mean (P+L,) and covariance factor (P+L, P') of (theta, eta), P counting the columns left out too."""
+    p, length = reduced.n_regressors, reduced.fir_length
     scale = np.linalg.norm(reduced.r11, axis=0)
-    r11 = reduced.r11 / scale
     right_hand = np.column_stack(
         [
             reduced.r1 - reduced.r12 @ posterior.kernel_mean,
@@ -298,9 +312,12 @@ def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tupl
             -reduced.r12 @ posterior.kernel_factor,
         ]
     )
-    solved = solve_triangular(r11, right_hand, check_finite=False) / scale[:, None]
-    below = np.hstack([np.zeros((posterior.kernel_mean.size, p)), posterior.kernel_factor])
-    return np.concatenate([solved[:, 0], posterior.kernel_mean]), np.vstack([solved[:, 1:], below])
+    solved = solve_triangular(reduced.r11 / scale, right_hand, check_finite=False) / scale[:, None]
+    mean = np.zeros(reduced.n_columns + length)
+    factor = np.zeros((mean.size, p + posterior.kernel_factor.shape[1]))
+    mean[reduced.kept], factor[reduced.kept] = solved[:, 0], solved[:, 1:]
+    mean[reduced.n_columns :], factor[reduced.n_columns :, p:] = posterior.kernel_mean, posterior.kernel_factor
+    return mean, factor
 
 
 def _symmetric_factor(covariance: RealArray) -> RealArray:

@@ -171,13 +171,33 @@ def test_nuisance_basis_drops_repeated_and_zero_columns():
     np.testing.assert_allclose(basis @ (basis.T @ a), a, atol=1e-12)
 
 
-def test_too_few_rows_and_unexcited_regressors_are_refused():
+def test_too_few_rows_and_zero_regressors_are_refused():
     block = problem(7, 1)[0]
     short = RegressionBlock(block.nuisance[:15], block.regressors[:15], block.kernel[:15], block.output[:15])
     with pytest.raises(ValueError, match="do not determine"):
         reduce_regression([short])
-    twice = np.column_stack([block.regressors, block.regressors[:, 0]])
-    with pytest.raises(ValueError, match="does not excite regressor"):
-        reduce_regression([RegressionBlock(block.nuisance, twice, block.kernel, block.output)])
+    zero = np.column_stack([block.regressors, np.zeros(N)])
+    with pytest.raises(ValueError, match="does not excite regressor 5 of 5"):
+        reduce_regression([RegressionBlock(block.nuisance, zero, block.kernel, block.output)])
     with pytest.raises(ValueError, match="at least one record"):
         reduce_regression([])
+
+
+def test_a_column_given_twice_is_left_out_and_nothing_else_changes():
+    block = problem(8, 1)[0]
+    twice = np.insert(block.regressors, 2, block.regressors @ [1.0, 1.0, 0.0, 0.0], axis=1)
+
+    def solve(regressors):
+        reduced = reduce_regression([RegressionBlock(block.nuisance, regressors, block.kernel, block.output)])
+        grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.8, tc_factor(0.8, L))], np.ones(1))
+        return joint_factor(reduced, conditional_posterior(grid, np.ones((1, 1)), 0.0))
+
+    (mean, factor), (mean_twice, factor_twice) = solve(block.regressors), solve(twice)
+    assert mean_twice[2] == 0
+    assert not np.any(factor_twice[2])
+    rest = np.delete(np.arange(mean_twice.size), 2)
+    np.testing.assert_allclose(mean_twice[rest], mean, atol=1e-9)
+    covariance = factor @ factor.T
+    np.testing.assert_allclose(
+        (factor_twice @ factor_twice.T)[np.ix_(rest, rest)], covariance, atol=1e-9 * np.abs(covariance).max()
+    )

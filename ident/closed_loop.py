@@ -1,0 +1,174 @@
+"""Logs taken in closed loop with a known reference: check of the feedback, two-stage and indirect identification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ident.arrays import RealArray
+from ident.embedding import EmbeddingOptions, tangent
+from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.identify import Identification, identify
+from ident.options import IdentOptions
+from ident.posterior import ResponsePosterior
+from ident.record import Record
+
+
+@dataclass(frozen=True)
+class FeedbackCheck:
+    """Whether the log obeys u(k) = reference_gain r(k) - feedback_gain y(k) + offset at the same sample.
+
+    largest_error is in input units, over all records; exact when it is within `tolerance`.
+    """
+
+    reference_gain: float
+    feedback_gain: float
+    offset: float
+    largest_error: float
+    tolerance: float
+    exact: bool
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+
+def check_feedback(
+    records: Sequence[Record],
+    *,
+    tolerance: float,
+    reference_gain: float | None = None,
+    feedback_gain: float | None = None,
+) -> FeedbackCheck:
+    """Test a proportional feedback of the (single) output against the log.
+
+    Gains not given are estimated by least squares from all records together. tolerance (input units) is what
+    rounding in the log explains, e.g. half a count. Raises ValueError when a record has not exactly one reference,
+    input and output.
+    """
+    for record in records:
+        _reference(record)
+    u = np.concatenate([record.input[:, 0] for record in records])
+    y = np.concatenate([record.output[:, 0] for record in records])
+    r = np.concatenate([_reference(record) for record in records])
+    known = np.zeros(u.size)
+    free = [np.ones(u.size)]
+    for gain, signal in ((reference_gain, r), (feedback_gain, -y)):
+        if gain is None:
+            free.append(signal)
+        else:
+            known += gain * signal
+    solution, *_ = np.linalg.lstsq(np.column_stack(free), u - known, rcond=None)
+    estimated = [float(value) for value in solution[1:]]
+    a = reference_gain if reference_gain is not None else estimated.pop(0)
+    g = feedback_gain if feedback_gain is not None else estimated.pop(0)
+    error = float(np.abs(u - a * r + g * y - solution[0]).max())
+    exact = error <= tolerance
+    law = f"u = {a:.6g} r - {g:.6g} y {solution[0]:+.3g}"
+    verdict = (
+        f"The log obeys {law} at every sample (largest error {error:.2g})."
+        if exact
+        else f"The log does not obey {law}: largest error {error:.3g}, more than {tolerance:.3g}."
+    )
+    return FeedbackCheck(float(a), float(g), float(solution[0]), error, float(tolerance), exact, verdict)
+
+
+@dataclass(frozen=True, eq=False)
+class TwoStage:
+    """Open-loop records made from closed-loop ones, and how good the first stage is.
+
+    records: as given, but with the noise-free input u_hat = S_hat r (the reference dropped: it has done its work);
+    sensitivity: posterior of S, r -> u; fit_percent (per record) of u by u_hat; first_stage: the identification.
+    """
+
+    records: tuple[Record, ...]
+    sensitivity: ResponsePosterior
+    fit_percent: tuple[float, ...]
+    first_stage: Identification
+    verdict: str
+
+    def relative_error(self, omega_rad_s: RealArray) -> RealArray:
+        """(F,) standard deviation of S_hat over |S_hat|: what the second stage inherits and does not see."""
+        estimate = self.sensitivity.at(omega_rad_s)
+        spread = estimate.covariance[:, 0, 0] + estimate.covariance[:, 1, 1]
+        return np.asarray(np.sqrt(spread) / np.abs(estimate.centre))
+
+
+def two_stage(
+    records: Sequence[Record], options: IdentOptions | None = None, embedding: EmbeddingOptions | None = None
+) -> TwoStage:
+    """Van den Hof and Schrama (Automatica 29(6), 1993): turn r -> u -> y into an open-loop problem.
+
+    The sensitivity r -> u is identified first (direct term on, no integrators or delay, whatever `options` say about
+    the plant), the records' inputs are replaced by its simulation from rest, which the noise does not touch. What
+    the later bounds miss is the error of S_hat (`relative_error`); it matters only where the loop gain is not
+    small. Raises ValueError when a record has not exactly one reference and one input.
+    """
+    plant_options = options or IdentOptions()
+    stage = plant_options.model_copy(
+        update={"feedthrough": True, "integrators": 0, "input_delay_samples": 0, "fixed_poles": ()}
+    )
+    closed = [_reference_to_input(record) for record in records]
+    first = identify(closed, stage)
+    sensitivity = tangent(closed, first.model, embedding)
+    opened, fits = [], []
+    for record in records:
+        u, u_hat = record.input[:, 0], sensitivity.simulate(_reference(record))
+        spread = float(np.linalg.norm(u - u.mean()))
+        fits.append(100 * (1 - float(np.linalg.norm(u - u_hat)) / spread))
+        opened.append(replace(record, input=u_hat[:, None], reference=None, reference_names=()))
+    verdict = (
+        f"The reference explains {min(fits):.1f} to {max(fits):.1f} % of the input: the rest is noise and distortion "
+        "that the loop fed back, and no longer drives the estimate."
+    )
+    return TwoStage(tuple(opened), sensitivity, tuple(fits), first, verdict)
+
+
+def indirect(
+    closed_loop: FrequencyUncertainty, reference_gain: float, feedback_gain: float
+) -> FrequencyUncertainty:
+    """Plant from the closed-loop response T (r -> y) under u = reference_gain r - feedback_gain y.
+
+    G = T / (a - g T); dG/dT = a / (a - g T)^2 turns and scales each ellipse (first order: good while the ellipse is
+    small against |a - g T|). Raises ValueError where a - g T is within its own ellipse of zero.
+    """
+    rest = reference_gain - feedback_gain * closed_loop.centre
+    lost = np.abs(rest) <= abs(feedback_gain) * closed_loop.enclosing_radius()
+    if np.any(lost):
+        at = closed_loop.omega_rad_s[int(np.argmax(lost))]
+        raise ValueError(
+            f"at omega = {at:.6g} rad/s the closed loop tells nothing about the plant: a - g T may be zero"
+        )
+    slope = reference_gain / rest**2
+    turn = np.stack([np.stack([slope.real, -slope.imag], -1), np.stack([slope.imag, slope.real], -1)], -2)
+    return replace(
+        closed_loop,
+        centre=closed_loop.centre / rest,
+        covariance=turn @ closed_loop.covariance @ turn.transpose(0, 2, 1),
+        method=f"{closed_loop.method}, indirect",
+    )
+
+
+def _reference(record: Record) -> RealArray:
+    if record.reference is None or record.reference.shape[1] != 1:
+        raise ValueError(f"{record.label}: closed-loop identification needs exactly one reference column")
+    if record.input.shape[1] != 1:
+        raise ValueError(f"{record.label}: need one input; got {list(record.input_names)}")
+    return record.reference[:, 0]
+
+
+def _reference_to_input(record: Record) -> Record:
+    reference = _reference(record)
+    return Record(
+        name=record.name,
+        input=reference[:, None],
+        output=record.input,
+        dt_s=record.dt_s,
+        input_names=record.reference_names,
+        output_names=record.input_names,
+        source=record.source,
+    )
