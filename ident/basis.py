@@ -1,10 +1,10 @@
 """Generalised orthonormal basis functions as a lossless cascade (design 4.1, paper (5)).
 
-L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper. A conjugate pair gets
-the real two-column Kautz form after the all-pass of the poles before it: sg (z - beta)/D and sg sb/D with
-D = z^2 - beta (1 + gamma) z + gamma, gamma = |x|^2, beta = 2 Re x/(1 + |x|^2), sg = sqrt(1 - gamma^2),
-sb = sqrt(1 - beta^2). FIR (all poles 0), Laguerre (one repeated real pole) and two-parameter Kautz (one repeated
-pair) are nothing but particular poles here: one code path, four names.
+L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper. A conjugate
+pair gets the real two-column Kautz form after the all-pass of the poles before it: sg (z - beta)/D and sg
+sb/D with D = z^2 - beta (1 + gamma) z + gamma, gamma = |x|^2, beta = 2 Re x/(1 + |x|^2), sg = sqrt(1 -
+gamma^2), sb = sqrt(1 - beta^2). FIR (all poles 0), Laguerre (one repeated real pole) and two-parameter
+Kautz (one repeated pair) are nothing but particular poles here: one code path, four names.
 
 Order of the functions: real poles first, then two per pair.
 """
@@ -21,7 +21,8 @@ from ident.poles import Poles
 
 
 class LosslessCascade(NamedTuple):
-    """State space x(k+1) = A x + B u, w = C x + D u; the states x are the basis functions, w is the all-pass output.
+    """State space x(k+1) = A x + B u, w = C x + D u; the states x are the basis functions, w is the
+    all-pass output.
 
     A (B, B), B (B, 1), C (1, B), D (1, 1); the matrix [[A, B], [C, D]] is orthogonal, so A A^T + B B^T = I.
     """
@@ -33,11 +34,12 @@ class LosslessCascade(NamedTuple):
 
 
 def block_parameters(poles: Poles) -> RealArray:
-    """The numbers each block of the cascade needs, (R + P, 4): real [a, sqrt(1 - a^2), 0, 0], pair [gamma, beta, sg, sb].
+    """The numbers each block of the cascade needs, (R + P, 4): real [a, sqrt(1 - a^2), 0, 0], pair [gamma,
+    beta, sg, sb].
 
-    Nothing here subtracts two numbers close to 1 after squaring: 1 - gamma is formed as (1 - |re|)(1 + |re|) - im^2
-    from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 = 1 and
-    gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
+    Nothing here subtracts two numbers close to 1 after squaring: 1 - gamma is formed as (1 - |re|)(1 +
+    |re|) - im^2 from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 =
+    1 and gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
     """
     blocks = np.zeros((poles.real.size + poles.pairs.size, 4))
     n_real = poles.real.size
@@ -45,7 +47,8 @@ def block_parameters(poles: Poles) -> RealArray:
     blocks[:n_real, 1] = np.sqrt((1 - poles.real) * (1 + poles.real))
     re, im = poles.pairs.real, poles.pairs.imag
     gamma = re**2 + im**2
-    # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis function.
+    # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis
+    # function.
     one_minus_gamma = np.maximum((1 - np.abs(re)) * (1 + np.abs(re)) - im**2, np.finfo(np.float64).eps / 4)
     blocks[n_real:, 0] = gamma
     blocks[n_real:, 1] = 2 * re / (1 + gamma)
@@ -57,8 +60,9 @@ def block_parameters(poles: Poles) -> RealArray:
 def basis_state_space(poles: Poles) -> LosslessCascade:
     """Lossless cascade whose states are the basis functions (replaces inverting E in (24)).
 
-    Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B = [sg, 0],
-    C = [-beta sg, sb sg], D = gamma; each block is driven by the all-pass output of the one before.
+    Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B
+    = [sg, 0], C = [-beta sg, sb sg], D = gamma; each block is driven by the all-pass output of the one
+    before.
     """
     n = poles.order
     A, B = np.zeros((n, n)), np.zeros((n, 1))
@@ -146,7 +150,8 @@ def free_response(poles: Poles, n_samples: int) -> RealArray:
 
 @numba.njit(cache=True)
 def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
-    """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass output.
+    """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
+    output.
 
     One block after the other over the whole signal: the recursion of a block is a short chain that the
     processor overlaps, and every row is written once, contiguously.
@@ -183,12 +188,14 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
 
 @numba.njit(cache=True)
 def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
-    """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k = -1.
+    """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k
+    = -1.
 
     Once a block and its input have died out (1e-30, looked at every 32 samples) the rest is set to zero: far
     below rounding, it saves time and keeps denormal numbers (slow) away.
     """
-    # The all-pass response to the impulse: its value at k = -1 (the direct terms), the signal w from k = 0 on.
+    # The all-pass response to the impulse: its value at k = -1 (the direct terms), the signal w from k = 0
+    # on.
     impulse = 1.0
     w = np.zeros(length)
     alive = 0  # w is zero from here on

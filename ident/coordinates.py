@@ -1,8 +1,9 @@
 """Where the pole search looks: boxes from the data, and maps from the unit cube to poles.
 
-Coordinates "log": log10(1 - a) for a real pole, (log10 omega, log10 zeta) for a pair. Coordinates "raw": the paper's
-own x, and (beta, gamma) of (29). Poles of equal type are ordered by the triangular map s2 = s1 + (hi - s1) x2 on
-their first coordinate: two equal real poles are a saddle that DIRECT would sample and a descent cannot leave.
+Coordinates "log": log10(1 - a) for a real pole, (log10 omega, log10 zeta) for a pair. Coordinates "raw":
+the paper's own x, and (beta, gamma) of (29). Poles of equal type are ordered by the triangular map s2 = s1
++ (hi - s1) x2 on their first coordinate: two equal real poles are a saddle that DIRECT would sample and a
+descent cannot leave.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ ZETA_LIMIT = 0.98
 class SearchSpace:
     """Box of a search for n_real real poles and n_pairs pairs, as low and high (3,) of one pole of each type.
 
-    low, high: [real, pair first, pair second] in the coordinates of the module text; frequencies in rad/sample.
+    low, high: [real, pair first, pair second] in the coordinates of the module text; frequencies in
+    rad/sample.
     """
 
     n_real: int
@@ -63,7 +65,8 @@ class SearchSpace:
         return np.asarray(blocks_of_point(unit, self.n_real, self.low, self.high, self.raw))
 
     def poles(self, unit: RealArray) -> Poles:
-        """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta = 0.95."""
+        """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =
+        0.95."""
         blocks = self.blocks(unit)
         gamma, beta = blocks[self.n_real :, 0], blocks[self.n_real :, 1]
         re = beta * (1 + gamma) / 2
@@ -132,7 +135,8 @@ def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
 
 @numba.njit(cache=True)
 def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> Any:
-    """Cascade blocks of a point of the unit cube (see `ident.basis.block_parameters`), without cancellation."""
+    """Cascade blocks of a point of the unit cube (see `ident.basis.block_parameters`), without
+    cancellation."""
     point = _coordinates_of_point(unit, n_real, low, high)
     blocks = np.zeros((n_real + (unit.size - n_real) // 2, 4))
     for i in range(n_real):

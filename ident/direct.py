@@ -53,7 +53,8 @@ def minimise(
 
 
 def best_apart(points: RealArray, costs: RealArray, count: int, apart: float = 0.15) -> RealArray:
-    """Up to `count` of the best points (C, D), each at least `apart` from the better ones chosen before it."""
+    """Up to `count` of the best points (C, D), each at least `apart` from the better ones chosen before
+    it."""
     chosen: list[RealArray] = []
     for i in np.argsort(costs, kind="stable"):
         if all(np.linalg.norm(points[i] - other) >= apart for other in chosen):

@@ -17,10 +17,10 @@ from ident.model import GobfModel
 from ident.options import IdentOptions
 from ident.order_selection import OrderSelection, OrderStep, Progress
 from ident.pole_search import PoleSearch
-from ident.polish import Bounds, Polished, free_optimality
 from ident.poles import Poles
+from ident.polish import Bounds, Polished, free_optimality
 from ident.record import Record
-from ident.regression import Regression, prepare
+from ident.regression import Regression, prepare, thinned
 from ident.search_trace import SearchTrace
 from ident.structure import Structure
 
@@ -148,8 +148,8 @@ def identify(
     Raises
     ------
     ValueError
-        If a record cannot be used (constant signal, several columns, other sampling time) or all of them are too
-        short for the order asked for.
+        If a record cannot be used (constant signal, several columns, other sampling time) or all of them
+        are too short for the order asked for.
 
     Notes
     -----
@@ -163,14 +163,17 @@ def identify(
     refuse_unusable(
         records, data, wanted if wanted else min(2, options.max_real) + 2 * min(1, options.max_pairs)
     )
-    outcome = _searched(data, options, lambda fraction, message: report(0.45 * fraction, message))
-    outcome = _with_initial_state_if_asked_for(records, outcome, report)
-    report(0.95, "test of the offset")
-    outcome = _without_offset_if_needless(records, outcome)
-    report(0.98, "final fit")
-    result = _result(records, outcome)
+    part, in_mid_record = thinned(records, options.search_samples)
+    structure = options.structure()
+    if in_mid_record:
+        structure = replace(structure, estimate_initial_state=True)
+    outcome = _searched(prepare(part, structure), options, lambda f, message: report(0.45 * f, message))
+    if options.estimate_initial_state == "auto" and not in_mid_record:
+        outcome = _searched_with_initial_state(part, outcome, report)
+    report(0.95, "polish and tests on all samples")
+    fitted = _fitted_on_all(records, options, outcome)
     report(1.0, "identified")
-    return result
+    return fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,13 +184,100 @@ class _Outcome:
     search: PoleSearch
     selection: OrderSelection
     best: Polished
-    verdicts: tuple[str, ...] = ()
 
 
 def _searched(data: Regression, options: IdentOptions, report: Progress) -> _Outcome:
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
     return _Outcome(data, search, selection, selection.run())
+
+
+@dataclass(frozen=True)
+class _NuisanceTest:
+    """Likelihood ratio N ln(J without / J with) of a nuisance against its chi-square quantile.
+
+    One degree of freedom per column. Coloured residuals make the statistic larger, so the test errs on the
+    side of estimating the nuisance, which costs only variance.
+    """
+
+    name: str
+    columns: int
+    statistic: float
+
+    @property
+    def limit(self) -> float:
+        return float(chi2.ppf(_NUISANCE_LEVEL, self.columns))
+
+    @property
+    def needed(self) -> bool:
+        return self.statistic > self.limit
+
+    def verdict(self) -> str:
+        return (
+            f"{self.name} {'estimated' if self.needed else 'left out'}: {self.columns} unknowns, test "
+            "statistic "
+            f"{self.statistic:.1f} against {self.limit:.1f} at {_NUISANCE_LEVEL:.0%}"
+        )
+
+
+def _nuisance_test(
+    name: str, without: tuple[Regression, Polished], with_it: tuple[Regression, Polished]
+) -> _NuisanceTest:
+    order = without[1].poles.order
+    columns = with_it[0].n_parameters(order) - without[0].n_parameters(order)
+    ratio = max(without[1].rss, 1e-300) / max(with_it[1].rss, 1e-300)
+    return _NuisanceTest(name, columns, float(without[0].n_samples * np.log(ratio)))
+
+
+def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, report: Progress) -> _Outcome:
+    """Search again with unknown initial states if the fit from rest is improbably worse than one with
+    them."""
+    data, options = outcome.data, outcome.search.options
+    free = prepare(records, replace(data.structure, estimate_initial_state=True))
+    order = outcome.best.poles.order
+    if not free.n_samples > free.n_parameters(order) > data.n_parameters(order):
+        return outcome
+    end = PoleSearch(free, options).descend(outcome.best.poles, "with initial state")
+    if not _nuisance_test("initial state", (data, outcome.best), (free, end)).needed:
+        return outcome
+    return _searched(free, options, lambda fraction, message: report(0.5 + 0.45 * fraction, message))
+
+
+def _fitted_on_all(records: Sequence[Record], options: IdentOptions, outcome: _Outcome) -> Identification:
+    """Polish on all samples and decide what was left to the data: initial state first, then the offset."""
+    structure, search, best = outcome.data.structure, outcome.search, outcome.best
+    data = prepare(records, structure)
+    if data.n_samples != outcome.data.n_samples:
+        best = _moved(data, best, search)
+    verdicts = []
+    for name, key, chosen in (
+        ("initial state", "estimate_initial_state", options.estimate_initial_state),
+        ("offset", "estimate_offset", options.estimate_offset),
+    ):
+        if chosen != "auto":
+            continue
+        here = (data, best)
+        other_data = prepare(records, replace(data.structure, **{key: not getattr(data.structure, key)}))
+        order = best.poles.order
+        if other_data.n_parameters(order) == data.n_parameters(order):
+            continue  # the polynomials that integrators leave free contain the offset
+        if not other_data.n_samples > other_data.n_parameters(order):
+            continue
+        there = (other_data, _moved(other_data, best, search))
+        with_it, without = (here, there) if getattr(data.structure, key) else (there, here)
+        test = _nuisance_test(name, without, with_it)
+        verdicts.append(test.verdict())
+        data, best = with_it if test.needed else without
+    return _result(records, data, best, outcome, tuple(verdicts))
+
+
+def _moved(data: Regression, best: Polished, search: PoleSearch) -> Polished:
+    """The best poles polished on other rows or columns; noted in the trace of the search."""
+    other = PoleSearch(data, search.options)
+    end = other.descend(best.poles, "final polish")
+    search.minima += other.minima
+    search.evaluations += other.evaluations
+    return end
 
 
 def _silent(fraction: float, message: str) -> None:
@@ -198,75 +288,10 @@ def _under(prefix: str, arrays: Mapping[str, np.ndarray[Any, Any]]) -> dict[str,
     return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
 
-def _statistic(n_samples: int, without: Polished, with_it: Polished) -> float:
-    """Likelihood ratio N ln(J without / J with) of a nuisance."""
-    return float(n_samples * np.log(max(without.rss, 1e-300) / max(with_it.rss, 1e-300)))
-
-
-def _with_initial_state_if_asked_for(
-    records: Sequence[Record], outcome: _Outcome, report: Progress
-) -> _Outcome:
-    """Search again with unknown initial states if the fit from rest is improbably worse than one with them.
-
-    Compared with the chi-square quantile, one degree of freedom per column. Coloured residuals make the statistic
-    larger, so the test errs on the side of estimating the initial state, which costs only variance.
-    """
-    options, data = outcome.search.options, outcome.data
-    if options.estimate_initial_state != "auto":
-        return outcome
-    report(0.46, "test of the initial state")
-    free = prepare(records, replace(data.structure, estimate_initial_state=True))
-    order = outcome.best.poles.order
-    columns = free.n_parameters(order) - data.n_parameters(order)
-    if columns == 0 or not free.n_samples > free.n_parameters(order):
-        return outcome
-    trial = PoleSearch(free, options)
-    end = trial.descend(outcome.best.poles, "with initial state")
-    statistic, limit = (
-        _statistic(data.n_samples, outcome.best, end),
-        float(chi2.ppf(_NUISANCE_LEVEL, columns)),
-    )
-    needed = statistic > limit
-    verdict = (
-        f"initial state {'estimated' if needed else 'left out (records start from rest)'}: its {columns} columns "
-        f"lower the test statistic by {statistic:.1f} (limit {limit:.1f} at {_NUISANCE_LEVEL:.0%})"
-    )
-    if needed:
-        outcome = _searched(free, options, lambda fraction, message: report(0.5 + 0.45 * fraction, message))
-    return replace(outcome, verdicts=(*outcome.verdicts, verdict))
-
-
-def _without_offset_if_needless(records: Sequence[Record], outcome: _Outcome) -> _Outcome:
-    """Re-polish without the offsets if the fit with them is not improbably better."""
-    search, data = outcome.search, outcome.data
-    if search.options.estimate_offset != "auto":
-        return outcome
-    reduced = prepare(records, replace(data.structure, estimate_offset=False))
-    order = outcome.best.poles.order
-    columns = data.n_parameters(order) - reduced.n_parameters(order)
-    if columns == 0:  # the polynomial that integrators leave free contains the constant
-        return outcome
-    trial = PoleSearch(reduced, search.options)
-    end = trial.rescan(trial.descend(outcome.best.poles, "without offset"))
-    statistic, limit = (
-        _statistic(data.n_samples, end, outcome.best),
-        float(chi2.ppf(_NUISANCE_LEVEL, columns)),
-    )
-    needed = statistic > limit
-    verdict = (
-        f"offset {'estimated' if needed else 'left out'}: its {columns} columns lower the test statistic by "
-        f"{statistic:.1f} (limit {limit:.1f} at {_NUISANCE_LEVEL:.0%})"
-    )
-    verdicts = (*outcome.verdicts, verdict)
-    if needed:
-        return replace(outcome, verdicts=verdicts)
-    search.minima += trial.minima
-    search.evaluations += trial.evaluations
-    return replace(outcome, data=reduced, best=end, verdicts=verdicts)
-
-
-def _result(records: Sequence[Record], outcome: _Outcome) -> Identification:
-    data, best, search = outcome.data, outcome.best, outcome.search
+def _result(
+    records: Sequence[Record], data: Regression, best: Polished, outcome: _Outcome, verdicts: tuple[str, ...]
+) -> Identification:
+    search = outcome.search
     options = search.options
     linear = fit(data, best.poles)
     model = GobfModel(
@@ -303,10 +328,8 @@ def _result(records: Sequence[Record], outcome: _Outcome) -> Identification:
         tangent_optimality=free_optimality(
             linearisation(data, best.poles), best.poles, bounds, fixed.real.size, fixed.pairs.size
         ),
-        order_table=tuple(
-            sorted(outcome.selection.steps.values(), key=lambda step: (step.order, step.n_real))
-        ),
-        verdicts=outcome.verdicts,
+        order_table=outcome.selection.table(outcome.best),
+        verdicts=verdicts,
         search=SearchTrace(
             tuple(search.stages), tuple(search.minima), tuple(dict.fromkeys(warnings)), search.evaluations
         ),
@@ -320,19 +343,22 @@ def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> li
     for a in poles.real[fixed.real.size :]:
         if 1 - a <= bounds.distance_min * close:
             sentences.append(
-                f"a real pole went to the slow bound (a = {a:.9g}): it is an integrator as far as the record can "
+                f"a real pole went to the slow bound (a = {a:.9g}): it is an integrator as far as the "
+                "record can "
                 "tell; try integrators = 1 more and compare"
             )
         elif 1 - a >= bounds.distance_max / close:
             sentences.append(
-                f"a real pole went to the fast bound (a = {a:.3g}): it stands for a direct term or a delay; try "
+                f"a real pole went to the fast bound (a = {a:.3g}): it stands for a direct term or a "
+                "delay; try "
                 "feedthrough = true, another input_delay_samples, or one real pole less"
             )
     omegas, zetas = poles.omega_rad_s(dt_s), poles.zeta()
     for pole, omega, zeta in list(zip(poles.pairs, omegas, zetas, strict=True))[fixed.pairs.size :]:
         if zeta >= ZETA_LIMIT - 1e-6:
             sentences.append(
-                f"a pole pair at {omega:.4g} rad/s is overdamped (zeta = {zeta:.2f}): replace the pair by two real poles"
+                f"a pole pair at {omega:.4g} rad/s is overdamped (zeta = {zeta:.2f}): replace the pair "
+                "by two real poles"
             )
         elif zeta >= bounds.zeta_max / close or zeta <= bounds.zeta_min * close:
             sentences.append(
@@ -340,12 +366,14 @@ def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> li
             )
         elif -np.log(abs(pole)) <= bounds.s_min * close:
             sentences.append(
-                f"the pole pair at {omega:.4g} rad/s does not decay within the record: its damping cannot be told; "
+                f"the pole pair at {omega:.4g} rad/s does not decay within the record: its damping "
+                "cannot be told; "
                 "record longer"
             )
         if not bounds.omega_min * close < omega * dt_s < bounds.omega_max / close:
             sentences.append(
-                f"a pole pair went to the bound of its frequency ({omega:.4g} rad/s): widen the bound, or fit one "
+                f"a pole pair went to the bound of its frequency ({omega:.4g} rad/s): widen the bound, "
+                "or fit one "
                 "pair less"
             )
     return sentences

@@ -16,7 +16,8 @@ _WEAK_INPUT = 1e-4
 
 
 def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> None:
-    """Raise ValueError for a constant input or output, or too few samples for `order` poles; names the record."""
+    """Raise ValueError for a constant input or output, or too few samples for `order` poles; names the
+    record."""
     for record in records:
         for kind, signal, names in (
             ("input", record.input, record.input_names),
@@ -59,14 +60,16 @@ def advice(records: Sequence[Record], data: Regression, order: int) -> list[str]
             share = clipped_share(signal[:, 0])
             if share > 0:
                 sentences.append(
-                    f"{record.label}: {share:.1%} of {kind} '{names[0]}' stand at its very limit, as if saturated "
+                    f"{record.label}: {share:.1%} of {kind} '{names[0]}' stand at its very limit, as if "
+                    "saturated "
                     "or clipped: lower the amplitude, or cut those samples out"
                 )
     return sentences
 
 
 def excitation_limit_rad_s(records: Sequence[Record]) -> float:
-    """Highest frequency at which the input of any record still has 1e-4 of its largest spectral density, rad/s."""
+    """Highest frequency at which the input of any record still has 1e-4 of its largest spectral density,
+    rad/s."""
     highest = 0.0
     for record in records:
         u = record.input[:, 0]

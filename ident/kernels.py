@@ -1,7 +1,7 @@
 """Compiled inner loops of the pole search: the cost of a candidate and the linearisation of a fit.
 
-Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1]. Matrices are
-kept as rows (columns of the regression), so that every inner loop runs over contiguous memory.
+Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1].
+Matrices are kept as rows (columns of the regression), so that every inner loop runs over contiguous memory.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 
 from ident.basis import run_cascade, run_cascade_free
 
-# A column whose part outside the columns before it is below this fraction of its length carries no information.
+# A column whose part outside the columns before it is below this fraction of its length carries no
+# information.
 _RANK_TOLERANCE = 1e-11
 
 
@@ -70,10 +71,11 @@ def candidate_rss(
 ) -> float:
     """Residual sum of squares when the given blocks join what is already fitted.
 
-    w (N,) drives the candidate blocks (the input, or the all-pass output of the frozen poles); residual (N,) is
-    what the frozen columns leave of y; local_q (Ql, N) and shared_q (Qs, N) are those columns made orthonormal,
-    within each record and over all. With `free` the candidate poles also get their free responses per record.
-    Works on the Gram matrix: good to about 1e-10 of |residual|^2, enough to rank candidates.
+    w (N,) drives the candidate blocks (the input, or the all-pass output of the frozen poles); residual
+    (N,) is what the frozen columns leave of y; local_q (Ql, N) and shared_q (Qs, N) are those columns made
+    orthonormal, within each record and over all. With `free` the candidate poles also get their free
+    responses per record. Works on the Gram matrix: good to about 1e-10 of |residual|^2, enough to rank
+    candidates.
     """
     n_records = starts.size - 1
     n_total = residual.size
@@ -209,8 +211,8 @@ def linearise(
         triangle[j, j] = _normalise(row, size, 0, n_total)
         theta[j] = _dot(row, residual, 0, n_total)
         _subtract(residual, theta[j], row, 0, n_total)
-    # The fitted output that the poles make. With free responses among the columns a polynomial part does no harm
-    # (filtered, it stays in the span of the columns); without them it has to be left out.
+    # The fitted output that the poles make. With free responses among the columns a polynomial part does no
+    # harm (filtered, it stays in the span of the columns); without them it has to be left out.
     fitted = y - residual
     if not free:
         for j in range(n_shared - 1, -1, -1):
@@ -244,7 +246,8 @@ def linearise(
 
 @numba.njit(cache=True)
 def _normalise(row: Any, size_before: float, lo: int, hi: int) -> float:
-    """Scale row[lo:hi] to length 1 and return the length it had, or set it to zero if nothing of it is left."""
+    """Scale row[lo:hi] to length 1 and return the length it had, or set it to zero if nothing of it is
+    left."""
     size = _dot(row, row, lo, hi)
     if not size > _RANK_TOLERANCE**2 * size_before:
         row[lo:hi] = 0.0
@@ -253,4 +256,4 @@ def _normalise(row: Any, size_before: float, lo: int, hi: int) -> float:
     part = row[lo:hi]
     for k in range(part.size):
         part[k] /= length
-    return length
+    return float(length)

@@ -12,7 +12,8 @@ from ident.kernels import linearise
 from ident.poles import Poles
 from ident.regression import Regression
 
-# Directions of the columns weaker than this fraction of the strongest are left at zero: the data do not show them.
+# Directions of the columns weaker than this fraction of the strongest are left at zero: the data do not
+# show them.
 _RANK_TOLERANCE = 1e-12
 
 
@@ -40,7 +41,8 @@ class Projection:
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """Least-squares fit for given poles: coefficients (B,), direct term, residual (N,), residual sum of squares."""
+    """Least-squares fit for given poles: coefficients (B,), direct term, residual (N,), residual sum of
+    squares."""
 
     coefficients: RealArray
     feedthrough: float
@@ -65,7 +67,8 @@ def local_columns(data: Regression, poles: Poles, record: int) -> RealArray:
 
 
 def project(data: Regression, shared: Poles, local: Poles | None = None) -> Projection:
-    """Orthonormalise the columns of a regression; `local` are the poles of the free responses (default: the same).
+    """Orthonormalise the columns of a regression; `local` are the poles of the free responses (default: the
+    same).
 
     With `shared` doubled and `local` not, the residual is the one that candidates for a further pole see: all
     first-order changes of the poles are taken out of it (design 4.3).
@@ -134,7 +137,8 @@ class Linearisation:
 
 
 def linearisation(data: Regression, poles: Poles) -> Linearisation:
-    """Cost, residual and Kaufman linearisation at the given poles (compiled; see `ident.kernels.linearise`)."""
+    """Cost, residual and Kaufman linearisation at the given poles (compiled; see
+    `ident.kernels.linearise`)."""
     n = poles.order
     residual, normal, gradient = np.empty(data.n_samples), np.empty((n, n)), np.empty(n)
     rss = linearise(

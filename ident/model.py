@@ -16,7 +16,8 @@ from ident.structure import filter_input
 
 @dataclass(frozen=True, eq=False)
 class GobfModel:
-    """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and (5).
+    """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
+    (5).
 
     Attributes
     ----------
@@ -49,7 +50,8 @@ class GobfModel:
         object.__setattr__(self, "coefficients", readonly_real(self.coefficients))
         if self.coefficients.shape != (self.poles.order,):
             raise ValueError(
-                f"need one coefficient per basis function, shape ({self.poles.order},); got {self.coefficients.shape}"
+                f"need one coefficient per basis function, shape ({self.poles.order},); got "
+                f"{self.coefficients.shape}"
             )
         if not (np.all(np.isfinite(self.coefficients)) and np.isfinite(self.feedthrough)):
             raise ValueError("the coefficients and the direct term must be finite")
@@ -85,7 +87,8 @@ class GobfModel:
     def state_space(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
         """(A, B, C, D) of the cascade delay -> integrators -> lossless basis; (n, n), (n, 1), (1, n), (1, 1).
 
-        The basis keeps its orthogonal realisation (no expansion into polynomials, which loses order-12 models).
+        The basis keeps its orthogonal realisation (no expansion into polynomials, which loses order-12
+        models).
         """
         # Front end as scalar stages in series; the state vector is [delay line, integrators, basis].
         delay, k, n = self.input_delay_samples, self.integrators, self.order

@@ -63,11 +63,14 @@ class IdentOptions(BaseModel):
     algorithm: Algorithm = Field("GN_DIRECT_L", description="NLopt's DIRECT variants, or scipy's")
     coordinates: Literal["log", "raw"] = Field(
         "log",
-        description="log10 of decay, frequency and damping; or the (x, beta, gamma) of the paper, which miss the best "
+        description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the best "
         "poles more often than not",
     )
     evaluations: int = Field(
         500, ge=20, le=1_000_000, description="cost evaluations of the first global search"
+    )
+    search_samples: int = Field(
+        20_000, ge=100, description="longer data are searched on a part of them, then polished on all"
     )
     starts: int = Field(4, ge=1, le=20, description="points of a global search that are polished")
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
+from ident.arrays import RealArray
+from ident.least_squares import linearisation
 from ident.options import IdentOptions
 from ident.pole_search import PoleSearch
 from ident.poles import Poles
@@ -22,7 +26,9 @@ _EXPLAINED = 1e-18
 class OrderStep:
     """One structure that was tried: numbers of searched poles, residual sum of squares and criterion.
 
-    criterion = N ln(J/N) + 2 n ln N, lower is better: a pole costs two numbers, itself and a coefficient.
+    criterion = Ne ln(J/N) + (2 n + nuisances) ln Ne, lower is better: a pole costs two numbers, itself and a
+    coefficient, and one more per record whose initial state is estimated. Ne is the number of independent
+    samples that the chosen model's residual is worth, N where it is white.
     """
 
     n_real: int
@@ -35,6 +41,27 @@ class OrderStep:
         return self.n_real + 2 * self.n_pairs
 
 
+def effective_samples(residual: RealArray, starts: npt.NDArray[np.int64]) -> float:
+    """Number of independent samples a residual is worth: N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth.
+
+    Bartlett: that factor is by how much colour widens the scatter of quadratic forms such as J. With N
+    itself a criterion goes on adding poles that describe noise, friction and the like, without end on long
+    records.
+    """
+    n = residual.size
+    lags = min(200, int(np.min(np.diff(starts))) // 10)
+    covariance = np.zeros(lags + 1)
+    for lo, hi in pairwise(starts):
+        part = residual[lo:hi]
+        size = 1 << int(2 * part.size - 1).bit_length()
+        covariance += np.fft.irfft(np.abs(np.fft.rfft(part, size)) ** 2, size)[: lags + 1]
+    if not covariance[0] > 0:
+        return float(n)
+    rho = covariance[1:] / covariance[0]
+    # What white noise shows by chance, 1/N per lag, is no colour.
+    return float(n / (1 + 2 * np.sum(np.maximum(rho**2 - 1 / n, 0.0))))
+
+
 class OrderSelection:
     """Grows and prunes the set of poles of one search."""
 
@@ -42,7 +69,7 @@ class OrderSelection:
         self.search = search
         self.options: IdentOptions = search.options
         self.progress = progress
-        self.steps: dict[tuple[int, int], OrderStep] = {}
+        self._tried: dict[tuple[int, int], float] = {}
         self._n = search.data.n_samples
         self._power = float(search.data.y @ search.data.y)
 
@@ -65,11 +92,20 @@ class OrderSelection:
                 break
         return best
 
+    def table(self, best: Polished) -> tuple[OrderStep, ...]:
+        """Everything that was tried, by order, judged by the residual of the chosen model."""
+        worth = self._worth(best)
+        steps = [
+            OrderStep(n_real, n_pairs, rss, self._criterion(rss, n_real + 2 * n_pairs, worth))
+            for (n_real, n_pairs), rss in self._tried.items()
+        ]
+        return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
+
     def _grow_pairs(self, best: Polished, most_pairs: int) -> Polished:
         while (count := self._counts(best)[1]) < most_pairs and self._visible(best):
             self.progress(0.1 + 0.8 * count / max(most_pairs, 1), f"search for pole pair {count + 1}")
             trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
-            if self.options.n_pairs is None and not self._gain(best, trial) > 4 * np.log(self._n):
+            if self.options.n_pairs is None and not self._better(trial, best, self._worth(trial)):
                 break
             best = trial
         return best
@@ -77,7 +113,7 @@ class OrderSelection:
     def _grow_real(self, best: Polished) -> Polished:
         while self._counts(best)[0] < self.options.max_real and self._visible(best):
             trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
-            if not self._gain(best, trial) > 2 * np.log(self._n):
+            if not self._better(trial, best, self._worth(trial)):
                 break
             best = trial
         return best
@@ -93,20 +129,27 @@ class OrderSelection:
             if self.options.n_pairs is None:
                 for i in range(fixed.pairs.size, best.poles.pairs.size):
                     trials.append(Poles(best.poles.real, np.delete(best.poles.pairs, i)))
+            worth = self._worth(best) if trials else 0.0
             ends = [self._noted(self.search.descend(poles, "pruning", 1e-4)) for poles in trials]
-            # Per pole that would go: what the fit loses against what the criterion asks it to be worth.
-            ends = [end for end in ends if self._excess(end) < self._excess(best)]
+            ends = [end for end in ends if self._better(end, best, worth)]
             if not ends:
                 return best
-            best = self._noted(self.search.descend(min(ends, key=self._excess).poles, "pruning"))
+            chosen = min(ends, key=lambda end: self._criterion(end.rss, end.poles.order, worth))
+            best = self._noted(self.search.descend(chosen.poles, "pruning"))
 
-    def _excess(self, end: Polished) -> float:
-        floor = max(end.rss, _EXPLAINED * self._power, np.finfo(np.float64).tiny)
-        return float(self._n * np.log(floor / self._n) + 2 * end.poles.order * np.log(self._n))
+    def _better(self, trial: Polished, best: Polished, worth: float) -> bool:
+        """Is the trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne (design 4.3)."""
+        return self._criterion(trial.rss, trial.poles.order, worth) < self._criterion(
+            best.rss, best.poles.order, worth
+        )
 
-    def _gain(self, before: Polished, after: Polished) -> float:
-        floor = max(after.rss, np.finfo(np.float64).tiny)
-        return float(self._n * np.log(before.rss / floor))
+    def _criterion(self, rss: float, order: int, worth: float) -> float:
+        floor = max(rss, _EXPLAINED * self._power, np.finfo(np.float64).tiny)
+        return float(worth * np.log(floor / self._n) + self.search.data.n_parameters(order) * np.log(worth))
+
+    def _worth(self, end: Polished) -> float:
+        data = self.search.data
+        return effective_samples(linearisation(data, end.poles).residual, data.starts)
 
     def _visible(self, best: Polished) -> bool:
         enough = self._n > 2 * self.search.data.n_parameters(best.poles.order + 2)
@@ -118,7 +161,5 @@ class OrderSelection:
 
     def _noted(self, end: Polished) -> Polished:
         key = self._counts(end)
-        step = OrderStep(*key, rss=end.rss, criterion=self._excess(end))
-        if key not in self.steps or step.rss < self.steps[key].rss:
-            self.steps[key] = step
+        self._tried[key] = min(end.rss, self._tried.get(key, np.inf))
         return end

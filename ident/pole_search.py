@@ -13,14 +13,15 @@ from ident.direct import best_apart, minimise
 from ident.kernels import candidate_rss
 from ident.least_squares import Projection, driving_signal, project
 from ident.options import IdentOptions
-from ident.polish import Bounds, Polished, polish
 from ident.poles import Poles
+from ident.polish import Bounds, Polished, polish
 from ident.regression import Regression
 from ident.search_trace import PolishedMinimum, SearchStage
 
 # A rescan has to gain this fraction of J to count.
 _GAIN = 1e-6
-# Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the end.
+# Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
+# end.
 _ROUGH = 1e-4
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
 _PAIR_EVALUATIONS = 240
@@ -77,7 +78,8 @@ class PoleSearch:
         )
 
     def rescan(self, best: Polished) -> Polished:
-        """Look at each block on a grid with the rest frozen, descend from what is found, until nothing is gained."""
+        """Look at each block on a grid with the rest frozen, descend from what is found, until nothing is
+        gained."""
         for _ in range(6):
             found = self._rescan_real(best)
             for index in range(self.fixed.pairs.size, best.poles.pairs.size):

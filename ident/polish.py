@@ -1,11 +1,12 @@
 """Local descent in the poles: Levenberg-Marquardt on Kaufman's Jacobian (design 4.2).
 
-Modulo the columns of the regression, moving a pole changes the fitted output y_hat by -(dD_b/dp)/D_b y_hat, D_b(z)
-being the denominator of its block: the numerator is re-fitted anyway. So the sensitivities are combinations of the
-block's own states driven by y_hat, and dJ/dp = -2 r^T s_p holds exactly because r is orthogonal to the columns.
+Modulo the columns of the regression, moving a pole changes the fitted output y_hat by -(dD_b/dp)/D_b y_hat,
+D_b(z) being the denominator of its block: the numerator is re-fitted anyway. So the sensitivities are
+combinations of the block's own states driven by y_hat, and dJ/dp = -2 r^T s_p holds exactly because r is
+orthogonal to the columns.
 
-The unknowns are decay rates and angles, linear, so that a pole can reach the circle: 1 - a for a real pole, (s, f) with
-p = exp(-s +- j f) for a pair.
+The unknowns are decay rates and angles, linear, so that a pole can reach the circle: 1 - a for a real pole,
+(s, f) with p = exp(-s +- j f) for a pair.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class Polished:
-    """End of a descent: poles, residual sum of squares, iterations; `converged` if a stationary point was reached."""
+    """End of a descent: poles, residual sum of squares, iterations; `converged` if a stationary point was
+    reached."""
 
     poles: Poles
     rss: float
@@ -152,7 +154,8 @@ def polish(
 def pole_system(
     here: Linearisation, poles: Poles, n_fixed_real: int = 0, n_fixed_pairs: int = 0
 ) -> tuple[RealArray, RealArray]:
-    """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T r."""
+    """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T
+    r."""
     chain = _chain_rule(poles, n_fixed_real, n_fixed_pairs)
     return chain.T @ here.normal @ chain, chain.T @ here.gradient
 
@@ -179,7 +182,8 @@ def free_optimality(
 
 
 def _chain_rule(poles: Poles, n_fixed_real: int, n_fixed_pairs: int) -> RealArray:
-    """(B, P): sensitivity to each free unknown as a combination of the block states driven by the fitted output.
+    """(B, P): sensitivity to each free unknown as a combination of the block states driven by the fitted
+    output.
 
     States of a real block: b/(z - a) y_hat; of a pair: sg (z - beta)/D y_hat and sg sb/D y_hat, with
     D = z^2 - t z + g, t = 2 exp(-s) cos f, g = exp(-2 s).

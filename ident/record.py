@@ -36,7 +36,8 @@ class Record:
     Raises
     ------
     ValueError
-        If a shape or a name does not fit, dt_s is not positive, or a sample is not finite (names the first one).
+        If a shape or a name does not fit, dt_s is not positive, or a sample is not finite (names the first
+        one).
     """
 
     name: str
@@ -73,7 +74,8 @@ class Record:
         object.__setattr__(self, key, signal)
         if signal.ndim != 2 or signal.shape[1] != len(names) or not names:
             raise ValueError(
-                f"{self.label}: {key} must be (T, {len(names)}), one column per name {list(names)}; got shape {signal.shape}"
+                f"{self.label}: {key} must be (T, {len(names)}), one column per name {list(names)}; got "
+                f"shape {signal.shape}"
             )
         if len(set(names)) != len(names):
             raise ValueError(f"{self.label}: {key} names must be distinct; got {list(names)}")
@@ -86,7 +88,8 @@ class Record:
         if bad.size:
             k, column = bad[0]
             raise ValueError(
-                f"{self.label}: {key} column '{names[column]}' is {signal[k, column]} at index {k}; expected finite numbers"
+                f"{self.label}: {key} column '{names[column]}' is {signal[k, column]} at index {k}; "
+                "expected finite numbers"
             )
 
     @property
@@ -101,7 +104,7 @@ class Record:
     @property
     def time_s(self) -> RealArray:
         """Sampling instants (T,), starting at 0."""
-        return np.arange(self.n_samples) * self.dt_s
+        return np.arange(self.n_samples, dtype=np.float64) * self.dt_s
 
     def siso(self, input_name: str | None = None, output_name: str | None = None) -> Record:
         """The record with one input and one output; a name may be left out where there is only one column."""

@@ -1,4 +1,5 @@
-"""Reading columns of numbers from log files; every complaint is one line that names file, place and expectation."""
+"""Reading columns of numbers from log files; every complaint is one line that names file, place and
+expectation."""
 
 from __future__ import annotations
 
@@ -14,14 +15,15 @@ import pandas as pd
 
 from ident.arrays import RealArray
 
-# Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase of a
-# sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
+# Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
+# of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
 TIME_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Named columns of one file. `first_line` is the file line of row 0, or None where rows have no lines (npz, mat)."""
+    """Named columns of one file. `first_line` is the file line of row 0, or None where rows have no lines
+    (npz, mat)."""
 
     path: Path
     names: tuple[str, ...]
@@ -81,16 +83,19 @@ class Table:
         bad = np.flatnonzero(~np.isfinite(numbers))
         if bad.size:
             raise ValueError(
-                f"{self.path}, {self.place(int(bad[0]))}: column '{name}' is {numbers[bad[0]]}; expected a finite number"
+                f"{self.path}, {self.place(int(bad[0]))}: column '{name}' is {numbers[bad[0]]}; "
+                "expected a finite number"
             )
 
     def sampling_time(self, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
-        """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both are there.
+        """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both
+        are there.
 
         Raises
         ------
         ValueError
-            If neither is given, dt_s is not positive, or the stamps are not increasing and uniform to `TIME_TOLERANCE`.
+            If neither is given, dt_s is not positive, or the stamps are not increasing and uniform to
+            `TIME_TOLERANCE`.
         """
         if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
             raise ValueError(f"{self.path}: dt_s must be a positive number of seconds; got {dt_s}")
@@ -109,16 +114,19 @@ class Table:
         if backwards.size:
             row = int(backwards[0]) + 1
             raise ValueError(
-                f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to {stamps[row]:.9g} s; "
+                f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
+                f"{stamps[row]:.9g} s; "
                 "expected increasing time"
             )
-        # The median says what the step is even where samples are lost; the mean over all is the better estimate after.
+        # The median says what the step is even where samples are lost; the mean over all is the better
+        # estimate after.
         median = float(np.median(interval))
         uneven = np.flatnonzero(~(np.abs(interval - median) <= TIME_TOLERANCE * median))
         if uneven.size:
             row = int(uneven[0]) + 1
             raise ValueError(
-                f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s where most steps are "
+                f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s "
+                "where most steps are "
                 f"{median:.6g} s; expected uniform sampling (each step within {TIME_TOLERANCE:.0%})"
             )
         mean = float((stamps[-1] - stamps[0]) / interval.size)
@@ -136,7 +144,8 @@ def read_csv(path: str | PathLike[str], separator: str = ",") -> Table:
     """A text table with one header line. Numbers use a decimal point."""
     file = _existing(path)
     try:
-        # As text: only so can a complaint quote what stands at the place. Blank lines stay, to keep the line numbers.
+        # As text: only so can a complaint quote what stands at the place. Blank lines stay, to keep the
+        # line numbers.
         frame = pd.read_csv(
             file,
             sep=separator,

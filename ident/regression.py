@@ -78,7 +78,8 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
     for record in records:
         if record.input.shape[1] != 1 or record.output.shape[1] != 1:
             raise ValueError(
-                f"{record.label}: identification takes one input and one output, got {list(record.input_names)} "
+                f"{record.label}: identification takes one input and one output, got "
+                f"{list(record.input_names)} "
                 f"and {list(record.output_names)}; choose with Record.siso"
             )
         if not abs(record.dt_s - dt_s) <= 1e-3 * dt_s:
@@ -103,3 +104,24 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
         structure=structure,
         dt_s=dt_s,
     )
+
+
+def thinned(records: Sequence[Record], limit: int) -> tuple[list[Record], bool]:
+    """Part of the records with about `limit` samples for a search, and whether it starts in mid-record.
+
+    Whole records, evenly chosen, as many as fit; if not even one fits, the most exciting stretch of the
+    first.
+    """
+    total = sum(record.n_samples for record in records)
+    if total <= limit:
+        return list(records), False
+    count = max(1, int(len(records) * limit / total))
+    chosen = [records[i] for i in np.linspace(0, len(records), count, endpoint=False).astype(int)]
+    if count > 1 or chosen[0].n_samples <= limit:
+        return chosen, False
+    record = chosen[0]
+    starts = range(0, record.n_samples - limit + 1, max(limit // 4, 1))
+    # Ties (a periodic or binary input) go to the beginning, where the record may well start from rest.
+    power = [float(np.var(record.input[start : start + limit])) for start in starts]
+    best = starts[int(np.argmax(np.array(power) > 0.9 * max(power)))]
+    return [record.slice(best, best + limit)], best > 0

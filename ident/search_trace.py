@@ -27,13 +27,15 @@ class SearchStage:
         object.__setattr__(self, "log_cost", readonly_real(self.log_cost))
         if self.points.shape != (self.log_cost.size, len(self.coordinate_names)):
             raise ValueError(
-                f"points must be ({self.log_cost.size}, {len(self.coordinate_names)}); got {self.points.shape}"
+                f"points must be ({self.log_cost.size}, {len(self.coordinate_names)}); got "
+                f"{self.points.shape}"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class PolishedMinimum:
-    """End of one descent: where it was started from, the poles it reached and their residual sum of squares."""
+    """End of one descent: where it was started from, the poles it reached and their residual sum of
+    squares."""
 
     stage: str
     poles: Poles

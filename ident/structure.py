@@ -1,4 +1,5 @@
-"""What is known or assumed around the basis: integrators, delay, direct term, and the nuisance columns of a fit."""
+"""What is known or assumed around the basis: integrators, delay, direct term, and the nuisance columns of a
+fit."""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ class Structure:
     """Fixed structure of y = [sum_i c_i L_i(q) + feedthrough] (1 - q^-1)^-integrators q^-delay u + nuisance.
 
     The nuisance columns belong to each record by itself: a constant (`estimate_offset`), and with
-    `estimate_initial_state` the free responses of all poles together with the polynomials that the integrators
-    leave free (1, k, ... up to k^(integrators - 1)).
+    `estimate_initial_state` the free responses of all poles together with the polynomials that the
+    integrators leave free (1, k, ... up to k^(integrators - 1)).
     """
 
     integrators: int = 0
@@ -42,7 +43,8 @@ class Structure:
 
 
 def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
-    """u (T,) delayed by whole samples (zeros before the record), then summed `integrators` times: 1/(1 - q^-1)^k, exact."""
+    """u (T,) delayed by whole samples (zeros before the record), then summed `integrators` times: 1/(1 -
+    q^-1)^k, exact."""
     u = np.asarray(u, dtype=np.float64)
     delayed = np.zeros_like(u)
     delayed[delay_samples:] = u[: max(u.size - delay_samples, 0)]
