@@ -106,7 +106,8 @@ def run(
     held = np.zeros(n_held)
     new = np.empty(n)
     start = np.empty(n_channels)
-    free, position = np.empty(2 * n_channels), np.empty(2 * n_channels)
+    free, position = np.empty(2 * n_channels), np.zeros(2 * n_channels)
+    middle, end = position[:n_channels], position[n_channels:]
     f = np.zeros((3, n_channels))
     wanted = np.zeros(n_elements, dtype=np.int64)
     for k in range(inputs.shape[0]):
@@ -165,9 +166,10 @@ def run(
                         )
                         for j in range(n_channels):
                             f[1, j], f[2, j] = f[0, j], f[0, j]
-                        # Collocation at start, middle and end (order 4); a contraction for these soft forces.
+                        # Collocation at start, middle and end (order 4). Sweeps contract by h |df/dv| / J
+                        # or less, a few per cent, so the error left is that much below the last change.
                         for sweep in range(12):
-                            change, size = 0.0, 1e-12
+                            change, size = 0.0, 1e-3
                             for j in range(2 * n_channels):
                                 previous = position[j]
                                 total = free[j]
@@ -177,10 +179,10 @@ def run(
                                 position[j] = total
                                 change = max(change, abs(total - previous))
                                 size = max(size, abs(total))
-                            if sweep > 0 and change <= 1e-13 * size:
+                            if sweep > 0 and change <= 1e-9 * size:
                                 break
                             _smooth_forces(
-                                position[:n_channels],
+                                middle,
                                 f[1],
                                 mode,
                                 channel_kind,
@@ -189,7 +191,7 @@ def run(
                                 geometric_stiffness,
                             )
                             _smooth_forces(
-                                position[n_channels:],
+                                end,
                                 f[2],
                                 mode,
                                 channel_kind,

@@ -26,8 +26,10 @@ from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]
 
-# Basic step where something switches or is not linear: 8 a sample at 5 ms.
+# Basic step where something switches: 8 a sample at 5 ms. Twice that where forces are smooth.
 SUBSTEP_S = 6.25e-4
+# A ripple of N cycles advances by at most this phase in one step at the speed of a brisk slew.
+_RIPPLE_PHASE_RAD, _SLEW_RAD_S = 0.25, 5.0
 # A basic step is halved this many times to place a switching instant (to 1.2 us at the basic step above).
 _HALVINGS = 9
 # A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
@@ -326,7 +328,9 @@ class _Builder:
     def longest_step_s(
         self, element: Real, element_rows: Real, held_columns: Real, substep_s: float
     ) -> float:
-        longest = substep_s
+        longest = substep_s if element.shape[0] else 2 * substep_s
+        for ripple in self.machine.joint.ripple:
+            longest = min(longest, _RIPPLE_PHASE_RAD / (_SLEW_RAD_S * max(ripple.cycles_per_rev, 1.0)))
         for e in range(element.shape[0]):
             stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
             mobility = abs(element_rows[e, 1] @ held_columns[:, 3 + e])

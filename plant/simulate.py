@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from plant.plan import SUBSTEP_S, make_plan
 from plant.rig import Rig
 
 Real = npt.NDArray[np.float64]
+F = TypeVar("F", float, Real)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +117,17 @@ def simulate(
         inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
     observed = np.empty((n_samples, 3))
     plan.advance(inputs, observed, plan.at_rest())
+    hub, tip, tip_behind = observed.T
     time = np.arange(n_samples, dtype=np.float64) * dt
-    noise = None if rng is None else rng.standard_normal((n_samples, 2))
-    measured = _measured(machine, observed[:, [0, 2]], time, noise)
-    return Trajectory(time, voltage, measured[:, 0], measured[:, 1], observed[:, 0], observed[:, 1])
+    noise = _noise(machine, rng, n_samples)
+    return Trajectory(
+        time_s=time,
+        voltage_V=voltage,
+        hub_angle_rad=hub + noise[:, 0],
+        tip_m=_tip_reading(machine.sensor, tip_behind, time, noise[:, 1]),
+        hub_angle_true_rad=hub,
+        tip_true_m=tip,
+    )
 
 
 class SampledArm:
@@ -171,10 +179,12 @@ class SampledArm:
     def measure(self) -> Real:
         """(2,) hub_angle_rad, tip_m at t_k as measured; asking twice at one instant gives the same sample."""
         if self._measurement is None:
-            now = (self._rows @ self._state.x)[[0, 2]][None, :]
-            noise = None if self._rng is None else self._rng.standard_normal((1, 2))
-            time = np.array([self._sample * self._dt_s])
-            self._measurement = _measured(self._machine, now, time, noise)[0]
+            hub, _, tip = (self._rows @ self._state.x).tolist()
+            hub_noise, tip_noise = (0.0, 0.0) if self._rng is None else self._rng.standard_normal(2).tolist()
+            sensors = self._machine.rig.sensors
+            time = self._sample * self._dt_s
+            reading = _tip_reading(self._machine.sensor, tip, time, sensors.tip_noise_m * tip_noise)
+            self._measurement = np.array([hub + sensors.hub_angle_noise_rad * hub_noise, reading])
         return self._measurement.copy()
 
     def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
@@ -205,18 +215,20 @@ def _static(machine: Machine, voltage: Real) -> Real:
     return np.asarray(np.copysign(np.clip(np.abs(value) - path.dead_zone_V, 0.0, path.limit_V), value))
 
 
-def _measured(
-    machine: Machine, output: Real, time: Real, noise: npt.NDArray[np.floating[Any]] | None
-) -> Real:
-    """Gain, drift, noise and quantisation of (T, 2) outputs whose tip is already behind the sensor lag."""
-    sensor: SensorPath = machine.sensor
-    measured = output.copy()
-    measured[:, 1] = sensor.gain * measured[:, 1] + sensor.drift_m_s * time
-    if noise is not None:
-        measured += noise * (machine.rig.sensors.hub_angle_noise_rad, machine.rig.sensors.tip_noise_m)
+def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int) -> Real:
+    """(T, 2) noise of hub angle and tip, drawn sample by sample; zeros without a generator."""
+    if rng is None:
+        return np.zeros((n_samples, 2))
+    sensors = machine.rig.sensors
+    return rng.standard_normal((n_samples, 2)) * (sensors.hub_angle_noise_rad, sensors.tip_noise_m)
+
+
+def _tip_reading(sensor: SensorPath, tip: F, time: F, noise: F) -> F:
+    """Gain, drift, noise and quantisation of a tip position that is already behind the sensor lag."""
+    reading = sensor.gain * tip + sensor.drift_m_s * time + noise
     if sensor.step_m > 0:
-        measured[:, 1] = sensor.step_m * np.round(measured[:, 1] / sensor.step_m)
-    return measured
+        reading = sensor.step_m * np.rint(reading / sensor.step_m)
+    return reading
 
 
 def _sampling_period(rig: Rig, dt_s: float | None) -> float:

@@ -104,7 +104,7 @@ def parse_effect(entry: Mapping[str, Any]) -> Effect:
     if "name" not in entry:
         raise ValueError(f"effect without a name; known effects: {', '.join(EFFECTS)}")
     name = entry["name"]
-    if name not in EFFECTS:
+    if not isinstance(name, str) or name not in EFFECTS:
         raise ValueError(f"unknown effect {name!r}; known effects: {', '.join(EFFECTS)}")
     try:
         return EFFECTS[name].model_validate({key: value for key, value in entry.items() if key != "name"})

@@ -47,9 +47,8 @@ def _exact_response(rig, omega):
 
 def test_response_is_that_of_the_beam_equation():
     exact = _exact_response(RIG, OMEGA)
-    # The modal series converges like the third power of the number of modes for what the hub does, and the
-    # worst relative errors sit at the notches; measured 4e-6 with 40 modes and 2e-3 with 6.
-    for n_modes, tolerance in ((40, 2e-5), (6, 5e-3)):
+    # Up to 64 Hz, notches included; measured 2.7e-2, 3.7e-4 and 2.7e-8, largest for a force at the tip.
+    for n_modes, tolerance in ((3, 5e-2), (6, 1e-3), (40, 1e-7)):
         response = linear_arm(RIG, n_modes).frequency_response(OMEGA)[:, :, 1:]
         assert np.max(np.abs(response - exact) / np.abs(exact)) < tolerance
 

@@ -1,0 +1,238 @@
+"""The contract every registered effect keeps. An effect without an entry in EXAMPLES fails here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs, simulate, without
+from plant.effects import CoulombFriction, InputDelay, TipPayload
+
+RIG = paper_link()
+VOLTAGE = prbs(7, 6, 3.0, 300, np.random.default_rng(4))
+
+# A size that shows in the outputs, and whether it shows at the hub too.
+EXAMPLES: dict[str, dict[str, float]] = {
+    "coulomb_friction": {"torque_Nm": 0.1},
+    "stribeck_friction": {
+        "static_torque_Nm": 0.15,
+        "coulomb_torque_Nm": 0.1,
+        "stribeck_velocity_rad_s": 0.05,
+    },
+    "viscous_friction": {"coefficient_Nms": 0.05},
+    "backlash": {"gap_rad": 0.02},
+    "actuator_saturation": {"limit_V": 2.2},
+    "actuator_dead_zone": {"width_V": 0.3},
+    "actuator_lag": {"time_constant_s": 0.02},
+    "input_delay": {"delay_s": 0.0123},
+    "actuator_gain": {"ratio": 0.9},
+    "torque_ripple": {"amplitude_Nm": 0.1, "cycles_per_rev": 11.0, "phase_rad": 0.5},
+    "joint_compliance": {"stiffness_Nm_rad": 20.0, "damping_Nms": 0.02},
+    "tip_payload": {"mass_kg": 0.02},
+    "link_stiffness": {"ratio": 0.85},
+    "structural_damping": {"ratio": 2.0},
+    "hardening_spring": {"cubic_Nm_rad3": 5.0},
+    "gravity": {"acceleration_m_s2": 0.5},
+    "sensor_lag": {"time_constant_s": 0.02},
+    "sensor_gain": {"ratio": 1.1},
+    "sensor_drift": {"rate_m_s": 0.01},
+    "quantisation": {"step_m": 0.005},
+    "periodic_disturbance": {"amplitude_Nm": 0.1, "frequency_Hz": 1.7, "phase_rad": 0.2},
+    "base_compliance": {"stiffness_Nm_rad": 100.0, "damping_Nms": 0.2, "inertia_kg_m2": 0.2},
+    "hub_inertia": {"ratio": 1.2},
+}
+ON_THE_SENSOR = {"sensor_lag", "sensor_gain", "sensor_drift", "quantisation"}
+
+
+def _output(*effects: Effect) -> np.ndarray:
+    return simulate(RIG, VOLTAGE, effects).output
+
+
+def _example(name: str) -> Effect:
+    return parse_effect({"name": name, **EXAMPLES[name]})
+
+
+@pytest.fixture(scope="module")
+def nominal() -> np.ndarray:
+    return _output()
+
+
+def test_every_effect_of_the_rig_description_is_registered():
+    assert set(EFFECTS) == set(EXAMPLES)
+    assert len(EFFECTS) == 23
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+class TestContract:
+    def test_it_says_what_it_is(self, name):
+        kind = EFFECTS[name]
+        assert kind.id == name
+        assert kind.group in ("actuator", "joint", "link", "sensor")
+        assert kind.__doc__
+        for field, info in kind.model_fields.items():
+            assert info.description, f"{name}.{field} has no description"
+
+    def test_it_is_frozen_and_its_table_reads_back(self, name):
+        effect = _example(name)
+        assert parse_effect(effect.to_dict()) == effect
+        assert effect.parameters() == EXAMPLES[name]
+        with pytest.raises(ValueError, match="frozen"):
+            setattr(effect, next(iter(EXAMPLES[name])), 1.0)
+
+    def test_it_changes_the_outputs(self, name, nominal):
+        change = np.sqrt(np.mean((_output(_example(name)) - nominal) ** 2, axis=0))
+        assert change[1] > 5e-4
+        assert change[0] == 0 if name in ON_THE_SENSOR else change[0] > 5e-4
+
+    def test_it_vanishes_at_its_neutral_value(self, name, nominal):
+        neutral = EFFECTS[name].neutral
+        if neutral is None:
+            assert name in ("joint_compliance", "base_compliance", "backlash")
+            return
+        np.testing.assert_allclose(
+            _output(parse_effect({"name": name, **neutral})), nominal, rtol=0, atol=1e-12
+        )
+
+    def test_the_outputs_depend_on_every_parameter_as_claimed(self, name):
+        kind, base = EFFECTS[name], EXAMPLES[name]
+        if kind.dependence == "jagged":
+            assert name in ("backlash", "quantisation")
+            return
+        reference = _output(_example(name))
+        for parameter, value in base.items():
+
+            def change(relative, parameter=parameter, value=value):
+                changed = {**base, parameter: value * (1 + relative)}
+                return _output(parse_effect({"name": name, **changed})) - reference
+
+            step = change(1e-4)
+            if kind.dependence == "smooth":
+                # A derivative exists: a step and its half agree but for the curvature, 1e-4 of the step or
+                # so.
+                error = np.max(np.abs(2 * change(0.5e-4) - step))
+                assert error < 0.02 * np.max(np.abs(step)) + 1e-12, parameter
+            else:
+                # Continuous: the change shrinks with the step (a kink may bend it), and stays in proportion.
+                small = np.max(np.abs(change(1e-6)))
+                assert small < 0.2 * np.max(np.abs(step)) + 1e-9, parameter
+                assert np.max(np.abs(step)) < 1e-2, parameter
+
+    def test_bad_parameters_are_refused_in_one_line(self, name):
+        for parameter in EXAMPLES[name]:
+            for bad in (np.nan, np.inf, "1", None):
+                with pytest.raises(ValueError) as caught:
+                    parse_effect({"name": name, **EXAMPLES[name], parameter: bad})
+                assert str(caught.value).startswith(f"effect {name}: {parameter}: expected")
+                assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("effect", "tolerance"),
+    [
+        ({"name": "joint_compliance", "stiffness_Nm_rad": 1e6, "damping_Nms": 1.0}, 2e-5),
+        (
+            {"name": "base_compliance", "stiffness_Nm_rad": 1e7, "damping_Nms": 10.0, "inertia_kg_m2": 0.1},
+            2e-6,
+        ),
+    ],
+    ids=lambda value: value["name"] if isinstance(value, dict) else "",
+)
+def test_stiff_springs_are_rigid(effect, tolerance, nominal):
+    # A spring k turns by torque / k: about 2 N m over k here.
+    np.testing.assert_allclose(_output(parse_effect(effect)), nominal, rtol=0, atol=tolerance)
+
+
+def test_effects_commute():
+    effects = [_example(name) for name in EFFECTS if name != "backlash"]
+    forward, backward = _output(*effects), _output(*reversed(effects))
+    np.testing.assert_allclose(forward, backward, rtol=0, atol=1e-9)
+
+
+def test_voltage_effects_act_in_the_stated_order():
+    gain, zone, limit = 1.7, 0.4, 2.5
+    entries = [
+        {"name": "actuator_saturation", "limit_V": limit},
+        {"name": "actuator_dead_zone", "width_V": zone},
+        {"name": "actuator_gain", "ratio": gain},
+    ]
+    voltage = np.linspace(-4, 4, 81)
+    amplified = gain * voltage
+    expected = np.clip(np.sign(amplified) * np.maximum(np.abs(amplified) - zone, 0), -limit, limit)
+    got = simulate(RIG, voltage, parse_effects(entries)).output
+    np.testing.assert_allclose(got, simulate(RIG, expected).output, rtol=0, atol=1e-13)
+
+
+def test_sensor_effects_act_in_the_stated_order():
+    entries = [
+        {"name": "quantisation", "step_m": 0.003},
+        {"name": "sensor_drift", "rate_m_s": 0.02},
+        {"name": "sensor_gain", "ratio": 1.3},
+    ]
+    bare = simulate(RIG, VOLTAGE, rng=np.random.default_rng(1))
+    got = simulate(RIG, VOLTAGE, parse_effects(entries), rng=np.random.default_rng(1))
+    noise = bare.tip_m - bare.tip_true_m
+    analogue = 1.3 * bare.tip_true_m + 0.02 * bare.time_s + noise
+    np.testing.assert_allclose(got.tip_m, 0.003 * np.round(analogue / 0.003), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(got.hub_angle_rad, bare.hub_angle_rad)
+    np.testing.assert_array_equal(got.tip_true_m, bare.tip_true_m)
+
+
+def test_a_parametric_effect_is_the_rig_with_that_parameter():
+    changed = {
+        "tip_payload": RIG.perturbed({"payload.mass_kg": 0.02}),
+        "link_stiffness": RIG.scaled({"link.youngs_modulus_Pa": 0.85}),
+        "structural_damping": RIG.scaled({"link.kelvin_voigt_s": 2.0}),
+        "hub_inertia": RIG.scaled({"hub.inertia_kg_m2": 1.2}),
+        "viscous_friction": RIG.perturbed({"hub.viscous_friction_Nms": RIG.hub.viscous_friction_Nms + 0.05}),
+    }
+    for name, rig in changed.items():
+        np.testing.assert_allclose(_output(_example(name)), simulate(rig, VOLTAGE).output, rtol=0, atol=1e-12)
+
+
+def test_without_takes_an_effect_out():
+    effects = (CoulombFriction(torque_Nm=0.1), InputDelay(delay_s=0.01), TipPayload(mass_kg=0.1))
+    assert without(effects, "input_delay") == (effects[0], effects[2])
+    assert without(effects, CoulombFriction) == effects[1:]
+    assert without(effects, "gravity") == effects
+    with pytest.raises(ValueError, match=r"unknown effect 'gravitation'; known effects: coulomb_friction, "):
+        without(effects, "gravitation")
+
+
+@pytest.mark.parametrize(
+    ("entry", "complaint"),
+    [
+        (
+            {"name": "gravitation", "g": 1.0},
+            r"^unknown effect 'gravitation'; known effects: coulomb_friction, ",
+        ),
+        ({"torque_Nm": 1.0}, r"^effect without a name; known effects: "),
+        ({"name": ["a"]}, r"^unknown effect \['a'\]"),
+        ("coulomb_friction", "^an effect is a table"),
+        ({"name": "coulomb_friction"}, r"^effect coulomb_friction: torque_Nm: missing, expected a value$"),
+        (
+            {"name": "coulomb_friction", "torque_Nm": 1.0, "level": 2.0},
+            r"^effect coulomb_friction: level: unknown key$",
+        ),
+        (
+            {
+                "name": "stribeck_friction",
+                "static_torque_Nm": 0.1,
+                "coulomb_torque_Nm": 0.2,
+                "stribeck_velocity_rad_s": 0.1,
+            },
+            r"^effect stribeck_friction: static_torque_Nm must not be below coulomb_torque_Nm; got 0\.1 and",
+        ),
+    ],
+)
+def test_entries_that_are_no_effect_are_refused(entry, complaint):
+    with pytest.raises(ValueError, match=complaint) as caught:
+        parse_effect(entry)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_same_effect_twice_is_refused():
+    effect = CoulombFriction(torque_Nm=0.1)
+    with pytest.raises(ValueError, match=r"^effect coulomb_friction is given twice$"):
+        simulate(RIG, VOLTAGE, [effect, effect])
+    with pytest.raises(ValueError, match=r"^expected effects"):
+        simulate(RIG, VOLTAGE, ["coulomb_friction"])
