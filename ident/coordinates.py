@@ -56,9 +56,8 @@ class SearchSpace:
         """Name of each coordinate, with its unit."""
         real = "x" if self.raw else "log10(1 - a)"
         pair = ("beta", "gamma") if self.raw else ("log10(omega [rad/s])", "log10(zeta)")
-        return (*(f"{real} {i + 1}" for i in range(self.n_real)),) + tuple(
-            f"{name} {i + 1}" for i in range(self.n_pairs) for name in pair
-        )
+        pairs = [f"{name} {i + 1}" for i in range(self.n_pairs) for name in pair]
+        return (*(f"{real} {i + 1}" for i in range(self.n_real)), *pairs)
 
     def blocks(self, unit: RealArray) -> RealArray:
         """Cascade blocks (R + P, 4) of a point of the unit cube."""

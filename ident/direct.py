@@ -26,11 +26,11 @@ def minimise(
         return value
 
     if algorithm.startswith("SCIPY"):
-        from scipy.optimize import direct
+        from scipy.optimize import Bounds, direct
 
         direct(
             recorded,
-            [(0.0, 1.0)] * dimension,
+            Bounds(np.zeros(dimension), np.ones(dimension)),
             maxfun=evaluations,
             maxiter=evaluations,
             vol_tol=0.0,

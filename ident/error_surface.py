@@ -125,7 +125,8 @@ def error_surface(
         width = 1 - gamma
         if first is None:
             reach = max(10 * width, 0.02) * np.array([-1, 1])
-            first = np.linspace(*np.clip(own[0] + reach, -1 + 1e-9, 1 - 1e-9), n_points)
+            left, right = np.clip(own[0] + reach, -1 + 1e-9, 1 - 1e-9)
+            first = np.linspace(float(left), float(right), n_points)
         if second is None:
             second = 1 - np.geomspace(min(30 * width, 1.0), width / 30, n_points)
         names = ("beta", "gamma")

@@ -106,7 +106,7 @@ def fit(data: Regression, poles: Poles) -> LinearFit:
     theta = np.linalg.lstsq(projection.triangle, projection.shared_q @ data.y, rcond=_RANK_TOLERANCE)[0]
     residual = projection.residual
     return LinearFit(
-        coefficients=theta[: poles.order],
+        coefficients=np.asarray(theta[: poles.order], dtype=np.float64),
         feedthrough=float(theta[poles.order]) if data.structure.feedthrough else 0.0,
         residual=residual,
         rss=float(residual @ residual),

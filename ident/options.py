@@ -63,8 +63,8 @@ class IdentOptions(BaseModel):
     algorithm: Algorithm = Field("GN_DIRECT_L", description="NLopt's DIRECT variants, or scipy's")
     coordinates: Literal["log", "raw"] = Field(
         "log",
-        description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the best "
-        "poles more often than not",
+        description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the "
+        "best poles more often than not",
     )
     evaluations: int = Field(
         500, ge=20, le=1_000_000, description="cost evaluations of the first global search"

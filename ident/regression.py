@@ -59,7 +59,7 @@ class Regression:
     def n_parameters(self, order: int) -> int:
         """Number of free real numbers of a fit with `order` poles: coefficients, poles, nuisances."""
         local = self.polynomials.shape[0] + (order if self.structure.estimate_initial_state else 0)
-        return 2 * order + int(self.structure.feedthrough) + self.n_records * local
+        return int(2 * order + self.structure.feedthrough + self.n_records * local)
 
 
 def prepare(records: Sequence[Record], structure: Structure) -> Regression:
