@@ -149,6 +149,7 @@ def read_csv(path: str | PathLike[str], separator: str = ",") -> Table:
         frame = pd.read_csv(
             file,
             sep=separator,
+            header=None,  # pandas would silently rename repeated columns
             dtype=str,
             keep_default_na=False,
             skip_blank_lines=False,
@@ -163,8 +164,8 @@ def read_csv(path: str | PathLike[str], separator: str = ",") -> Table:
         raise ValueError(f"{file}: not a table separated by {separator!r} ({reason})") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{file}: not a UTF-8 text file (byte {error.start}); expected CSV") from None
-    names = tuple(str(item).strip() for item in frame.columns)
-    frame.columns = pd.Index(names)
+    names = tuple(str(item).strip() for item in frame.iloc[0])
+    frame = frame.iloc[1:].set_axis(list(names), axis="columns")
     if len(set(names)) != len(names):
         raise ValueError(f"{file}, line 1: column names repeat; got {_listed(names)}")
     # Blank lines at the very end are no samples.

@@ -1,0 +1,95 @@
+"""Known truths for identification tests, built with scipy only: P1 and P2 of the benchmark description.
+
+SNR = 20 log10(standard deviation of the noise-free output / standard deviation of the white output noise); with that
+reading the Cramer-Rao bounds of P1 come out as the published 0.97 and 0.063.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+
+from ident.record import Record
+
+DT_S = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Discrete state space of the plant, and a noisy record of it."""
+
+    system: tuple
+    record: Record
+    clean: np.ndarray
+    noise_std: float
+
+    def response(self, omega_rad_s):
+        A, B, C, D = self.system
+        eye = np.eye(A.shape[0])
+        return np.array([(C @ np.linalg.solve(np.exp(1j * w * DT_S) * eye - A, B) + D)[0, 0] for w in omega_rad_s])
+
+
+def run(system, u):
+    """Output of a discrete state space from rest, sample by sample."""
+    A, B, C, D = system
+    x = np.zeros((A.shape[0], 1))
+    y = np.empty(u.size)
+    for k, value in enumerate(u):
+        y[k] = (C @ x + D * value)[0, 0]
+        x = A @ x + B * value
+    return y
+
+
+def as_record(u, y, name="test", dt_s=DT_S):
+    return Record(name, u[:, None], y[:, None], dt_s, ("u",), ("y",))
+
+
+def _truth(system, u, snr_db, rng, name):
+    clean = run(system, u)
+    noise_std = np.std(clean) / 10 ** (snr_db / 20)
+    return Truth(system, as_record(u, clean + noise_std * rng.normal(size=u.size), name), clean, noise_std)
+
+
+def max_length_sequence(seed, n_samples):
+    state = np.random.default_rng(seed).integers(0, 2, 11)
+    state[0] = 1
+    return scipy.signal.max_len_seq(11, state=state, length=n_samples)[0] * 2.0 - 1
+
+
+def p1(seed, n_samples=1000, snr_db=30):
+    """One mode at 15 rad/s, zeta 0.015, double integrator, non-minimum-phase zero."""
+    numerator = 15.0**2 * np.polymul([-1 / 10.8, 1], [1 / 10.5, 1])
+    denominator = np.polymul([1, 0, 0], [1, 2 * 0.015 * 15.0, 15.0**2])
+    A, B, C, D, _ = scipy.signal.cont2discrete(scipy.signal.tf2ss(numerator, denominator), DT_S)
+    u = max_length_sequence(1, n_samples)
+    scale = 0.1265 / np.std(run((A, B, C, D), u))
+    return _truth((A, B, scale * C, scale * D), u, snr_db, np.random.default_rng(seed), f"P1 {seed}")
+
+
+P2_HZ = (2.5, 11.0, 27.0)
+P2_ZETA = (0.015, 0.015, 0.02)
+
+
+def p2(seed, n_samples=2000, snr_db=35):
+    """Three modes and two slow real poles, random binary input held two samples."""
+    blocks, B, C = [np.array([[-0.1]])], [1.0], [1.0]
+    for hertz, zeta, gain in zip(P2_HZ, P2_ZETA, (-0.02, 0.0045, -0.0016), strict=True):
+        w = 2 * np.pi * hertz
+        blocks.append(np.array([[0, w], [-w, -2 * zeta * w]]))
+        B += [0.0, w]
+        C += [gain, 0.0]
+    n = len(B)
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n] = scipy.linalg.block_diag(*blocks)
+    A[:n, n] = B
+    A[n, n] = -25.0
+    drive, out = np.zeros((n + 1, 1)), np.zeros((1, n + 1))
+    drive[n, 0] = 25.0
+    out[0, :n] = C
+    system = scipy.signal.cont2discrete((A, drive, out, np.zeros((1, 1))), DT_S)[:4]
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.integers(0, 2, n_samples) * 2.0 - 1, 2)[rng.integers(0, 2) :][:n_samples]
+    return _truth(system, u, snr_db, rng, f"P2 {seed}")

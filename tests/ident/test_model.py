@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from ident.model import GobfModel
+from ident.poles import Poles
+
+MODEL = GobfModel(
+    poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]),
+    coefficients=[0.3, -0.2, 0.5, 0.1],
+    dt_s=0.01,
+    feedthrough=0.4,
+    integrators=2,
+    input_delay_samples=3,
+    input_name="voltage",
+    output_name="angle",
+)
+OMEGA = np.geomspace(0.1, 300, 50)
+
+
+def test_control_model_has_the_same_response():
+    system = MODEL.to_control()
+    assert system.dt == MODEL.dt_s
+    assert system.nstates == 4 + 2 + 3
+    expected = system(np.exp(1j * OMEGA * MODEL.dt_s))
+    # control inverts (z I - A) with two poles at z = 1: 1e-3 from them squared costs 1e6 roundings.
+    np.testing.assert_allclose(MODEL.frequency_response(OMEGA), expected, rtol=1e-9)
+
+
+def test_simulation_agrees_with_control():
+    u = np.random.default_rng(0).normal(size=200)
+    expected = control.forced_response(MODEL.to_control(), inputs=u).outputs
+    np.testing.assert_allclose(MODEL.simulate(u), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_simulation_of_a_sine_settles_to_the_frequency_response():
+    model = GobfModel(MODEL.poles, MODEL.coefficients, 0.01, feedthrough=0.4, input_delay_samples=1)
+    k = np.arange(6000)
+    y = model.simulate(np.sin(7.0 * k * 0.01))
+    G = model.frequency_response(np.array([7.0]))[0]
+    # The slowest pole has decayed by 0.98^3000 = 5e-27.
+    np.testing.assert_allclose(y[3000:], np.abs(G) * np.sin(7.0 * k[3000:] * 0.01 + np.angle(G)), atol=1e-9)
+
+
+def test_round_trip_through_arrays_is_exact():
+    again = GobfModel.from_arrays(MODEL.to_arrays())
+    np.testing.assert_array_equal(again.frequency_response(OMEGA), MODEL.frequency_response(OMEGA))
+    assert (again.input_name, again.output_name) == ("voltage", "angle")
+
+
+def test_model_without_poles_is_a_gain():
+    model = GobfModel(Poles(), [], 0.01, feedthrough=2.0)
+    np.testing.assert_array_equal(model.simulate(np.array([1.0, 2.0])), [2.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coefficients": [1.0]}, "one coefficient per basis function"),
+        ({"coefficients": [1.0, np.nan, 0, 0]}, "finite"),
+        ({"dt_s": 0.0}, "dt_s"),
+        ({"dt_s": np.nan}, "dt_s"),
+        ({"feedthrough": np.inf}, "finite"),
+        ({"integrators": -1}, "negative"),
+    ],
+)
+def test_bad_models_are_refused(change, message):
+    arguments = {"poles": MODEL.poles, "coefficients": MODEL.coefficients, "dt_s": 0.01} | change
+    with pytest.raises(ValueError, match=message):
+        GobfModel(**arguments)
+
+
+def test_frequencies_must_make_sense():
+    with pytest.raises(ValueError, match="stop at pi/dt"):
+        MODEL.frequency_response(np.array([400.0]))
+    with pytest.raises(ValueError, match="stop at pi/dt"):
+        MODEL.frequency_response(np.array([np.nan]))
+    with pytest.raises(ValueError, match="omega = 0"):
+        MODEL.frequency_response(np.array([0.0]))

@@ -1,0 +1,266 @@
+"""Records from files: what is read, and that every kind of bad input gets one line that names the place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.io
+
+from ident.record import Record
+
+T, U, Y = "t_s", "u_V", "y_rad"
+
+
+def write(path, lines):
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def rows(n=6, dt=0.01, start=0):
+    return [f"{dt * k:.6f},{(-1) ** k},{0.5 * k}" for k in range(start, start + n)]
+
+
+@pytest.fixture
+def good(tmp_path):
+    return write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows()])
+
+
+def read(path, **kwargs):
+    return Record.from_csv(path, [U], [Y], **({"time": T} | kwargs))
+
+
+def complaint(path, **kwargs):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the message is what the test looks at
+        read(path, **kwargs)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_csv_is_read(good):
+    record = read(good)
+    assert record.name == "log"
+    assert record.dt_s == 0.01
+    np.testing.assert_array_equal(record.input[:, 0], [1, -1, 1, -1, 1, -1])
+    np.testing.assert_array_equal(record.output[:, 0], 0.5 * np.arange(6))
+    assert (record.input_names, record.output_names) == ((U,), (Y,))
+    np.testing.assert_allclose(record.time_s, 0.01 * np.arange(6))
+
+
+def test_csv_with_spaces_bom_and_trailing_blank_lines(tmp_path):
+    path = tmp_path / "log.csv"
+    text = "\n".join([f"{T}, {U} ,{Y}", *rows(), "", ""])
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert read(path).n_samples == 6
+
+
+def test_other_separator(tmp_path):
+    path = write(tmp_path / "log.csv", [f"{T};{U};{Y}", *(row.replace(",", ";") for row in rows())])
+    assert read(path, separator=";").n_samples == 6
+    assert "no column 't_s'; the file has t_s;u_V;y_rad" in complaint(path)
+
+
+def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
+    rng = np.random.default_rng(0)
+    stamps = 5.0 + 1e-3 * np.arange(50) + rng.uniform(-5e-8, 5e-8, 50)
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *(f"{t:.9f},{k % 3},{k}" for k, t in enumerate(stamps))])
+    # The mean interval of 49 steps with end stamps off by 5e-8 s at most: 2e-9 s.
+    assert read(path).dt_s == pytest.approx(1e-3, abs=2.1e-9)
+
+
+def test_dt_can_be_given_instead_of_or_beside_time(good):
+    assert read(good, time=None, dt_s=0.5).dt_s == 0.5
+    assert read(good, dt_s=0.01).dt_s == 0.01
+    assert "dt_s = 0.02 s, but the time column 't_s' steps by 0.01 s" in complaint(good, dt_s=0.02)
+    assert "give the time column or dt_s" in complaint(good, time=None)
+
+
+@pytest.mark.parametrize("dt_s", [0.0, -1.0, np.nan, np.inf])
+def test_dt_must_be_positive(good, dt_s):
+    assert f"{good}: dt_s must be a positive number of seconds" in complaint(good, time=None, dt_s=dt_s)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"), [("nan", "'nan'"), ("inf", "'inf'"), ("-Infinity", "'-Infinity'"), ("", "empty"), ("o.k.", "'o.k.'")]
+)
+def test_bad_numbers_are_named_with_line_and_column(tmp_path, text, shown):
+    body = rows()
+    body[3] = f"0.03,{text},1.5"
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *body])
+    assert complaint(path) == f"{path}, line 5: column 'u_V' is {shown}; expected a finite number"
+
+
+def test_bad_numbers_in_columns_nobody_asked_for_do_no_harm(tmp_path):
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y},note", *(f"{row},hello" for row in rows())])
+    assert read(path).n_samples == 6
+
+
+def test_missing_column_lists_those_there(good):
+    with pytest.raises(ValueError, match="no column 'w'; the file has t_s, u_V, y_rad"):
+        Record.from_csv(good, ["w"], [Y], time=T)
+
+
+def test_a_blank_line_in_the_middle_is_named(tmp_path):
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "", *rows(3, start=3)])
+    assert f"{path}, line 5: column 't_s' is empty" in complaint(path)
+
+
+def test_rows_of_uneven_length_are_named(tmp_path):
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "0.03,1", *rows(2, start=4)])
+    assert f"{path}, line 5: column 'y_rad' is empty" in complaint(path)
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "0.03,1,2,3", *rows(2, start=4)])
+    message = complaint(path)
+    assert str(path) in message
+    assert "line 5" in message
+
+
+def test_time_running_backwards_or_standing_still(tmp_path):
+    body = rows()
+    body[4] = "0.030000,1,2"
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *body])
+    message = complaint(path)
+    assert f"{path}, line 6: time 't_s' goes from 0.03 to 0.03 s" in message
+    assert "expected increasing time" in message
+
+
+def test_a_lost_sample_is_named(tmp_path):
+    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(10), *rows(5, start=11)])
+    message = complaint(path)
+    assert f"{path}, line 12: time 't_s' steps by 0.02 s where most steps are 0.01 s" in message
+    assert "within 1%" in message
+
+
+@pytest.mark.parametrize("content", ["", "\n\n", f"{T},{U},{Y}\n"])
+def test_files_without_rows(tmp_path, content):
+    path = tmp_path / "log.csv"
+    path.write_text(content)
+    assert str(path) in complaint(path)
+
+
+def test_repeated_column_names_are_refused(tmp_path):
+    path = write(tmp_path / "log.csv", [f"{T},{U},{U},{Y}", "0,1,2,3", "1,2,3,4"])
+    assert "column names repeat" in complaint(path)
+
+
+def test_a_binary_file_is_no_csv(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_bytes(bytes(range(256)) * 4)
+    assert str(path) in complaint(path)
+
+
+def test_paths_that_are_not_there(tmp_path):
+    assert complaint(tmp_path / "no.csv") == f"{tmp_path / 'no.csv'}: no such file"
+    assert complaint(tmp_path) == f"{tmp_path}: not a file"
+
+
+def test_one_string_is_not_a_list_of_columns(good):
+    with pytest.raises(ValueError, match="must be a list of column names"):
+        Record.from_csv(good, U, [Y], time=T)
+
+
+def arrays():
+    return {T: 0.01 * np.arange(6), U: np.array([1, -1, 1, -1, 1, -1]), Y: 0.5 * np.arange(6)}
+
+
+def test_npz_and_mat_are_read_like_csv(tmp_path, good):
+    np.savez(tmp_path / "log.npz", **arrays())
+    scipy.io.savemat(tmp_path / "log.mat", arrays())
+    expected = read(good)
+    for record in (
+        Record.from_npz(tmp_path / "log.npz", [U], [Y], time=T),
+        Record.from_mat(tmp_path / "log.mat", [U], [Y], time=T),
+    ):
+        np.testing.assert_array_equal(record.input, expected.input)
+        np.testing.assert_array_equal(record.output, expected.output)
+        assert record.dt_s == expected.dt_s
+
+
+def test_npz_with_objects_is_refused_without_running_them(tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, **(arrays() | {U: np.array([object()] * 6)}))
+    with pytest.raises(ValueError, match="'u_V' holds Python objects"):
+        Record.from_npz(path, [U], [Y], time=T)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({U: np.array([1, -1, np.nan, 1, 2, 3])}, "index 2: column 'u_V' is nan; expected a finite number"),
+        ({U: np.arange(6) + 1j}, "'u_V' holds complex128; expected real numbers"),
+        ({U: np.array(list("abcdef"))}, "expected real numbers"),
+        ({U: np.ones((6, 2))}, r"shape \(6, 2\); expected a vector"),
+        ({U: np.arange(5.0)}, "equally long"),
+    ],
+)
+def test_bad_npz_content(tmp_path, change, message):
+    path = tmp_path / "log.npz"
+    np.savez(path, **(arrays() | change))
+    with pytest.raises(ValueError, match=message):
+        Record.from_npz(path, [U], [Y], time=T)
+
+
+def test_files_of_another_kind(tmp_path, good):
+    with pytest.raises(ValueError, match="not a numpy .npz archive"):
+        Record.from_npz(good, [U], [Y], time=T)
+    with pytest.raises(ValueError, match="not a MATLAB .mat file"):
+        Record.from_mat(good, [U], [Y], time=T)
+    np.save(tmp_path / "one.npy", np.arange(3.0))
+    with pytest.raises(ValueError, match="without column names"):
+        Record.from_npz(tmp_path / "one.npy", [U], [Y], time=T)
+
+
+def two_by_two(**change):
+    fields = {
+        "name": "r",
+        "input": np.arange(8.0).reshape(4, 2),
+        "output": np.arange(12.0).reshape(4, 3),
+        "dt_s": 0.1,
+        "input_names": ("a", "b"),
+        "output_names": ("c", "d", "e"),
+        "reference": np.ones((4, 1)),
+        "reference_names": ("ref",),
+        "output_units": ("rad", "m", "m/s^2"),
+    }
+    return Record(**(fields | change))
+
+
+def test_siso_and_slice():
+    record = two_by_two().siso("b", "e")
+    np.testing.assert_array_equal(record.input[:, 0], [1, 3, 5, 7])
+    np.testing.assert_array_equal(record.output[:, 0], [2, 5, 8, 11])
+    assert record.output_units == ("m/s^2",)
+    part = record.slice(1, 3)
+    np.testing.assert_array_equal(part.input[:, 0], [3, 5])
+    assert part.reference.shape == (2, 1)
+    with pytest.raises(ValueError, match="no input column 'z'; there is"):
+        two_by_two().siso("z", "e")
+    with pytest.raises(ValueError, match="0 <= start < stop <= 4"):
+        record.slice(2, 2)
+
+
+def test_record_round_trip_through_arrays(tmp_path):
+    record = two_by_two()
+    np.savez(tmp_path / "r.npz", **record.to_arrays())
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as stored:
+        again = Record.from_arrays(dict(stored))
+    for key in ("input", "output", "reference"):
+        np.testing.assert_array_equal(getattr(again, key), getattr(record, key))
+    for key in ("name", "dt_s", "input_names", "output_names", "reference_names", "input_units", "output_units"):
+        assert getattr(again, key) == getattr(record, key)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dt_s": 0.0}, "dt_s must be a positive"),
+        ({"input": np.arange(8.0)}, r"input must be \(T, 2\)"),
+        ({"output": np.zeros((3, 3))}, "equally long"),
+        ({"output": np.full((4, 3), np.inf)}, "output column 'c' is inf at index 0"),
+        ({"input_names": ("a", "a")}, "distinct"),
+        ({"reference": None}, "without a reference"),
+        ({"output_units": ("rad",)}, "one per column"),
+    ],
+)
+def test_bad_records_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        two_by_two(**change)
