@@ -101,7 +101,8 @@ class FileSource(Section):
                 raise ValueError(f"records[{index}]: give time (a column) or dt_s (a number), not both")
             if not any((self.time, self.dt_s, record.time, record.dt_s)):
                 raise ValueError(
-                    f"records[{index}] has no time base: give time = 'column name' or dt_s = seconds in [source]"
+                    f"records[{index}] has no time base: give time = 'column name' or dt_s = seconds in "
+                    "[source]"
                 )
             if record.stop_sample is not None and record.stop_sample <= record.start_sample:
                 raise ValueError(
@@ -139,6 +140,11 @@ class Channel(Section):
         None,
         description="'control' is measured and fed back, 'performance' is what should not swing; "
         "default: control for the first channel, performance for the others",
+    )
+    increments: bool = Field(
+        False,
+        description="fit the differences from sample to sample of input and output: the response is the same, "
+        "drift and friction weigh less",
     )
     identification: IdentOptions = Field(default_factory=IdentOptions)
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)

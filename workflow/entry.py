@@ -87,7 +87,8 @@ def run_from_files(
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     """Simulate the experiments of a configuration; one CSV per record, named after it.
 
-    Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises InputError.
+    Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises
+    InputError.
     """
     config, _ = load_config(config_path) if config_path is not None else built_in_config()
     if not isinstance(config.source, SimulatedSource):
@@ -206,7 +207,8 @@ def load_plant_file(path: Path) -> UncertainPlant:
 def design_controller(
     source: Path, specification_path: Path | None, *, out: Path | None = None, seed: int = 2006
 ) -> RunSummary:
-    """Design and certify a controller for a run's identified plant, or for a file of `flexlink identify --out`.
+    """Design and certify a controller for a run's identified plant, or for a file of `flexlink identify
+    --out`.
 
     With `out` the controller is written as JSON. Raises InputError.
     """

@@ -35,7 +35,8 @@ def realise(posterior: ResponsePosterior, coefficients: Real) -> tuple[Real, Rea
     ]
     if posterior.fir_length:
         shift = Poles(np.zeros(posterior.fir_length), np.zeros(0, dtype=np.complex128))
-        parts.append(GobfModel(poles=shift, coefficients=coefficients[taps:], **common))  # type: ignore[arg-type]
+        parts.append(GobfModel(poles=shift, coefficients=coefficients[taps:], **common))  # type:
+        ignore[arg - type]
     spaces = [part.state_space() for part in parts]
     size = sum(space[0].shape[0] for space in spaces)
     a = np.zeros((size, size))

@@ -145,7 +145,8 @@ def channel_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
     for role in ("estimation", "validation", "repeat"):
         fits = list(found[f"fit_{role}_percent"].values())
         if fits:
-            rows.append(Row(f"fit, {role}", _range(fits, "%")))
+            of = " of increments" if found.get("increments") else ""
+            rows.append(Row(f"fit, {role}", _range(fits, f"%{of}")))
     return tuple(rows)
 
 
@@ -155,7 +156,8 @@ def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:
         Row(
             f"{100 * spread['level']:g} % radius",
             ", ".join(
-                f"{band['median_radius_percent']:.2g} % ({band['from_rad_s']:.3g}-{band['to_rad_s']:.3g} rad/s)"
+                f"{band['median_radius_percent']:.2g} % "
+                f"({band['from_rad_s']:.3g}-{band['to_rad_s']:.3g} rad/s)"
                 for band in spread["bands"]
             ),
         )

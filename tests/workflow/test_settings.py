@@ -68,7 +68,8 @@ SIMULATED = {"kind": "simulated"}
         ),
         (
             {"source": {"kind": "simulated", "bandwidth_rad_s": "fast"}},
-            "source.bandwidth_rad_s: input should be a valid number, unable to parse string as a number, got 'fast'",
+            "source.bandwidth_rad_s: input should be a valid number, unable to parse string as a "
+            "number, got 'fast'",
         ),
     ],
 )

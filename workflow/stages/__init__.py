@@ -16,7 +16,8 @@ records.npz
               noise_free/<i>/output        (T, Y) before sensor effects and noise, simulated source only
 
 identify.npz
-    document  channels: list of {name, input, output, purpose "control"|"performance", n_used, n_fresh,
+    document  channels: list of {name, input, output, purpose "control"|"performance", increments, n_used,
+    n_fresh,
               fit_estimation_percent {record: %}, fit_validation_percent {record: %}, fit_repeat_percent
               {record: %}, order, integrators, input_delay_samples, feedthrough, modes: list of {frequency_Hz,
               omega_rad_s, damping} ascending, real_poles_per_s: list of decay rates, noise_std (output

@@ -24,7 +24,9 @@ from workflow.stages.results import load_plant, load_posterior, load_records, lo
 Real = npt.NDArray[np.float64]
 
 _LEAD_IN = 0.05  # share of the record before the step, so that the picture shows rest
-_SETTLED = 0.1  # a run counts as settled when its error ends within this share of the step
+# A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
+# where tracking is asked for, has arrived within it.
+_SETTLED = 0.1
 _LONGEST_SAMPLES = 6000
 
 
@@ -48,6 +50,7 @@ class Trial:
     disturbance: Real
     step: float
     half: int
+    tracking: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
     document = {
         "skipped": None,
         "machine": config.machine,
+        "tracking": trial.tracking,
         "draws": len(rows),
         "settled_draws": sum(row["settled"] for row in rows),
         "reference_step": trial.step,
@@ -146,6 +150,8 @@ def make_trial(stage: StageInput, dt_s: float, pole_radius: float) -> Trial:
         disturbance=np.where(k >= half, disturbance, 0.0),
         step=step,
         half=half,
+        tracking=config.specification.bandwidth_rad_s is not None
+        or config.specification.sensitivity_weight is not None,
     )
 
 
@@ -252,7 +258,7 @@ def _loop(
 
 
 def describe(runs: Runs, trial: Trial) -> list[dict[str, Any]]:
-    """Step and disturbance metrics of every run; `settled` says whether its error dies out."""
+    """Step and disturbance metrics of every run; `settled` says whether its motion dies out."""
     rows = []
     for output, command, limited in _each(runs):
         first = slice(0, trial.half)
@@ -264,21 +270,24 @@ def describe(runs: Runs, trial: Trial) -> list[dict[str, Any]]:
             limited[first],
             float(trial.time_s[1] - trial.time_s[0]),
         )
-        error = trial.reference[trial.half :] - output[trial.half :]
-        tail = error[-max(1, error.size // 10) :]
-        before = trial.reference[first] - output[first]
+        error = trial.reference - output
+        ends = [_tail(error[: trial.half]), _tail(error[trial.half :])]
+        steady = all(np.ptp(end) <= _SETTLED * abs(trial.step) for end in ends)
+        arrived = abs(float(np.mean(ends[0]))) <= _SETTLED * abs(trial.step)
         rows.append(
             {
                 **step_metrics(step).to_dict(),
-                "disturbance_peak": float(np.max(np.abs(error))),
-                "disturbance_left": float(np.mean(tail)),
-                "settled": bool(
-                    np.max(np.abs(before[-max(1, before.size // 10) :])) <= _SETTLED * abs(trial.step)
-                    and np.ptp(tail) <= _SETTLED * abs(trial.step)
-                ),
+                "disturbance_peak": float(np.max(np.abs(error[trial.half :]))),
+                "disturbance_left": float(np.mean(ends[1])),
+                "settled": bool(steady and (arrived or not trial.tracking)),
             }
         )
     return rows
+
+
+def _tail(signal: Real) -> Real:
+    """The last tenth."""
+    return signal[-max(1, signal.size // 10) :]
 
 
 def _each(runs: Runs) -> Iterator[tuple[Real, Real, npt.NDArray[np.bool_]]]:

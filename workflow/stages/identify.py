@@ -43,11 +43,19 @@ def identify_channels(stage: StageInput) -> StageData:
             if config.closed_loop_data.method == "two_stage":
                 opened = two_stage(used, channel.identification)
                 used, first_stage = list(opened.records), opened.verdict
+            if channel.increments:
+                used = [increments(record) for record in used]
             found = identify(used, channel.identification, progress=report)
-            fresh = [
-                fit_on_fresh_data(found.model, item.record.siso(channel.input, channel.output))
+            rest = [
+                item.record.siso(channel.input, channel.output)
                 for item in records
                 if item.role != "estimation"
+            ]
+            # A free run of an integrating plant drifts away with friction; increments are judged as they
+            # were fitted.
+            fresh = [
+                fit_on_fresh_data(found.model, increments(record) if channel.increments else record)
+                for record in rest
             ]
         at = f"channel/{k}/"
         arrays |= {f"{at}identification/{key}": value for key, value in found.to_arrays().items()}
@@ -62,6 +70,19 @@ def identify_channels(stage: StageInput) -> StageData:
 def estimation_records(records: Sequence[RunRecord], input_name: str, output_name: str) -> list[Record]:
     """The SISO records a channel is fitted to."""
     return [item.record.siso(input_name, output_name) for item in records if item.role == "estimation"]
+
+
+def increments(record: Record) -> Record:
+    """Input and output filtered by 1 - q^-1, one sample shorter: the same response, slow noise whitened."""
+    return Record(
+        name=record.name,
+        input=np.diff(record.input, axis=0),
+        output=np.diff(record.output, axis=0),
+        dt_s=record.dt_s,
+        input_names=record.input_names,
+        output_names=record.output_names,
+        source=record.source,
+    )
 
 
 def describe(
@@ -79,6 +100,7 @@ def describe(
         "input": channel.input,
         "output": channel.output,
         "purpose": config.purpose_of(index),
+        "increments": channel.increments,
         "n_used": len(found.record_names),
         "n_fresh": len(fresh),
         "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),

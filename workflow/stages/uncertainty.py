@@ -22,6 +22,7 @@ from workflow.config import Channel, RunConfig, UncertaintyOptions
 from workflow.errors import naming
 from workflow.run_directory import StageData
 from workflow.stages.base import StageInput
+from workflow.stages.identify import increments
 from workflow.stages.results import ChannelResult, RunRecord, channel_result, load_records
 from workflow.storage import AnyArray
 
@@ -172,7 +173,8 @@ def scatter_of(
     groups: dict[str, list[Record]] = {}
     for item in records:
         if item.condition is not None and item.role != "validation":
-            groups.setdefault(item.condition, []).append(item.record.siso(channel.input, channel.output))
+            record = item.record.siso(channel.input, channel.output)
+            groups.setdefault(item.condition, []).append(increments(record) if channel.increments else record)
     repeated = [group for group in groups.values() if len(group) >= 2]
     if not repeated:
         return None
