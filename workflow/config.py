@@ -127,7 +127,7 @@ class UncertaintyOptions(EmbeddingOptions):
         description="tangent: covers; conditions: tangent per condition plus the scatter between conditions; "
         "classical: the published recipe, for comparison",
     )
-    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each frequency's ellipse taken alone")
+    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
 
 
 class Channel(Section):
@@ -143,7 +143,7 @@ class Channel(Section):
     )
     increments: bool = Field(
         False,
-        description="fit the differences from sample to sample of input and output: the response is the same, "
+        description="fit sample-to-sample differences of input and output: the response is the same, "
         "drift and friction weigh less",
     )
     identification: IdentOptions = Field(default_factory=IdentOptions)
@@ -168,7 +168,7 @@ class ClosedLoopOptions(Section):
 
     machine: Literal["simulated", "identified"] | None = Field(
         None,
-        description="'simulated': the nonlinear arm of [source]; 'identified': plants drawn from the identified "
+        description="'simulated': nonlinear arm of [source]; 'identified': plants drawn from the identified "
         "uncertain model; default: simulated where the records are",
     )
     effects: tuple[EffectTable, ...] = Field(
@@ -181,7 +181,7 @@ class ClosedLoopOptions(Section):
     )
     disturbance: float | None = Field(
         None,
-        description="step at the plant's input half-way, in its units; default: a tenth of the input's spread",
+        description="step at the plant's input half-way, its units; default: a tenth of the input's spread",
     )
     quantisation: float = Field(
         0.0, ge=0, description="step of the converter at the plant's input, in its units"

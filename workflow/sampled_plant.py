@@ -18,25 +18,11 @@ def realise(posterior: ResponsePosterior, coefficients: Real) -> tuple[Real, Rea
     A kernel of L taps is the basis of L poles at zero, a shift register; both parts carry their own
     integrators and delay, which doubles those states and changes nothing in the response from rest.
     """
-    n = posterior.poles.order
-    taps = n + int(posterior.has_feedthrough)
-    common = {
-        "dt_s": posterior.dt_s,
-        "integrators": posterior.integrators,
-        "input_delay_samples": posterior.input_delay_samples,
-    }
-    parts = [
-        GobfModel(
-            poles=posterior.poles,
-            coefficients=coefficients[:n],
-            feedthrough=float(coefficients[n]) if posterior.has_feedthrough else 0.0,
-            **common,  # type: ignore[arg-type]
-        )
-    ]
+    n, direct = posterior.poles.order, int(posterior.has_feedthrough)
+    parts = [_part(posterior, posterior.poles, coefficients[:n], float(coefficients[n]) if direct else 0.0)]
     if posterior.fir_length:
         shift = Poles(np.zeros(posterior.fir_length), np.zeros(0, dtype=np.complex128))
-        parts.append(GobfModel(poles=shift, coefficients=coefficients[taps:], **common))  # type:
-        ignore[arg - type]
+        parts.append(_part(posterior, shift, coefficients[n + direct :], 0.0))
     spaces = [part.state_space() for part in parts]
     size = sum(space[0].shape[0] for space in spaces)
     a = np.zeros((size, size))
@@ -48,6 +34,17 @@ def realise(posterior: ResponsePosterior, coefficients: Real) -> tuple[Real, Rea
     b = np.concatenate([space[1][:, 0] for space in spaces])
     c = np.concatenate([space[2][0] for space in spaces])
     return a, b, c, sum(float(space[3][0, 0]) for space in spaces)
+
+
+def _part(posterior: ResponsePosterior, poles: Poles, coefficients: Real, feedthrough: float) -> GobfModel:
+    return GobfModel(
+        poles,
+        coefficients,
+        posterior.dt_s,
+        feedthrough=feedthrough,
+        integrators=posterior.integrators,
+        input_delay_samples=posterior.input_delay_samples,
+    )
 
 
 class StateSpaceMachine:

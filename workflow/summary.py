@@ -237,14 +237,14 @@ def closed_loop_rows(loop: Mapping[str, Any], unit: str) -> tuple[Row, ...]:
         Row("machine", f"{machine[loop['machine']]}, {loop['draws']} runs, {loop['settled_draws']} settle"),
         Row("reference step", f"{loop['reference_step']:.4g} {unit}".rstrip()),
     ]
-    for label, key, suffix in (
+    tracking = (
         ("rise time", "rise_time_s", "s"),
         ("overshoot", "overshoot_percent", "%"),
         ("settling time", "settling_time_s", "s"),
         ("steady error", "steady_error", unit),
-        ("peak command", "peak_command", ""),
-        ("disturbance peak", "disturbance_peak", unit),
-    ):
+    )
+    always = (("peak command", "peak_command", ""), ("disturbance peak", "disturbance_peak", unit))
+    for label, key, suffix in (*(tracking if loop["tracking"] else ()), *always):
         achieved = [row[key] for row in loop["achieved"] if row[key] is not None]
         never = len(loop["achieved"]) - len(achieved)
         text = _range(achieved, suffix) if achieved else "never"

@@ -32,7 +32,7 @@ def test_begin_writes_config_and_manifest(tmp_path):
 
 def test_non_empty_directory_is_refused_without_resume(tmp_path):
     begin(tmp_path / "run")
-    with pytest.raises(InputError, match="not empty.*--resume"):
+    with pytest.raises(InputError, match=r"not empty.*--resume"):
         begin(tmp_path / "run")
 
 
@@ -77,7 +77,7 @@ def test_directory_killed_before_its_manifest_is_begun_afresh(tmp_path):
 
 def test_output_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write.*is not a directory"):
+    with pytest.raises(InputError, match=r"cannot write.*is not a directory"):
         RunDirectory.check_free(tmp_path / "file" / "run")
     with pytest.raises(InputError, match="cannot write"):
         RunDirectory.check_free(tmp_path / "file")

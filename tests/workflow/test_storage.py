@@ -50,7 +50,7 @@ def test_numpy_itself_reads_the_file(tmp_path):
 
 
 def test_objects_are_refused_on_writing(tmp_path):
-    with pytest.raises(TypeError, match="'bad'.*pickle"):
+    with pytest.raises(TypeError, match=r"'bad'.*pickle"):
         storage.write_npz(tmp_path / "a.npz", {"bad": np.array([{"a": 1}], dtype=object)})
     assert list(tmp_path.iterdir()) == []
 
