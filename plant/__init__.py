@@ -6,6 +6,7 @@ from plant.modal import LinearArm, linear_arm
 from plant.presets import paper_example, paper_example_rig, paper_link
 from plant.rig import Rig, parameter_keys
 from plant.simulate import SampledArm, Trajectory, simulate
+from plant.two_link import two_link_operating_point
 
 __all__ = [
     "EFFECTS",
@@ -29,5 +30,6 @@ __all__ = [
     "parse_effects",
     "prbs",
     "simulate",
+    "two_link_operating_point",
     "without",
 ]

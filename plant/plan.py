@@ -35,6 +35,8 @@ _HALVINGS = 9
 # A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
 # step. Less for contacts, which bounce: what a step misses there is amplified by the bounces that follow.
 _PHASE_PER_STEP_RAD = {FRICTION: 0.8, CONTACT: 0.25}
+# Falling Stribeck friction is a negative damper; a step may cover this much of its growth time.
+_GROWTH_PER_STEP = 0.3
 # A fraction of a sample below this is no separate part of it.
 _SMALLEST_PART = 1e-9
 
@@ -334,6 +336,8 @@ class _Builder:
         for e in range(element.shape[0]):
             stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
             mobility = abs(element_rows[e, 1] @ held_columns[:, 3 + e])
+            if element[e, 0] == FRICTION and element[e, 3] != 0:
+                longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
             longest = min(longest, _PHASE_PER_STEP_RAD[int(element[e, 0])] / np.sqrt(stiffness * mobility))
         return float(longest)
 

@@ -10,6 +10,10 @@ from pydantic import Field, model_validator
 from plant.effects.base import Effect, NotNegative, Positive, with_joint, with_parameters
 from plant.machine import Disturbance, DryFriction, Machine, Ripple, TorsionSpring
 
+# Bounds that only keep the step of the simulation reasonable: a stiffer pre-sliding, a steeper fall or a
+# finer ripple needs a shorter one (see plant.plan).
+_LARGEST_LEVEL_NM = 1e4
+
 
 class CoulombFriction(Effect):
     """Dry friction -Tc sign(omega); at rest up to Tc is held (with 10 microradian of elastic pre-sliding)."""
@@ -19,7 +23,7 @@ class CoulombFriction(Effect):
     neutral = MappingProxyType({"torque_Nm": 0.0})
     dependence = "continuous"
 
-    torque_Nm: NotNegative = Field(description="friction level Tc")
+    torque_Nm: float = Field(ge=0, le=_LARGEST_LEVEL_NM, description="friction level Tc")
 
     def modify(self, machine: Machine) -> Machine:
         friction = DryFriction(self.torque_Nm, self.torque_Nm, 1.0)
@@ -36,9 +40,11 @@ class StribeckFriction(Effect):
     )
     dependence = "continuous"
 
-    static_torque_Nm: NotNegative = Field(description="break-away level Ts, at least Tc")
-    coulomb_torque_Nm: NotNegative = Field(description="level Tc at speed")
-    stribeck_velocity_rad_s: Positive = Field(description="speed vs over which the level falls")
+    static_torque_Nm: float = Field(
+        ge=0, le=_LARGEST_LEVEL_NM, description="break-away level Ts, at least Tc"
+    )
+    coulomb_torque_Nm: float = Field(ge=0, description="level Tc at speed")
+    stribeck_velocity_rad_s: float = Field(ge=1e-4, description="speed vs over which the level falls")
 
     @model_validator(mode="after")
     def _falls_with_speed(self) -> Self:
@@ -90,7 +96,7 @@ class TorqueRipple(Effect):
     neutral = MappingProxyType({"amplitude_Nm": 0.0, "cycles_per_rev": 1.0, "phase_rad": 0.0})
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")
-    cycles_per_rev: NotNegative = Field(description="cycles N per hub revolution")
+    cycles_per_rev: float = Field(ge=0, le=1e4, description="cycles N per hub revolution")
     phase_rad: float = Field(description="phase p at theta = 0")
 
     def modify(self, machine: Machine) -> Machine:
