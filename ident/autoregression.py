@@ -38,7 +38,7 @@ def fit_autoregression(residuals: Sequence[RealArray], max_order: int) -> RealAr
 
 def _stable(whitening: RealArray) -> RealArray:
     """Roots reflected into the unit circle: the same spectrum, an invertible filter."""
-    roots = np.roots(whitening)
+    roots = np.asarray(np.roots(whitening), dtype=np.complex128)
     outside = np.abs(roots) >= 1
     if not np.any(outside):
         return whitening

@@ -47,8 +47,8 @@ def check_feedback(
     """Test a proportional feedback of the (single) output against the log.
 
     Gains not given are estimated by least squares from all records together. tolerance (input units) is what
-    rounding in the log explains, e.g. half a count. Raises ValueError when a record has not exactly one reference,
-    input and output.
+    rounding in the log explains, e.g. half a count. Raises ValueError when a record has not exactly one
+    reference, input and output.
     """
     for record in records:
         _reference(record)
@@ -81,32 +81,46 @@ def check_feedback(
 class TwoStage:
     """Open-loop records made from closed-loop ones, and how good the first stage is.
 
-    records: as given, but with the noise-free input u_hat = S_hat r (the reference dropped: it has done its work);
-    sensitivity: posterior of S, r -> u; fit_percent (per record) of u by u_hat; first_stage: the identification.
+    records: as given, but with the noise-free input u_hat = S_hat r (the reference dropped: it has done its
+    work); sensitivities: posterior of S, r -> u, one per record (the same one throughout if it was shared);
+    fit_percent (per record) of u by u_hat; first_stage: the identification that chose the poles of S.
     """
 
     records: tuple[Record, ...]
-    sensitivity: ResponsePosterior
+    sensitivities: tuple[ResponsePosterior, ...]
     fit_percent: tuple[float, ...]
     first_stage: Identification
     verdict: str
 
     def relative_error(self, omega_rad_s: RealArray) -> RealArray:
-        """(F,) standard deviation of S_hat over |S_hat|: what the second stage inherits and does not see."""
-        estimate = self.sensitivity.at(omega_rad_s)
-        spread = estimate.covariance[:, 0, 0] + estimate.covariance[:, 1, 1]
-        return np.asarray(np.sqrt(spread) / np.abs(estimate.centre))
+        """(F,) standard deviation of S_hat over |S_hat|, RMS over the records.
+
+        The bounds of a second stage do not see it: to first order the same relative error is in G.
+        """
+        total = np.zeros(np.shape(omega_rad_s))
+        for sensitivity in self.sensitivities:
+            estimate = sensitivity.at(omega_rad_s)
+            variance = estimate.covariance[:, 0, 0] + estimate.covariance[:, 1, 1]
+            total += variance / np.abs(estimate.centre) ** 2
+        return np.asarray(np.sqrt(total / len(self.sensitivities)))
 
 
 def two_stage(
-    records: Sequence[Record], options: IdentOptions | None = None, embedding: EmbeddingOptions | None = None
+    records: Sequence[Record],
+    options: IdentOptions | None = None,
+    embedding: EmbeddingOptions | None = None,
+    *,
+    shared: bool = False,
 ) -> TwoStage:
     """Van den Hof and Schrama (Automatica 29(6), 1993): turn r -> u -> y into an open-loop problem.
 
-    The sensitivity r -> u is identified first (direct term on, no integrators or delay, whatever `options` say about
-    the plant), the records' inputs are replaced by its simulation from rest, which the noise does not touch. What
-    the later bounds miss is the error of S_hat (`relative_error`); it matters only where the loop gain is not
-    small. Raises ValueError when a record has not exactly one reference and one input.
+    The sensitivity r -> u is identified first (direct term on, no integrators or delay, whatever `options`
+    say about the plant), the records' inputs are replaced by its simulation from rest, which the noise does
+    not touch. With shared = False each record gets its own sensitivity on common poles: the error of S_hat
+    then differs between records and shows in their scatter, so `combine_posteriors` over the records accounts
+    for it. With shared = True one sensitivity serves all, which is more accurate, but its error
+    (`relative_error`) is common and in no bound of the second stage. Raises ValueError when a record has not
+    exactly one reference and input.
     """
     plant_options = options or IdentOptions()
     stage = plant_options.model_copy(
@@ -114,9 +128,12 @@ def two_stage(
     )
     closed = [_reference_to_input(record) for record in records]
     first = identify(closed, stage)
-    sensitivity = tangent(closed, first.model, embedding)
+    if shared:
+        sensitivities = [tangent(closed, first.model, embedding)] * len(closed)
+    else:
+        sensitivities = [tangent([record], first.model, embedding) for record in closed]
     opened, fits = [], []
-    for record in records:
+    for record, sensitivity in zip(records, sensitivities, strict=True):
         u, u_hat = record.input[:, 0], sensitivity.simulate(_reference(record))
         spread = float(np.linalg.norm(u - u.mean()))
         fits.append(100 * (1 - float(np.linalg.norm(u - u_hat)) / spread))
@@ -125,7 +142,7 @@ def two_stage(
         f"The reference explains {min(fits):.1f} to {max(fits):.1f} % of the input: the rest is noise and distortion "
         "that the loop fed back, and no longer drives the estimate."
     )
-    return TwoStage(tuple(opened), sensitivity, tuple(fits), first, verdict)
+    return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits), first, verdict)
 
 
 def indirect(
@@ -133,8 +150,8 @@ def indirect(
 ) -> FrequencyUncertainty:
     """Plant from the closed-loop response T (r -> y) under u = reference_gain r - feedback_gain y.
 
-    G = T / (a - g T); dG/dT = a / (a - g T)^2 turns and scales each ellipse (first order: good while the ellipse is
-    small against |a - g T|). Raises ValueError where a - g T is within its own ellipse of zero.
+    G = T / (a - g T); dG/dT = a / (a - g T)^2 turns and scales each ellipse (first order: good while the
+    ellipse is small against |a - g T|). Raises ValueError where a - g T is within its own ellipse of zero.
     """
     rest = reference_gain - feedback_gain * closed_loop.centre
     lost = np.abs(rest) <= abs(feedback_gain) * closed_loop.enclosing_radius()

@@ -11,12 +11,40 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
+from ident.ellipses import chi2_radius
 from ident.embedding import EmbeddingOptions, common_fir_length, tangent
 from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.model import GobfModel
 from ident.posterior import ResponsePosterior
 from ident.record import Record
+
+
+def mean_record(records: Sequence[Record], name: str) -> Record:
+    """Average of records repeated with the same reference: the same linear system, less noise, fewer samples to fit.
+
+    Raises ValueError when lengths, sampling times or channels differ.
+    """
+    if not records:
+        raise ValueError("need at least one record")
+    first = records[0]
+    for record in records[1:]:
+        channels = (record.input_names, record.output_names, record.reference_names)
+        if (
+            record.n_samples != first.n_samples
+            or record.dt_s != first.dt_s
+            or channels != (first.input_names, first.output_names, first.reference_names)
+        ):
+            raise ValueError(f"{record.label} and {first.label} differ in length, sampling time or channels")
+    references = [record.reference for record in records if record.reference is not None]
+    return replace(
+        first,
+        name=name,
+        input=np.mean([record.input for record in records], axis=0),
+        output=np.mean([record.output for record in records], axis=0),
+        reference=np.mean(references, axis=0) if references else None,
+    )
 
 
 def record_posteriors(
@@ -29,15 +57,20 @@ def record_posteriors(
     return [tangent([record], model, shared) for record in records]
 
 
-def combine_posteriors(posteriors: Sequence[ResponsePosterior]) -> ResponsePosterior:
+def combine_posteriors(
+    posteriors: Sequence[ResponsePosterior], *, small_sample_level: float | None = None
+) -> ResponsePosterior:
     """Posterior of the response in a condition like these, from one posterior per condition.
 
-    Mean = average of the K means; covariance = (1 + 1/K) S + mean P / K with S the sample covariance between
-    the means. S estimates T + mean P, so noise is counted once too often in directions that differ between
-    conditions: the error is on the safe side. S has rank K - 1: with two conditions the ellipses stretch
-    along the line that joins them, to 2.1 times either's distance from the middle per standard deviation, and
-    nowhere else. The conditions are taken as a sample of those to be met; far outside their range nothing is
-    promised.
+    Mean = average of the K means; covariance = (1 + 1/K) w S + mean P / K with S the sample covariance
+    between the means. S estimates T + mean P, so noise is counted once too often in directions that differ
+    between conditions: the error is on the safe side. S has rank K - 1: with two conditions the ellipses
+    stretch along the line that joins them, and nowhere else. The conditions are taken as a sample of those to
+    be met; far outside their range nothing is promised.
+
+    w = 1 takes S as known. With small_sample_level (for instance 0.95) w makes the ellipses at that level
+    those of Hotelling's prediction region for one more condition: w = 2 (K - 1) / (K - 2) F(2, K - 2) /
+    chi2(2), 2.9 for six conditions, 10 for four; it needs K >= 4.
 
     All must share poles, structure and fir_length (see `record_posteriors`). Raises ValueError otherwise.
     """
@@ -58,7 +91,7 @@ def combine_posteriors(posteriors: Sequence[ResponsePosterior]) -> ResponsePoste
     count = len(posteriors)
     means = np.stack([posterior.mean for posterior in posteriors])
     mean = means.mean(axis=0)
-    between = (means - mean).T * np.sqrt((1 + 1 / count) / (count - 1))
+    between = (means - mean).T * np.sqrt(_widening(count, small_sample_level) * (1 + 1 / count) / (count - 1))
     within = np.hstack([posterior.covariance_factor for posterior in posteriors]) / count
     report = first.report and replace(
         first.report,
@@ -70,7 +103,9 @@ def combine_posteriors(posteriors: Sequence[ResponsePosterior]) -> ResponsePoste
     return replace(first, mean=mean, covariance_factor=factor, report=report)
 
 
-def combine_responses(responses: Sequence[FrequencyUncertainty]) -> FrequencyUncertainty:
+def combine_responses(
+    responses: Sequence[FrequencyUncertainty], *, small_sample_level: float | None = None
+) -> FrequencyUncertainty:
     """The same for frequency responses of any origin on one grid, frequency by frequency.
 
     Raises ValueError when there are fewer than two or their grids or sampling times differ.
@@ -85,7 +120,8 @@ def combine_responses(responses: Sequence[FrequencyUncertainty]) -> FrequencyUnc
     centres = np.stack([response.centre for response in responses])
     deviation = centres - centres.mean(axis=0)
     pair = np.stack([deviation.real, deviation.imag])
-    between = np.einsum("akf,bkf->fab", pair, pair) * (1 + 1 / count) / (count - 1)
+    factor = _widening(count, small_sample_level) * (1 + 1 / count) / (count - 1)
+    between = factor * np.einsum("akf,bkf->fab", pair, pair)
     within = np.mean([response.covariance for response in responses], axis=0) / count
     return replace(
         first,
@@ -93,3 +129,13 @@ def combine_responses(responses: Sequence[FrequencyUncertainty]) -> FrequencyUnc
         covariance=between + within,
         method=f"{first.method}, {count} conditions",
     )
+
+
+def _widening(count: int, level: float | None) -> float:
+    """Hotelling's prediction region over the chi-square ellipse, both at `level`; 1 without a level."""
+    if level is None:
+        return 1.0
+    if count < 4:
+        raise ValueError(f"a small-sample region needs at least four conditions; got {count}")
+    hotelling = 2 * (count - 1) / (count - 2) * float(f_distribution.ppf(level, 2, count - 2))
+    return hotelling / chi2_radius(level) ** 2

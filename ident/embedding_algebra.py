@@ -278,7 +278,7 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
         kernel_mean=mean,
         kernel_factor=_symmetric_factor(covariance),
         noise_variance=noise,
-        alpha=float(grid.alpha[best]),
+        alpha=float(grid.alpha[best]) if np.any(weights) else 0.0,
         lam=grid.spectra[best[0]].lam,
         probability_no_remainder=weight_none,
         log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import detrend
 from scipy.stats import f as f_distribution
 
 from ident.arrays import ComplexArray, RealArray
@@ -37,8 +38,8 @@ def empirical_frf(
     records: SISO, equal length and sampling time. half_width_lines: none given means 0 for three or more
     records and otherwise just enough for five lines. The result has one frequency per averaging width,
     between omega_min_rad_s (default: the first whole width) and omega_max_rad_s (default: pi/dt). periodic =
-    False differences input, output and reference first, which leaves G as it is and takes the leakage of
-    offset and drift away; True takes the records as whole periods in steady state. Raises ValueError when the
+    False takes a straight line off every signal, so that offset and drift do not leak; True takes the records
+    as whole periods in steady state. Raises ValueError when the
     records do not fit together or leave fewer than three spectral lines per estimate.
     """
     spectra = _spectra(records, periodic)
@@ -103,13 +104,12 @@ def _spectra(records: Sequence[Record], periodic: bool) -> _Spectra:
     def transform(signals: list[RealArray]) -> ComplexArray:
         stacked = np.stack(signals)
         if not periodic:
-            stacked = np.diff(stacked, axis=1)
+            stacked = detrend(stacked, axis=1, type="linear")
         return np.asarray(np.fft.rfft(stacked, axis=1)[:, 1:], dtype=np.complex128)
 
     u = transform([record.input[:, 0] for record in records])
-    n_used = first.n_samples - (0 if periodic else 1)
     return _Spectra(
-        omega_rad_s=2 * np.pi * np.arange(1, u.shape[1] + 1) / (n_used * first.dt_s),
+        omega_rad_s=2 * np.pi * np.arange(1, u.shape[1] + 1) / (first.n_samples * first.dt_s),
         input=u,
         output=transform([record.output[:, 0] for record in records]),
         instrument=transform([r[:, 0] for r in references if r is not None]) if by_reference else u,

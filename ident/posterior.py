@@ -17,7 +17,7 @@ from ident.poles import Poles
 from ident.structure import filter_input
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class EmbeddingReport:
     """How a posterior came about, in numbers a reader can judge.
 

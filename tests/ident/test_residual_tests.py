@@ -1,0 +1,93 @@
+"""Whiteness and independence: false alarms at the stated rate, real faults found, sentences that say so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from ident.residual_tests import ResidualTest, independence_test, whiteness_test
+
+
+def coloured(rng, n, pole):
+    return signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(n))
+
+
+def test_false_alarms_are_about_one_in_a_hundred():
+    alarms_white = alarms_independent = outside = 0
+    runs = 300
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        e, u = rng.standard_normal(600), coloured(rng, 600, 0.9)
+        white, independent = whiteness_test([e]), independence_test([u], [e])
+        alarms_white += not white.passed
+        alarms_independent += not independent.passed
+        outside += np.count_nonzero(np.abs(white.correlation) > white.band)
+    # Binomial, 300 trials at 1 %: mean 3, 4 sd above is 10.
+    assert alarms_white <= 10
+    assert alarms_independent <= 10
+    assert outside / (25 * runs) == pytest.approx(0.01, abs=0.006)
+
+
+def test_coloured_residual_and_input_do_not_fail_the_independence_test_by_themselves():
+    alarms = 0
+    for seed in range(200):
+        rng = np.random.default_rng([1, seed])
+        alarms += not independence_test([coloured(rng, 800, 0.9)], [coloured(rng, 800, 0.8)]).passed
+    assert alarms <= 12  # a little above 1 %: the variance is estimated
+
+
+def test_coloured_residuals_are_found_and_named():
+    result = whiteness_test([coloured(np.random.default_rng(2), 500, 0.5) for _ in range(3)])
+    assert not result.passed
+    assert "lag 1" in result.verdict
+    assert "not white" in result.verdict
+    assert result.correlation[0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_missed_dynamics_are_found_at_their_lag():
+    rng = np.random.default_rng(3)
+    u = rng.standard_normal(2000)
+    e = rng.standard_normal(2000)
+    e[7:] += 0.3 * u[:-7]
+    result = independence_test([u], [e])
+    assert not result.passed
+    assert "7 samples before" in result.verdict
+    assert result.lags[np.argmax(np.abs(result.correlation))] == 7
+
+
+def test_feedback_shows_at_negative_lags_and_does_not_fail_the_model():
+    rng = np.random.default_rng(4)
+    e = rng.standard_normal(4000)
+    u = rng.standard_normal(4000)
+    u[2:] -= 0.8 * e[:-2]
+    result = independence_test([u], [e])
+    assert result.passed
+    assert "closed loop" in result.verdict
+
+
+def test_records_are_pooled_without_correlating_across_their_joint():
+    rng = np.random.default_rng(5)
+    parts = [rng.standard_normal(400) for _ in range(5)]
+    pooled = whiteness_test(parts, max_lag=3)
+    own = sum(p @ p for p in [q - q.mean() for q in parts])
+    expected = sum((q - q.mean())[1:] @ (q - q.mean())[:-1] for q in parts) / own
+    assert pooled.correlation[0] == pytest.approx(expected, rel=1e-9)
+    assert pooled.band[0] == pytest.approx(2.5758 / np.sqrt(2000), rel=1e-4)
+
+
+def test_round_trip_and_bad_input():
+    result = whiteness_test([np.random.default_rng(6).standard_normal(100)])
+    again = ResidualTest.from_dict(result.to_dict())
+    np.testing.assert_array_equal(again.correlation, result.correlation)
+    assert (again.verdict, again.passed) == (result.verdict, result.passed)
+    with pytest.raises(ValueError, match="T > 50"):
+        whiteness_test([np.zeros(20)])
+    with pytest.raises(ValueError, match="constant"):
+        whiteness_test([np.ones(100)])
+    with pytest.raises(ValueError, match="equal length"):
+        independence_test([np.zeros(100)], [np.zeros(90)])
+    with pytest.raises(ValueError, match="at least one record"):
+        whiteness_test([])
+    with pytest.raises(ValueError, match="max_lag"):
+        whiteness_test([np.zeros(100)], max_lag=0)

@@ -1,0 +1,119 @@
+"""Fresh-data fit, invalidation and repeat scatter on systems whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.model import GobfModel
+from ident.poles import Poles
+from ident.record import Record
+from ident.validation import FreshFit, Invalidation, fit_on_fresh_data, invalidate, repeat_scatter
+
+DT = 0.01
+OMEGA = np.linspace(1.0, 100.0, 60)
+
+
+def model(integrators=0):
+    return GobfModel(Poles([0.9], [0.95 * np.exp(0.3j)]), [1.0, -0.4, 0.7], DT, integrators=integrators)
+
+
+def record(u, y, dt=DT):
+    return Record("fresh", u[:, None], y[:, None], dt, ("u",), ("y",))
+
+
+@pytest.mark.parametrize("integrators", [0, 1, 2])
+def test_true_model_fits_fully_whatever_the_initial_state(integrators):
+    m = model(integrators)
+    u = np.random.default_rng(0).standard_normal(900)
+    y = m.simulate(u) + 3.0
+    middle = record(u[400:], y[400:])
+    fit = fit_on_fresh_data(m, middle)
+    assert fit.fit_percent > 99.9999
+    from_rest = fit_on_fresh_data(m, middle, estimate_initial_state=False)
+    assert from_rest.fit_percent < 99.9
+    np.testing.assert_allclose(
+        fit.simulated + fit.residual, middle.output[:, 0], atol=1e-12 * np.abs(y).max()
+    )
+
+
+def test_fit_percent_of_pure_noise_on_top():
+    m = model()
+    rng = np.random.default_rng(1)
+    u = rng.standard_normal(20_000)
+    clean = m.simulate(u)
+    noise = 0.1 * np.std(clean) * rng.standard_normal(u.size)
+    fit = fit_on_fresh_data(m, record(u, clean + noise))
+    assert fit.fit_percent == pytest.approx(100 * (1 - 0.1 / np.sqrt(1.01)), abs=0.2)
+    again = FreshFit.from_arrays(fit.to_arrays())
+    assert (again.name, again.fit_percent) == (fit.name, fit.fit_percent)
+    np.testing.assert_array_equal(again.residual, fit.residual)
+
+
+def test_fresh_fit_refuses_what_it_cannot_judge():
+    u = np.random.default_rng(2).standard_normal(100)
+    with pytest.raises(ValueError, match="dt_s"):
+        fit_on_fresh_data(model(), record(u, u, 2 * DT))
+    with pytest.raises(ValueError, match="constant"):
+        fit_on_fresh_data(model(), record(u, np.ones(100)))
+    two = Record("w", np.zeros((9, 2)), np.zeros((9, 1)), DT, ("a", "b"), ("y",))
+    with pytest.raises(ValueError, match="one input"):
+        fit_on_fresh_data(model(), two)
+
+
+def estimate(rng, centre, sd):
+    noise = sd * (rng.standard_normal(OMEGA.size) + 1j * rng.standard_normal(OMEGA.size))
+    covariance = np.broadcast_to(sd**2 * np.eye(2), (OMEGA.size, 2, 2))
+    return FrequencyUncertainty(OMEGA, centre + noise, covariance, DT)
+
+
+def test_invalidation_alarms_at_its_level_and_finds_a_change():
+    truth = 1 / (1 + 0.1j * OMEGA)
+    alarms = 0
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        alarms += invalidate(estimate(rng, truth, 0.01), estimate(rng, truth, 0.02)).invalidated
+    # 5 % of 300 is 15, sd 3.8; 4 of those.
+    assert abs(alarms - 15) <= 15
+    rng = np.random.default_rng(1000)
+    changed = truth + 0.2 * (np.abs(OMEGA - 50) < 3)
+    report = invalidate(estimate(rng, truth, 0.01), estimate(rng, changed, 0.02))
+    assert report.invalidated
+    assert report.worst_omega_rad_s == pytest.approx(50, abs=3)
+    assert "contradict the model" in report.verdict
+    assert report.n_outside >= 3
+    again = Invalidation.from_dict(report.to_dict())
+    np.testing.assert_array_equal(again.distance, report.distance)
+    assert again.verdict == report.verdict
+    same = invalidate(estimate(rng, truth, 0.01), estimate(rng, truth, 0.02))
+    assert "do not contradict" in same.verdict or "more than" in same.verdict
+
+
+def test_invalidation_needs_one_grid():
+    rng = np.random.default_rng(3)
+    other = FrequencyUncertainty(OMEGA + 0.1, np.ones(60), np.zeros((60, 2, 2)), DT)
+    with pytest.raises(ValueError, match="different frequency grids"):
+        invalidate(estimate(rng, 1.0, 0.1), other)
+
+
+def test_repeat_scatter_ratio_is_one_for_honest_bounds_and_shows_dishonest_ones():
+    rng = np.random.default_rng(4)
+    honest = [[estimate(rng, g, 0.01) for _ in range(3)] for g in (1.0, 1.1)]
+    rows = repeat_scatter(honest, [(0, 50), (50, 101), (200, 300)])
+    assert len(rows) == 2
+    for row in rows:
+        # 30 frequencies x 4 complex degrees of freedom: relative sd of an RMS 1 / sqrt(4 x 30 x 2) = 0.065
+        assert row.ratio == pytest.approx(1.0, abs=0.26)
+        # |1.1 - 1| / sqrt 2, relative to 1.05, noise 0.01 sqrt(2 / 3)
+        assert row.between == pytest.approx(0.1 / np.sqrt(2) / 1.05, abs=0.01)
+        assert row.between_ratio > 5
+    narrow = [
+        [FrequencyUncertainty(OMEGA, e.centre, e.covariance / 9, DT) for e in group] for group in honest
+    ]
+    assert repeat_scatter(narrow, [(0, 101)])[0].ratio == pytest.approx(3.0, abs=0.6)
+    alone = repeat_scatter(honest[:1], [(0, 101)])[0]
+    assert np.isnan(alone.between)
+    assert set(alone.to_dict()) >= {"predicted", "measured", "ratio"}
+    with pytest.raises(ValueError, match="at least two repeats"):
+        repeat_scatter([honest[0][:1]], [(0, 101)])
