@@ -1,47 +1,55 @@
-"""A small made-up arm as the typed objects a run leaves behind, for tests of pictures and page."""
+"""A small made-up arm and a whole run of it, as typed objects and stage files like a real run's."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
+from control_design.certificate import certify
+from control_design.controller import Controller
+from control_design.plant_set import Channel, UncertainPlant
+from control_design.synthesis import BlockingPoint, Outcome, StartReport, SynthesisResult
+from ident.basis import basis_response
+from ident.identify import Identification
 from ident.model import GobfModel
+from ident.order_selection import OrderStep
 from ident.poles import Poles
 from ident.record import Record
+from ident.search_trace import PolishedMinimum, SearchStage, SearchTrace
+from ident.structure import Structure
 from ident.uncertainty import ResponsePosterior
+from ident.validation import ScatterRow, fit_on_fresh_data
+from workflow.config import RunConfig
+from workflow.run_directory import RunDirectory, StageData
+from workflow.stages import closed_loop as closed_loop_stage
+from workflow.stages import identify as identify_stage
+from workflow.stages import uncertainty as uncertainty_stage
+from workflow.stages.results import ChannelResult, RunRecord
 
 DT_S = 0.01
+INPUT = "voltage_V"
 
 
-def model(output: str = "hub_angle_rad", *, integrators: int = 1) -> GobfModel:
-    """A hub with one real pole and two lightly damped modes."""
-    poles = Poles.from_continuous(decay_per_s=[6.0], omega_rad_s=[14.0, 62.0], zeta=[0.02, 0.015], dt_s=DT_S)
-    coefficients = np.array([0.02, 0.004, -0.006, 0.003, 0.002])
-    return GobfModel(
-        poles, coefficients, DT_S, integrators=integrators, input_name="voltage_V", output_name=output
-    )
+def model(output: str = "hub_angle_rad", *, input_name: str = INPUT) -> GobfModel:
+    """A hub with one real pole, two lightly damped modes and an integrator."""
+    poles = Poles.from_continuous(decay_per_s=[6.0], omega_rad_s=[14.0, 62.0], zeta=[0.05, 0.015], dt_s=DT_S)
+    coefficients = np.array([0.02, 0.004, -0.006, 0.0005, 0.0003])
+    return GobfModel(poles, coefficients, DT_S, integrators=1, input_name=input_name, output_name=output)
 
 
-def posterior(of: GobfModel, relative: float = 0.03) -> ResponsePosterior:
-    """Independent coefficient errors of this relative size on the doubled basis."""
+def posterior(of: GobfModel, relative: float = 0.01) -> ResponsePosterior:
+    """The model as mean on its doubled basis (by projection on the circle), equal errors throughout."""
     doubled = of.poles.doubled()
-    mean = np.zeros(doubled.order)
-    n_real = of.poles.real.size
-    mean[:n_real] = 0.0
-    # A doubled basis orders real poles twice, then every pair twice; the first copy of each spans the model
-    # only together with what stands before it, so the mean is taken by projection on the circle.
-    omega = np.linspace(0.5, np.pi / DT_S, 600)
-    from ident.basis import basis_response
-
-    z = np.exp(1j * omega * DT_S)
+    z = np.exp(1j * np.linspace(0.5, np.pi / DT_S, 600) * DT_S)
     rows, wanted = basis_response(doubled, z), basis_response(of.poles, z) @ of.coefficients
-    mean = np.linalg.lstsq(
-        np.vstack([rows.real, rows.imag]), np.concatenate([wanted.real, wanted.imag]), rcond=None
-    )[0]
-    factor = np.diag(np.full(mean.size, relative * np.abs(of.coefficients).max()))
+    stacked = np.vstack([rows.real, rows.imag])
+    mean = np.linalg.lstsq(stacked, np.concatenate([wanted.real, wanted.imag]), rcond=None)[0]
     return ResponsePosterior(
         poles=doubled,
         mean=mean,
-        covariance_factor=factor,
+        covariance_factor=np.diag(np.full(mean.size, relative * float(np.abs(of.coefficients).min()))),
         dt_s=DT_S,
         fir_length=0,
         has_feedthrough=False,
@@ -53,26 +61,315 @@ def posterior(of: GobfModel, relative: float = 0.03) -> ResponsePosterior:
 
 
 def record(
-    of: list[GobfModel],
-    name: str,
-    seed: int,
-    *,
-    samples: int = 900,
-    units: bool = True,
-    input_name: str = "voltage_V",
+    models: list[GobfModel], name: str, seed: int, *, samples: int = 900, units: bool = True
 ) -> Record:
     """Square-wave excitation, outputs of the models with a little white noise."""
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.choice([-1.0, 1.0], samples // 12 + 1), 12)[:samples] * 2.0
-    y = np.column_stack([m.simulate(u) for m in of])
+    y = np.column_stack([m.simulate(u) for m in models])
     y = y + 0.02 * y.std(axis=0) * rng.standard_normal(y.shape)
     return Record(
         name=name,
         input=u[:, None],
         output=y,
         dt_s=DT_S,
-        input_names=(input_name,),
-        output_names=tuple(m.output_name for m in of),
+        input_names=(models[0].input_name,),
+        output_names=tuple(m.output_name for m in models),
         input_units=("V",) if units else (),
-        output_units=tuple("rad" if "rad" in m.output_name else "m" for m in of) if units else (),
+        output_units=tuple("rad" if "rad" in m.output_name else "m" for m in models) if units else (),
     )
+
+
+def identification(of: GobfModel, used: list[Record]) -> Identification:
+    """What `identify` would return for this model, with a made-up search."""
+    rng = np.random.default_rng(7)
+    residuals = tuple(r.output[:, 0] - of.simulate(r.input[:, 0]) for r in used)
+    rss = float(sum(e @ e for e in residuals))
+    points = np.column_stack([rng.uniform(0.3, 2.3, 120), rng.uniform(-3.0, -0.2, 120)])
+    names = ("log10(omega [rad/s]) 1", "log10(zeta) 1")
+    trace = SearchTrace(
+        stages=(SearchStage("pair 1", names, points, np.abs(points[:, 0] - np.log10(14.0))),),
+        minima=(PolishedMinimum("pair 1", of.poles, rss),),
+        warnings=("the pole pair at 62 rad/s sits on your bound of zeta: widen it",),
+        evaluations=240,
+    )
+    fit = [
+        100 * (1 - np.linalg.norm(e) / np.linalg.norm(r.output - r.output.mean()))
+        for e, r in zip(residuals, used, strict=True)
+    ]
+    return Identification(
+        model=of,
+        structure=Structure(of.integrators, 0, False, True, False),
+        record_names=tuple(r.name for r in used),
+        residuals=residuals,
+        fit_percent=np.array(fit),
+        rss=rss,
+        noise_std=float(np.sqrt(rss / sum(e.size for e in residuals))),
+        tangent_optimality=1e-9,
+        order_table=(OrderStep(1, 1, 2.5 * rss, 812.4), OrderStep(1, 2, rss, -95.1)),
+        verdicts=("offset left out: its columns lower the test statistic by 0.3",),
+        search=trace,
+    )
+
+
+def controller(gain: float = 1.5) -> Controller:
+    """A lead that leaves the example's modes alone."""
+    return Controller(
+        A=np.array([[0.7]]),
+        B=np.array([[1.0]]),
+        C=np.array([[-0.25 * gain]]),
+        D=np.array([[gain]]),
+        dt_s=DT_S,
+        input_limit=24.0,
+    )
+
+
+def plant(*, performance: bool = True) -> UncertainPlant:
+    hub, tip = model(), model("tip_m")
+    return UncertainPlant(
+        "hub",
+        hub.to_control(),
+        posterior(hub),
+        performance=Channel(tip.to_control(), posterior(tip)) if performance else None,
+    )
+
+
+def scatter_rows() -> list[ScatterRow]:
+    return [
+        ScatterRow(0.3, 3.0, 20, 0.11, 0.13, 1.18, 0.2, 1.8),
+        ScatterRow(3.0, 30.0, 20, 0.021, 0.019, 0.9, 0.03, 1.4),
+        ScatterRow(30.0, 300.0, 20, 0.3, 0.41, 1.37, float("nan"), float("nan")),
+    ]
+
+
+def config(
+    *,
+    channels: int = 2,
+    validation: bool = True,
+    title: str = "Made-up arm",
+    outputs: tuple[str, ...] = ("hub_angle_rad", "tip_m"),
+    labels: tuple[str, ...] = ("hub", "tip"),
+    records: tuple[str, ...] = ("prbs 1", "prbs 2", "fresh"),
+    input_name: str = INPUT,
+    modulus_margin: float = 0.5,
+    notes: tuple[str, ...] = ("link of 1 m",),
+    machine: str = "simulated",
+) -> RunConfig:
+    """The configuration such a run would have. The excitations stand for the records made above."""
+    excitation = {"kind": "prbs", "amplitude_V": 2.0, "samples": 900, "hold_samples": 12}
+    roles = ["estimation", "estimation", "validation" if validation else "repeat"]
+    return RunConfig.model_validate(
+        {
+            "run": {"name": "example", "title": title, "seed": 3},
+            "source": {
+                "kind": "simulated",
+                "records": [
+                    {"name": name, "role": role, "condition": "same", "excitation": excitation}
+                    for name, role in zip(records, roles, strict=True)
+                ][: 3 if validation else 2],
+            },
+            "channels": [
+                {"name": label, "input": input_name, "output": output}
+                for label, output in list(zip(labels, outputs, strict=True))[:channels]
+            ],
+            "specification": {
+                "bandwidth_rad_s": 0.1,
+                "modulus_margin": modulus_margin,
+                "input_limit": 24.0,
+                "controller_order": 1,
+            },
+            "closed_loop": {"machine": machine, "draws": 3},
+            "notes": {"known": list(notes), "unknown": ["the amplifier's bandwidth"]},
+        }
+    )
+
+
+def build_run(
+    path: Path,
+    settings: RunConfig,
+    *,
+    gain: float = 1.5,
+    impossible: bool = False,
+    settled: int = 3,
+    scatter: bool = True,
+    config_text: str = "# as given\n[run]\nname = 'example'\n",
+) -> RunDirectory:
+    """Write every stage but the report, through the same types and words as the real stages."""
+    run = RunDirectory.begin(
+        path,
+        config_text=config_text,
+        config=settings.to_document(),
+        seed=settings.run.seed,
+        inputs={"log.csv": "ab" * 32},
+    )
+    models = [model(channel.output, input_name=channel.input) for channel in settings.channels]
+    names = settings.record_names
+    roles = [entry.role for entry in settings.source.records]
+    records = [
+        RunRecord(record(models, name, seed, samples=900), role, "same", "a remark")
+        for seed, (name, role) in enumerate(zip(names, roles, strict=True), 1)
+    ]
+    _save_records(run, records)
+    results = _save_identification(run, settings, models, records)
+    _save_uncertainty(run, settings, results, scatter)
+    _save_design(run, settings, gain, impossible, settled)
+    for number, name in enumerate(("records", "identify", "uncertainty", "design", "certify", "closed_loop")):
+        run.record_stage(name, 1.5 + number, "00")
+    return run
+
+
+def _save_records(run: RunDirectory, records: list[RunRecord]) -> None:
+    arrays: dict[str, Any] = {}
+    about = []
+    for i, item in enumerate(records):
+        arrays |= {f"record/{i}/{key}": value for key, value in item.record.to_arrays().items()}
+        names = (*item.record.input_names, *item.record.output_names)
+        units = (*item.record.input_units, *item.record.output_units)
+        about.append(
+            {
+                "name": item.record.name,
+                "role": item.role,
+                "condition": item.condition,
+                "remark": item.remark,
+                "kind": "prbs",
+                "file": None,
+                "samples": item.record.n_samples,
+                "dt_s": DT_S,
+                "duration_s": item.record.n_samples * DT_S,
+                "closed_loop": False,
+                "units": dict(zip(names, units, strict=True)),
+            }
+        )
+    run.save_stage(
+        "records", StageData(arrays, {"source": "simulated", "effects": [], "records": about}), "00"
+    )
+
+
+def _save_identification(
+    run: RunDirectory, settings: RunConfig, models: list[GobfModel], records: list[RunRecord]
+) -> list[ChannelResult]:
+    arrays: dict[str, Any] = {}
+    about, results = [], []
+    for k, (channel, of) in enumerate(zip(settings.channels, models, strict=True)):
+        used = identify_stage.estimation_records(records, channel.input, channel.output)
+        found = identification(of, used)
+        fresh = [
+            fit_on_fresh_data(of, item.record.siso(channel.input, channel.output))
+            for item in records
+            if item.role != "estimation"
+        ]
+        at = f"channel/{k}/"
+        arrays |= {f"{at}identification/{key}": value for key, value in found.to_arrays().items()}
+        for i, one in enumerate(used):
+            arrays |= {f"{at}used/{i}/{key}": value for key, value in one.to_arrays().items()}
+        for i, fit in enumerate(fresh):
+            arrays |= {f"{at}fresh/{i}/{key}": value for key, value in fit.to_arrays().items()}
+        about.append(identify_stage.describe(settings, k, found, fresh, records))
+        results.append(ChannelResult(channel.label, found, tuple(used), tuple(fresh)))
+    run.save_stage("identify", StageData(arrays, {"channels": about}), "00")
+    return results
+
+
+def _save_uncertainty(
+    run: RunDirectory, settings: RunConfig, results: list[ChannelResult], scatter: bool
+) -> None:
+    arrays: dict[str, Any] = {}
+    about = []
+    for k, result in enumerate(results):
+        found = posterior(result.identification.model)
+        omega = uncertainty_stage.display_grid(result.identification.model, result.used)
+        frequency = found.at(omega, 0.95)
+        empirical = uncertainty_stage.empirical_response(result.used, 0.95)
+        at = f"channel/{k}/"
+        arrays |= {f"{at}posterior/{key}": value for key, value in found.to_arrays().items()}
+        arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
+        if empirical is not None:
+            arrays |= {f"{at}empirical/{key}": value for key, value in empirical.to_arrays().items()}
+        bands = uncertainty_stage.bands_of(omega)
+        about.append(
+            {
+                "name": settings.channels[k].label,
+                "method": "tangent",
+                "level": 0.95,
+                "report": None,
+                "bands": [uncertainty_stage.band_row(frequency, low, high) for low, high in bands],
+                "tests": uncertainty_stage.residual_tests(result),
+                "repeat_scatter": [row.to_dict() for row in scatter_rows()] if scatter else None,
+            }
+        )
+    run.save_stage("uncertainty", StageData(arrays, {"channels": about}), "00")
+
+
+def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible: bool, settled: int) -> None:
+    if impossible:
+        reason = "plant 'hub': bandwidth_rad_s = 900 lies beyond the Nyquist frequency"
+        run.save_stage(
+            "design", StageData(document={"synthesis": None, "met": False, "reason": reason}), "00"
+        )
+        nothing = {"certificate": None, "certified": False, "reason": reason}
+        run.save_stage("certify", StageData(document=nothing), "00")
+        skipped = {"skipped": reason, "machine": settings.machine}
+        run.save_stage("closed_loop", StageData(document=skipped), "00")
+        return
+    law = controller(gain)
+    certificate = certify(
+        law, [plant(performance=len(settings.channels) > 1)], settings.specification, n_dense=800
+    )
+    met = certificate.gamma <= 1
+    result = SynthesisResult(
+        outcome=Outcome.MET_ON_GRID if met else Outcome.NOT_MET,
+        controller=law,
+        gamma=certificate.gamma,
+        blocking=(BlockingPoint("hub", "modulus", 12.5, certificate.gamma),),
+        starts=(StartReport(0, "Solve_Succeeded", 41, 0.7, certificate.gamma),),
+        gamma_history=(certificate.gamma,),
+        grid_points=200,
+    )
+    document = {"synthesis": result.to_dict(), "met": met, "reason": result.explain()}
+    run.save_stage("design", StageData(document=document), "00")
+    run.save_stage(
+        "certify",
+        StageData(
+            document={
+                "certificate": certificate.to_dict(),
+                "certified": certificate.certified,
+                "reason": "; ".join(item.sentence() for item in certificate.items if not item.met) or "met",
+            }
+        ),
+        "00",
+    )
+    run.save_stage("closed_loop", closed_loop_data(settings, settled), "00")
+
+
+def closed_loop_data(settings: RunConfig, settled: int, draws: int = 3) -> StageData:
+    """A well-damped step response for the prediction, noisy copies for the machine."""
+    time = np.arange(800) * DT_S
+    reference = np.where(time >= 0.4, 0.5, 0.0)
+    disturbance = np.where(time >= 4.0, 0.3, 0.0)
+    shape = 1 - np.exp(-3 * (time - 0.4)) * np.cos(5 * (time - 0.4))
+    output = np.where(time >= 0.4, 0.5 * shape, 0.0)
+    rng = np.random.default_rng(5)
+
+    def runs(count: int, noise: float) -> closed_loop_stage.Runs:
+        y = output + noise * rng.standard_normal((count, time.size))
+        y[:, time >= 4.0] += 0.05 * np.exp(-2 * (time[time >= 4.0] - 4))
+        u = np.clip(4 * (reference - y), -24, 24)
+        return closed_loop_stage.Runs(y, u, 0.9 * y if len(settings.channels) > 1 else None, np.abs(u) >= 24)
+
+    trial = closed_loop_stage.Trial(time, reference, disturbance, 0.5, 400, tracking=True)
+    predicted, achieved = runs(1, 0.0), runs(draws, 0.002)
+    document = {
+        "skipped": None,
+        "tracking": True,
+        "machine": settings.machine,
+        "draws": draws,
+        "reference_step": 0.5,
+        "disturbance": 0.3,
+        "quantisation": 0.0,
+        "input_limit": 24.0,
+        "predicted": closed_loop_stage.describe(predicted, trial)[0],
+        "achieved": closed_loop_stage.describe(achieved, trial),
+        "settled_draws": settled,
+    }
+    arrays = {"time_s": time, "reference": reference, "disturbance": disturbance}
+    return StageData({**arrays, **predicted.arrays("predicted"), **achieved.arrays("achieved")}, document)

@@ -45,7 +45,7 @@ def draw_bode(
         floor = _gain_floor(band.gain, None if empirical is None else np.abs(empirical.response))
         if empirical is not None:
             inside = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
-            at, response = empirical.omega_rad_s[inside], empirical.response[inside]
+            at, response = _thinned(empirical.omega_rad_s[inside], empirical.response[inside])
             dots = {"color": style.MEASURED, "ls": "none", "marker": ".", "ms": 4.0, "alpha": 0.55, "mew": 0}
             label = "straight from the records, no model"
             gain.plot(at, np.maximum(np.abs(response), floor), **dots, label=label)
@@ -66,10 +66,9 @@ def draw_bode(
         gain.set_yscale("log")
         gain.set_xscale("log")
         gain.set_ylim(bottom=floor)
-        gain.set_title(
-            f"{style.plain(name)}: {style.plain(input_label[0], 30)} to {style.plain(output_label[0], 30)}"
-        )
-        gain.set_ylabel(f"gain [{style.plain(style.ratio_unit(output_label[1], input_label[1]), 36)}]")
+        signals = f"{style.plain(input_label[0], 26)} to {style.plain(output_label[0], 26)}"
+        gain.set_title(f"{style.plain(name, 26)}: {signals}")
+        gain.set_ylabel(f"gain [{style.plain(style.ratio_unit(output_label[1], input_label[1]), 24)}]")
         phase.set_ylabel("phase [deg]")
         span = np.ptp(band.phase_deg)
         phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
@@ -90,6 +89,15 @@ def draw_bode(
         figure.align_ylabels()
         style.finish(figure, (gain, size), columns=5)
     return figure
+
+
+def _thinned(omega_rad_s: Real, response: Complex, most: int = 450) -> tuple[Real, Complex]:
+    """Points evenly spread on the log axis: the thousands of a long record hide each other."""
+    if omega_rad_s.size <= most:
+        return omega_rad_s, response
+    wanted = np.geomspace(omega_rad_s[0], omega_rad_s[-1], most)
+    index = np.unique(np.minimum(np.searchsorted(omega_rad_s, wanted), omega_rad_s.size - 1))
+    return omega_rad_s[index], response[index]
 
 
 def _gain_floor(gain: Real, empirical: Real | None) -> float:

@@ -82,7 +82,7 @@ def draw_closed_loop(
                             onset,
                             f"disturbance {_disturbance_size(scene):.3g} {scene.command[1]}".rstrip(),
                         )
-            axes_row[0].set_ylabel(style.axis_label(*label))
+            axes_row[0].set_ylabel(style.two_lines(*label))
             _limits(axes_row[0], scene, kind, predicted, (achieved, spread))
         for axes, (_, _, title) in zip(grid[0], windows, strict=True):
             axes.set_title(title)

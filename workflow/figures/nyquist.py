@@ -58,7 +58,7 @@ def draw_nyquist(
     """Whole curve (as far as it fits) and the surroundings of -1. `modulus_margin` is the radius asked
     for."""
     with style.house_style():
-        figure = style.new_figure(5.5)
+        figure = style.new_figure(6.0)
         whole, near = figure.subplots(1, 2)
         reach = float(np.clip(1.15 * np.abs(loop.centre).max(), 1.6, 6.0))
         nearest = loop.nearest

@@ -81,12 +81,12 @@ def draw_poles(
         whole.set_xlim(-1.1, 1.1)
         whole.set_ylim(-1.1, 1.1)
         whole.set_title(
-            f"Poles{': ' + style.plain(name, 30) if name else ''} (sampled every {dt_s * 1e3:.4g} ms)"
+            f"Poles{': ' + style.plain(name, 13) if name else ''} (sampled every {dt_s * 1e3:.4g} ms)"
         )
         corner = _near_corner(np.concatenate([identified, known]))
         near.set_xlim(1 - corner, 1 + 0.12 * corner)
         near.set_ylim(-0.12 * corner, corner)
-        near.set_title("Near z = 1")
+        near.set_title("Near z = 1 (dashed: damping, dotted: frequency)")
         _frequency_arcs(near, corner, dt_s)
         _name_dampings(near, corner)
         style.finish(figure, whole, columns=5)
@@ -119,9 +119,12 @@ def _damping_lines(axes: Axes) -> None:
 def _name_dampings(axes: Axes, corner: float) -> None:
     """Damping ratios where their lines leave the close-up."""
     angle = np.linspace(1e-4, np.pi, 6000)
-    for zeta in _DAMPINGS:
+    for number, zeta in enumerate(_DAMPINGS):
         z = np.exp((-zeta / np.sqrt(1 - zeta**2) + 1j) * angle)
-        inside = (z.real > 1 - 0.93 * corner) & (z.imag < 0.93 * corner) & (z.imag >= 0)
+        share = 0.93 - 0.07 * (
+            number % 2
+        )  # neighbouring lines lie close together: their labels stand at two heights
+        inside = (z.real > 1 - 0.93 * corner) & (z.imag < share * corner) & (z.imag >= 0)
         leaves = int(np.argmin(inside)) if not inside.all() else angle.size - 1
         point = z[max(leaves - 1, 0)]
         axes.annotate(
@@ -133,16 +136,6 @@ def _name_dampings(axes: Axes, corner: float) -> None:
             color="#555555",
             bbox={"facecolor": "white", "lw": 0, "pad": 0.8},
         )
-    axes.text(
-        0.98,
-        0.98,
-        "dashed: damping ratio\ndotted: frequency",
-        transform=axes.transAxes,
-        fontsize=8.5,
-        color="#555555",
-        ha="right",
-        va="top",
-    )
 
 
 def _frequency_arcs(axes: Axes, corner: float, dt_s: float) -> None:

@@ -53,11 +53,11 @@ def draw_records(shown: Sequence[ShownRecord], inputs: Sequence[str], outputs: S
             draw = {"drawstyle": "steps-post"} if kind == "input" else {}
             right.plot(first.time_s[zoom], signal, **style.MEASURED_LINE, **draw)
             right.margins(x=0)
-            left.set_ylabel(_two_lines(name, _unit(first, kind, name)))
+            left.set_ylabel(style.two_lines(name, _unit(first, kind, name)))
             left.set_xlim(0, starts[-1])
         _name_records(grid[0, 0], shown, starts)
         grid[0, 0].set_title("Records, one after another", pad=16)
-        grid[0, 1].set_title(f"Close-up of {style.plain(shown[0].record.name, 22)}", pad=16)
+        grid[0, 1].set_title("Close-up of record 1", pad=16)
         grid[-1, 0].set_xlabel("time, all records [s]")
         grid[-1, 1].set_xlabel("time in this record [s]")
         figure.align_ylabels()
@@ -95,10 +95,6 @@ def _unit(record: Record, kind: str, name: str) -> str:
         else (record.output_names, record.output_units)
     )
     return units[names.index(name)] if units else ""
-
-
-def _two_lines(name: str, unit: str) -> str:
-    return style.plain(name, 20) + f"\n[{style.plain(unit, 16) if unit else 'as logged'}]"
 
 
 def _liveliest(record: Record, name: str) -> slice:

@@ -132,7 +132,7 @@ def draw_sensitivities(
                     fontsize=8.5,
                     color="#555555",
                 )
-            axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 34)}]")
+            axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
             axes.set_ylim(*_range(curve))
             axes.set_xlim(curve.omega_rad_s[0], curve.omega_rad_s[-1])
             for omega, word in marks:

@@ -136,9 +136,9 @@ def plain(text: object, longest: int = 60) -> str:
     return "".join(letter if ord(letter) in _drawable() else "\u25a1" for letter in one_line)
 
 
-def axis_label(name: object, unit: str) -> str:
-    """`name [unit]`; a unit nobody stated is said to be as logged, never guessed."""
-    return f"{plain(name, 34)} [{plain(unit, 20) if unit else 'as logged'}]"
+def two_lines(name: object, unit: str) -> str:
+    """Axis label `name`, `[unit]`; a unit nobody stated is said to be as logged, never guessed."""
+    return f"{plain(name, 20)}\n[{plain(unit, 16) if unit else 'as logged'}]"
 
 
 def ratio_unit(output_unit: str, input_unit: str) -> str:
@@ -175,7 +175,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 def _power_of_ten(value: float, _: int) -> str:
     if not value > 0:
         return ""
-    if 1e-2 <= value <= 1e3:
+    if 0.999e-3 <= value <= 1.001e3:
         return f"{value:g}"
     exponent = round(np.log10(value))
     return f"10{str(exponent).translate(_SUPERSCRIPT)}"

@@ -42,9 +42,9 @@ def draw_validation(
         words = "fresh record" if fresh else "record of the fit"
         grid[0, 0].set_title(f"{style.plain(record.name, 34)} ({words}): fit {fit.fit_percent:.1f} %")
         grid[0, 1].set_title("Close-up")
-        unit = style.plain(record.output_units[0], 16) if any(record.output_units) else "as logged"
-        grid[0, 0].set_ylabel(f"{style.plain(record.output_names[0], 22)}\n[{unit}]")
-        grid[1, 0].set_ylabel(f"residual\n[{unit}]")
+        unit = record.output_units[0] if record.output_units else ""
+        grid[0, 0].set_ylabel(style.two_lines(record.output_names[0], unit))
+        grid[1, 0].set_ylabel(style.two_lines("residual", unit))
         figure.align_ylabels()
         style.finish(figure, grid.ravel(), columns=4)
     return figure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config import RunConfig
 from workflow.run_directory import RunDirectory, StageData
+from workflow.stages.identify import increments
 from workflow.stages.results import (
     ChannelResult,
     RunRecord,
@@ -36,15 +37,11 @@ class ChannelData:
     empirical: FrequencyUncertainty | None
     identified: Mapping[str, Any]
     uncertain: Mapping[str, Any]
-    fresh_records: tuple[Record, ...] = ()
+    fresh_records: tuple[Record, ...]
 
     @property
     def label(self) -> str:
         return self.result.label
-
-    def fresh_record(self, index: int) -> Record:
-        """The SISO record behind a free run on data the fit has not seen."""
-        return self.fresh_records[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +91,14 @@ class RunData:
         return np.asarray(self.closed_loop.arrays[name], dtype=np.float64)
 
 
+def _as_fitted(record: Record, of_increments: bool) -> Record:
+    """The record as the fit sees it, increments named so."""
+    if not of_increments:
+        return record
+    name = f"increment of {record.output_names[0]}"
+    return replace(increments(record), output_names=(name,), output_units=record.output_units)
+
+
 def load(run: RunDirectory, config: RunConfig) -> RunData:
     """Read every stage once. Raises InputError when records, identification or uncertainty are missing."""
     records = run.load_stage("records")
@@ -112,7 +117,8 @@ def load(run: RunDirectory, config: RunConfig) -> RunData:
                 identified=identified.document["channels"][k],
                 uncertain=uncertain.document["channels"][k],
                 fresh_records=tuple(
-                    by_name[fit.name].siso(channel.input, channel.output) for fit in result.fresh
+                    _as_fitted(by_name[fit.name].siso(channel.input, channel.output), channel.increments)
+                    for fit in result.fresh
                 ),
             )
         )

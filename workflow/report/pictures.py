@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from control_design.frequency_grid import frequency_grid
 from control_design.plant_set import Mode, modes_of
 from control_design.stability import closed_loop_poles
-from ident.regression import prepare
+from ident.error_surface import error_surface
 from ident.uncertainty import ResponsePosterior
 from ident.validation import ResidualTest, ScatterRow, fit_on_fresh_data
 from workflow.figures.bands import Real
 from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
-from workflow.figures.error_surface import draw_error_surface, surface_of_pair
+from workflow.figures.error_surface import draw_error_surface, searched_pairs
 from workflow.figures.nyquist import draw_nyquist, uncertain_loop
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import ShownRecord, draw_records
@@ -60,7 +60,7 @@ def _of_channel(data: RunData, index: int, channel: ChannelData) -> dict[str, Dr
 
     pair = shown_pair(channel)
     if pair is not None:
-        add("error-surface", lambda: _error_surface(data, index, channel, pair))
+        add("error-surface", lambda: _error_surface(channel, pair))
     add("poles", lambda: _poles(data, channel, with_loop=index == data.config.control_index))
     add("bode", lambda: _bode(data, channel))
     add("validation", lambda: _validation(channel, fresh_index(data, channel)))
@@ -115,17 +115,21 @@ def _records(data: RunData) -> Figure:
     return draw_records([ShownRecord(item.record, item.role) for item in data.records], inputs, outputs)
 
 
-def _error_surface(data: RunData, index: int, channel: ChannelData, pair: int) -> Figure:
-    found, used = channel.result.identification, channel.result.used
-    surface = surface_of_pair(
-        prepare(used, found.structure),
-        data.config.channels[index].identification,
-        found.model.poles,
-        pair,
-        found.rss,
-        found.search.stages,
+def _error_surface(channel: ChannelData, pair: int) -> Figure:
+    found = channel.result.identification
+    poles, dt_s = found.model.poles, found.model.dt_s
+    omega, zeta = float(poles.omega_rad_s(dt_s)[pair]), float(poles.zeta()[pair])
+    longest_s = max(record.n_samples for record in channel.result.used) * dt_s
+    low = min(max(omega / 8, 2 * np.pi / longest_s), 0.8 * omega)
+    surface = error_surface(
+        channel.result.used,
+        found.model,
+        found.structure,
+        pair=pair,
+        first=np.geomspace(low, max(min(8 * omega, 0.95 * np.pi / dt_s), 1.02 * omega), 48),
+        second=np.geomspace(min(1e-3, zeta / 3), max(0.7, min(0.97, 1.1 * zeta)), 24),
     )
-    return draw_error_surface(surface, name=channel.label)
+    return draw_error_surface(surface, searched_pairs(found.search.stages, omega), name=channel.label)
 
 
 def _poles(data: RunData, channel: ChannelData, *, with_loop: bool) -> Figure:
@@ -163,7 +167,7 @@ def _validation(channel: ChannelData, fresh: int | None) -> Figure:
         record = channel.result.used[0]
         fit = fit_on_fresh_data(found.model, record)
     else:
-        record, fit = channel.fresh_record(fresh), channel.result.fresh[fresh]
+        record, fit = channel.fresh_records[fresh], channel.result.fresh[fresh]
     return draw_validation(record, fit, fresh=fresh is not None, noise_std=found.noise_std)
 
 
@@ -191,7 +195,7 @@ def _loop_grid(data: RunData) -> Real:
     ]
     worst = [] if data.certificate is None else [v.worst_margin_omega_rad_s for v in data.certificate.plants]
     dense = frequency_grid(
-        float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=41 * len(modes)
+        float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=81 * len(modes)
     )
     every = np.unique(np.concatenate([omega, dense, [w for w in worst if 0 < w <= omega[-1]]]))
     return np.asarray(every[(every > 0) & (every <= omega[-1])])

@@ -103,11 +103,14 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         parts.append(f"{count(about['input_delay_samples'], 'sample')} of input delay")
     if about["feedthrough"]:
         parts.append("a direct term")
+    of = "Fit to"
+    if about["increments"]:
+        of = "Fitted to the differences from sample to sample, so that drift weighs less. Fit to those of"
     fits = listing([f"{percent(fit)} ({name})" for name, fit in about["fit_estimation_percent"].items()])
     blocks.append(
         Text(
             f"{about['input']} to {about['output']}: {listing(parts)}, found with "
-            f"{about['search_evaluations']} evaluations of the error. Fit to the records used: {fits}."
+            f"{about['search_evaluations']} evaluations of the error. {of} the records used: {fits}."
         )
     )
     modes = tuple(
@@ -298,7 +301,7 @@ def _on(test: Mapping[str, Any]) -> str:
 
 def _scatter_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     between = any(not math.isnan(row["between"]) for row in rows)
-    head = (
+    head: tuple[str, ...] = (
         "from [rad/s]",
         "to [rad/s]",
         "predicted / gain [%]",
@@ -491,6 +494,7 @@ def _met(state: bool | None) -> str:
     return "–" if state is None else "yes" if state else "NO"
 
 
+_ONLY_TRACKING = 5  # the first metrics mean something only where the specification asks for tracking
 _METRICS = (
     ("rise_time_s", "rise time 10-90 % [s]", 1.0),
     ("overshoot_percent", "overshoot [%]", 1.0),
@@ -531,6 +535,8 @@ def closed_loop_section(data: RunData) -> Section:
         lead += f", commands rounded to {number(document['quantisation'])} {command}"
     lead += f": {settled} of {draws} settled."
     blocks: list[Block] = [Text(lead)]
+    if not document["tracking"]:
+        blocks.append(Text("The specification asks for no tracking; the step only shows what the loop does."))
     if simulated and data.config.closed_loop.effects:
         effects = listing([_effect(effect) for effect in data.config.closed_loop.effects])
         blocks.append(Text(f"The arm differs from the one the records came from: {effects}."))
@@ -549,14 +555,15 @@ def closed_loop_section(data: RunData) -> Section:
         )
     )
     if settled < draws:
-        words = f"{count(draws - settled, 'run')} of {draws} did not settle within a tenth of the step. "
-        words += (
+        words = (
+            f"{count(draws - settled, 'run')} of {draws} did not settle: still moving by more than a tenth "
+            f"of the step at the end of either half{', or not there' if document['tracking'] else ''}. "
             "Advice: look at friction (a steady error, a limit cycle) and at the disturbance's size first."
         )
         blocks.append(Remarks((words,), "warning"))
     achieved: Sequence[Mapping[str, Any]] = document["achieved"]
     rows = []
-    for key, words, factor in _METRICS:
+    for key, words, factor in _METRICS if document["tracking"] else _METRICS[_ONLY_TRACKING:]:
         predicted = document["predicted"][key]
         label = words.format(output=output, input=command)
         rows.append((label, _reached(predicted, factor), *_range([row[key] for row in achieved], factor)))

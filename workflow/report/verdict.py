@@ -139,7 +139,7 @@ def _achieved(data: RunData) -> list[str]:
         else "plants drawn from the uncertainty"
     )
     text = f"In closed loop {settled} of {draws} {on} settled"
-    if predicted["rise_time_s"] is not None and first["rise_time_s"] is not None:
+    if document["tracking"] and predicted["rise_time_s"] is not None and first["rise_time_s"] is not None:
         text += (
             f"; rise time {number(first['rise_time_s'])} s in the first (predicted "
             f"{number(predicted['rise_time_s'])} s)"
@@ -169,6 +169,12 @@ def _sure(data: RunData) -> list[str]:
         else:
             text += "; no fresh data to test it on"
         sentences.append(text + ".")
+        warnings = channel.identified["warnings"]
+        if warnings:
+            sentences.append(
+                f"{channel.label}: {count(len(warnings), 'warning')} about the model, first: "
+                f"{sentence(warnings[0])}"
+            )
         failed = [test for test in channel.uncertain["tests"] if not test["passed"]]
         if failed:
             sentences.append(

@@ -1,0 +1,386 @@
+"""Every picture: title, units on the axes, a legend that hides nothing, no text cut off, same bytes twice."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from control_design.stability import closed_loop_poles
+from ident.error_surface import error_surface
+from ident.uncertainty import FrequencyUncertainty
+from ident.validation import fit_on_fresh_data, independence_test, whiteness_test
+from tests.workflow import report_examples as example
+from workflow.figures import style
+from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees
+from workflow.figures.bode import EmpiricalResponse, draw_bode
+from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
+from workflow.figures.error_surface import draw_error_surface, searched_pairs
+from workflow.figures.nyquist import draw_nyquist, uncertain_loop
+from workflow.figures.poles import draw_poles
+from workflow.figures.records import ShownRecord, draw_records
+from workflow.figures.repeats import draw_repeat_scatter
+from workflow.figures.residuals import draw_residual_tests
+from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
+from workflow.figures.validation import draw_validation
+
+OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))
+HOSTILE = "a_$very$_<b>long</b>\nname & 漢 of a column that goes on and on and on"
+
+
+def frequency() -> FrequencyUncertainty:
+    return example.posterior(example.model()).at(OMEGA)
+
+
+def records_figure(name: str = "prbs") -> Figure:
+    models = [example.model(), example.model("tip_m")]
+    roles = ("estimation", "estimation", "validation", "repeat")
+    shown = [ShownRecord(example.record(models, f"{name} {i}", i), role) for i, role in enumerate(roles, 1)]
+    return draw_records(shown, [example.INPUT], ["hub_angle_rad", "tip_m"])
+
+
+def bode_figure(name: str = "hub") -> Figure:
+    found = frequency()
+    seen = EmpiricalResponse(OMEGA[::2], found.centre[::2] * 1.1)
+    return draw_bode(
+        found,
+        name=name,
+        input_label=(name, "V"),
+        output_label=(name, "rad"),
+        model=example.model(),
+        empirical=seen,
+    )
+
+
+def poles_figure(name: str = "hub") -> Figure:
+    loop = closed_loop_poles(example.controller(), example.plant())
+    poles = example.model().poles.values
+    return draw_poles(example.DT_S, identified=poles, integrators=1, closed_loop=loop, name=name)
+
+
+def error_surface_figure(name: str = "hub") -> Figure:
+    of = example.model()
+    used = [example.record([of], "prbs", 1)]
+    found = example.identification(of, used)
+    surface = error_surface(used, of, found.structure, n_points=16)
+    return draw_error_surface(surface, searched_pairs(found.search.stages, 14.0), name=name)
+
+
+def nyquist_figure(name: str = "hub") -> Figure:
+    loop = uncertain_loop(frequency(), example.controller().response(OMEGA))
+    return draw_nyquist(loop, level=0.95, modulus_margin=0.5, name=name)
+
+
+def sensitivity_figure(name: str = "V") -> Figure:
+    asked = example.config().specification
+    curves = sensitivity_curves(
+        example.plant(),
+        example.controller(),
+        asked,
+        OMEGA,
+        input_unit=name,
+        output_unit="rad",
+        performance_unit="m",
+    )
+    return draw_sensitivities(curves, level=0.95, marks=[(14.0, "mode 1")])
+
+
+def loop_scene(name: str = "hub") -> tuple[LoopScene, LoopTraces, LoopTraces]:
+    data = example.closed_loop_data(example.config(), 3)
+    arrays = data.arrays
+    scene = LoopScene(
+        arrays["time_s"],
+        arrays["reference"],
+        arrays["disturbance"],
+        (name, "rad"),
+        ("voltage_V", "V"),
+        (name, "m"),
+        24.0,
+    )
+
+    def traces(prefix: str) -> LoopTraces:
+        return LoopTraces(*(arrays[f"{prefix}/{key}"] for key in ("output", "command", "performance")))
+
+    return scene, traces("predicted"), traces("achieved")
+
+
+def closed_loop_figure(name: str = "hub") -> Figure:
+    scene, predicted, achieved = loop_scene(name)
+    return draw_closed_loop(scene, predicted, achieved, machine="simulated arm", spread=achieved)
+
+
+def validation_figure(name: str = "fresh") -> Figure:
+    of = example.model()
+    fresh = example.record([of], name, 3)
+    return draw_validation(fresh, fit_on_fresh_data(of, fresh), fresh=True, noise_std=0.05)
+
+
+def residuals_figure(name: str = "hub") -> Figure:
+    of = example.model()
+    used = example.record([of], "prbs", 3)
+    residual = used.output[:, 0] - of.simulate(used.input[:, 0])
+    return draw_residual_tests(
+        whiteness_test([residual]), independence_test([used.input[:, 0]], [residual]), name=name
+    )
+
+
+def repeats_figure(name: str = "hub") -> Figure:
+    return draw_repeat_scatter(example.scatter_rows(), name=name)
+
+
+FAMILIES: list[Callable[..., Figure]] = [
+    records_figure,
+    bode_figure,
+    poles_figure,
+    error_surface_figure,
+    nyquist_figure,
+    sensitivity_figure,
+    closed_loop_figure,
+    validation_figure,
+    residuals_figure,
+    repeats_figure,
+]
+
+
+def panels(figure: Figure) -> list:
+    """The axes that show something; colour bars and secondary axes have labels of their own or none."""
+    return [axes for axes in figure.axes if axes.get_visible() and not hasattr(axes, "_colorbar")]
+
+
+@pytest.mark.parametrize("draw", FAMILIES)
+def test_figure_has_titles_units_and_a_legend(draw):
+    figure = draw()
+    assert any(axes.get_title(loc="left") for axes in panels(figure))
+    labels = [label for axes in panels(figure) for label in (axes.get_xlabel(), axes.get_ylabel()) if label]
+    assert labels
+    for label in labels:
+        assert re.search(r"\[.+\]", label), f"no unit in {label!r}"
+    # Every panel of a row or column is labelled by itself or by the one it shares the axis with.
+    for axes in panels(figure):
+        assert any(other.get_xlabel() for other in axes.get_shared_x_axes().get_siblings(axes))
+        assert any(other.get_ylabel() for other in axes.get_shared_y_axes().get_siblings(axes)) or any(
+            other.get_ylabel() for other in panels(figure) if same_row(other, axes)
+        )
+    assert len(figure.legends) == 1
+    assert figure.legends[0].get_texts()
+
+
+def same_row(one, other) -> bool:
+    return one.get_subplotspec().rowspan == other.get_subplotspec().rowspan
+
+
+@pytest.mark.parametrize("name", ["hub", HOSTILE], ids=["plain", "hostile"])
+@pytest.mark.parametrize("draw", FAMILIES)
+def test_nothing_is_cut_off_and_nothing_overlaps(draw, name):
+    figure = draw(name)
+    with style.house_style():
+        figure.draw_without_rendering()
+        renderer = figure.canvas.get_renderer()
+    page = figure.bbox
+    words = [
+        *(axes.title for axes in panels(figure)),
+        *(axes._left_title for axes in panels(figure)),
+        *(axis.label for axes in panels(figure) for axis in (axes.xaxis, axes.yaxis)),
+        *figure.legends[0].get_texts(),
+    ]
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in words if text.get_text()]
+    slack = 1.5  # pixels: glyphs overhang their advance a little
+    for text, box in boxes:
+        assert box.x0 >= page.x0 - slack, text
+        assert box.x1 <= page.x1 + slack, text
+        assert box.y0 >= page.y0 - slack, text
+        assert box.y1 <= page.y1 + slack, text
+    for (one, first), (other, second) in itertools.combinations(boxes, 2):
+        overlap = (
+            min(first.x1, second.x1) - max(first.x0, second.x0),
+            min(first.y1, second.y1) - max(first.y0, second.y0),
+        )
+        assert min(overlap) <= slack, f"{one!r} overlaps {other!r}"
+    legend = figure.legends[0].get_window_extent(renderer)
+    for axes in panels(figure):
+        assert not legend.overlaps(axes.get_window_extent(renderer)), "the legend hides a panel"
+
+
+@pytest.mark.parametrize("draw", [bode_figure, nyquist_figure])
+def test_same_bytes_twice_and_no_date(draw):
+    first, second = style.render(draw()), style.render(draw())
+    assert first == second
+    assert b"<dc:date>" not in first.content
+
+
+def test_global_settings_are_left_alone():
+    before = dict(mpl.rcParams)
+    style.render(poles_figure())
+    assert dict(mpl.rcParams) == before
+
+
+def test_a_picture_too_large_for_svg_becomes_png(monkeypatch):
+    monkeypatch.setattr(style, "SVG_LIMIT_BYTES", 1000)
+    picture = style.render(residuals_figure())
+    assert picture.kind == "png"
+    assert picture.content.startswith(b"\x89PNG")
+    assert picture == style.render(residuals_figure())
+
+
+def test_svg_is_inlined_with_ids_of_its_own_and_without_names_in_comments():
+    svg = style.render(residuals_figure("x --> <script>")).content
+    text = style.inline_svg(svg, "one-", "a label")
+    assert text.startswith("<svg ")
+    assert text.rstrip().endswith("</svg>")
+    assert "<!--" not in text
+    assert "script" not in text
+    ids = re.findall(r'\bid="([^"]+)"', text)
+    assert ids
+    assert all(item.startswith("one-") for item in ids)
+    used = re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', text)
+    assert {one or other for one, other in used} <= set(ids)
+
+
+def test_hostile_text_is_drawn_as_it_is():
+    text = style.plain(HOSTILE)
+    assert "\n" not in text
+    assert "$very$" in text  # no formula: the house style parses none
+    assert "漢" not in text  # not in the font: a box, no warning
+    assert len(text) == 60
+
+
+def test_units_are_never_guessed():
+    assert style.two_lines("torque_Nm", "") == "torque_Nm\n[as logged]"
+    assert style.two_lines("torque_Nm", "N m") == "torque_Nm\n[N m]"
+
+
+def test_gain_and_phase_bands_hold_what_is_in_the_ellipse():
+    rng = np.random.default_rng(1)
+    found = frequency()
+    band = response_band(found)
+    ellipse = found.ellipse()
+    angle, radius = (
+        rng.uniform(0, 2 * np.pi, (2000, OMEGA.size)),
+        np.sqrt(rng.uniform(0, 1, (2000, OMEGA.size))),
+    )
+    members = found.centre + ellipse.direction * radius * (
+        ellipse.semi_major * np.cos(angle) + 1j * ellipse.semi_minor * np.sin(angle)
+    )
+    assert np.all(np.abs(members) <= band.gain_high * (1 + 1e-9))
+    assert np.all(np.abs(members) >= band.gain_low * (1 - 1e-9))
+    # The ends are reached: the largest of 2000 members comes within a few per cent of the band's width.
+    width = band.gain_high - band.gain_low
+    assert np.all(np.abs(members).max(axis=0) > band.gain_high - 0.1 * width)
+    phase = degrees_near(members, np.broadcast_to(band.phase_deg, members.shape))
+    inside = band.gain_low > 0
+    # 128 boundary points miss the extreme phase by less than 0.2 % of the swing.
+    swing = band.phase_high_deg - band.phase_low_deg
+    assert np.all((phase <= band.phase_high_deg + 0.002 * swing)[:, inside])
+    assert np.all((phase >= band.phase_low_deg - 0.002 * swing)[:, inside])
+
+
+def test_phase_is_the_whole_circle_where_the_ellipse_holds_the_origin():
+    covariance = np.broadcast_to(np.eye(2), (2, 2, 2))
+    found = FrequencyUncertainty(np.array([1.0, 2.0]), np.array([0.1 + 0j, 10.0 + 0j]), covariance, 0.01)
+    band = response_band(found)
+    assert band.gain_low[0] == 0
+    assert band.phase_high_deg[0] - band.phase_low_deg[0] == 360
+    assert band.phase_high_deg[1] - band.phase_low_deg[1] < 60
+
+
+def test_phase_starts_where_engineers_expect_it():
+    omega = np.geomspace(0.01, 100, 400)
+    double = 1 / (1j * omega) ** 2 / (1j * omega / 5 + 1)
+    phase = unwrapped_degrees(double)
+    assert phase[0] == pytest.approx(-180, abs=1)
+    assert phase[-1] == pytest.approx(-270, abs=5)
+
+
+@pytest.mark.parametrize("samples", [5, 2100, 2101, 12345])
+def test_outline_keeps_extremes_and_ends(samples):
+    rng = np.random.default_rng(samples)
+    time, signal = np.arange(samples) * 0.1, rng.standard_normal(samples)
+    t, s = outline(time, signal)
+    assert s.max() == signal.max()
+    assert s.min() == signal.min()
+    assert (t[0], t[-1]) == (time[0], time[-1])
+    assert np.all(np.diff(t) > 0)
+    assert t.size <= max(3 * 700, 2)
+
+
+@pytest.mark.parametrize("samples", [10, 600, 1777])
+def test_envelope_covers_every_signal(samples):
+    rng = np.random.default_rng(2)
+    time, signals = np.arange(samples) * 1.0, rng.standard_normal((4, samples))
+    t, low, high = envelope(time, signals)
+    assert (t[0], t[-1]) == (time[0], time[-1])
+    assert low.min() == signals.min()
+    assert high.max() == signals.max()
+
+
+def test_nearest_ellipse_is_the_one_a_sampling_finds():
+    found = frequency()
+    gain = example.controller().response(OMEGA)
+    loop = uncertain_loop(found, gain)
+    ellipse = found.ellipse()
+    sampled = np.abs(1 + gain[:, None] * (found.centre[:, None] + ellipse.boundary(400))).min(axis=1)
+    # 400 boundary points overestimate the distance by the sagitta of their chords at most.
+    sagitta = np.abs(gain) * ellipse.semi_major * (np.pi / 400) * 2
+    assert np.all(loop.distance <= sampled + 1e-12)
+    assert np.all(sampled <= loop.distance + sagitta + 1e-9)
+
+
+def test_sensitivity_curves_bound_every_member():
+    rng = np.random.default_rng(3)
+    plant = example.plant()
+    gain = example.controller().response(OMEGA)
+    curves = sensitivity_curves(plant, example.controller(), example.config().specification, OMEGA)
+    s, ks, t, gps = curves
+    ellipse, performance = plant.at(OMEGA), plant.performance_at(OMEGA)
+    assert performance is not None
+    for _ in range(300):
+        angle, radius = rng.uniform(0, 2 * np.pi, OMEGA.size), rng.uniform(0, 1, OMEGA.size)
+        member = ellipse.points(radius * np.cos(angle), radius * np.sin(angle))
+        other = performance.points(radius * np.sin(angle), radius * np.cos(angle))
+        size = np.abs(1 / (1 + gain * member))
+        assert np.all(size <= s.worst * (1 + 1e-9))
+        assert np.all(np.abs(gain) * size <= ks.worst * (1 + 1e-9))
+        assert np.all(np.abs(gain * member) * size <= t.worst * (1 + 1e-6))
+        assert np.all(np.abs(other) * size <= gps.worst * (1 + 1e-9))
+    assert not gps.exact
+
+
+def test_a_run_that_leaves_the_scene_does_not_flatten_the_others():
+    scene, predicted, achieved = loop_scene()
+    wild = LoopTraces(achieved.output * 1e6, achieved.command * 1e6, achieved.performance * 1e6)
+    figure = draw_closed_loop(scene, predicted, wild, machine="machine")
+    low, high = figure.axes[0].get_ylim()
+    assert high - low < 10 * np.ptp(predicted.output)
+
+
+def test_saturation_far_away_is_said_in_words():
+    scene, predicted, achieved = loop_scene()
+    figure = draw_closed_loop(scene, predicted, achieved, machine="machine")
+    words = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert any("saturation at ±24 V" in word for word in words)
+
+
+def test_loop_without_disturbance_or_performance():
+    scene, predicted, _ = loop_scene()
+    bare = LoopScene(scene.time_s, scene.reference, None, scene.output, scene.command)
+    figure = draw_closed_loop(bare, LoopTraces(predicted.output, predicted.command), None)
+    assert len(figure.axes) == 2
+
+
+def test_wrong_surface_and_missing_records_are_refused():
+    of = example.model()
+    used = [example.record([of], "prbs", 1)]
+    raw = error_surface(used, of, example.identification(of, used).structure, coordinates="raw", n_points=5)
+    with pytest.raises(ValueError, match="omega_rad_s and zeta"):
+        draw_error_surface(raw, np.zeros((0, 2)), name="hub")
+    with pytest.raises(ValueError, match="no record"):
+        draw_records([], ["u"], ["y"])
+    with pytest.raises(ValueError, match="no output column 'wrong'; there is"):
+        draw_records([ShownRecord(used[0], "estimation")], [example.INPUT], ["hub_angle_rad", "wrong"])
+    with pytest.raises(ValueError, match="no band"):
+        draw_repeat_scatter([], name="hub")

@@ -1,0 +1,280 @@
+"""The page: numbers are the stages' numbers, nothing is fetched, everything is escaped, every outcome has words."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import workflow.report
+from tests.workflow import report_examples as example
+from workflow.errors import InputError
+from workflow.figures.style import Picture
+from workflow.report import write_report
+from workflow.report.words import count, decibels, frequency, listing, number, sentence
+from workflow.run_directory import RunDirectory
+
+ATTACK = "<script>alert(1)</script>"
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and the text outside style and svg."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self._parts: list[str] = []
+        self._inside: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag in ("style", "svg"):
+            self._inside.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if self._inside and self._inside[-1] == tag:
+            self._inside.pop()
+
+    def handle_data(self, data: str) -> None:
+        if not self._inside:
+            self._parts.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self._parts).split())
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are built but not rendered: what a page says does not depend on its pictures."""
+    empty = Picture("svg", b'<svg viewBox="0 0 1 1"><path id="a"/><use href="#a"/></svg>')
+    monkeypatch.setattr(workflow.report, "render", lambda figure: empty)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory) -> RunDirectory:
+    settings = example.config()
+    run = example.build_run(tmp_path_factory.mktemp("report") / "run", settings)
+    write_report(run, settings)
+    return run
+
+
+def page_for(path: Path, settings, **how) -> Page:
+    run = example.build_run(path / "run", settings, **how)
+    return Page(write_report(run, settings).read_text(encoding="utf-8"))
+
+
+def test_page_and_pictures_are_written(drawn):
+    names = {path.name for path in drawn.figures_path.iterdir()}
+    families = {re.sub(r"(-\d.*)?\.(svg|png)$", "", name) for name in names}
+    assert families == {
+        "records",
+        "error-surface",
+        "poles",
+        "bode",
+        "validation",
+        "residuals",
+        "repeats",
+        "nyquist",
+        "sensitivities",
+        "closed-loop",
+    }
+    text = drawn.report_path.read_text(encoding="utf-8")
+    page = Page(text)
+    pictures = sum(tag == "svg" for tag, _ in page.tags) + sum(tag == "img" for tag, _ in page.tags)
+    assert pictures == len(names)
+    assert len(text) < 5_000_000
+
+
+def test_page_fetches_nothing(drawn):
+    text = drawn.report_path.read_text(encoding="utf-8")
+    for tag, attributes in Page(text).tags:
+        assert tag not in ("script", "link", "iframe", "object", "embed", "base"), tag
+        for name, value in attributes.items():
+            if name in ("src", "href", "xlink:href", "data", "action", "poster", "srcset"):
+                assert value is not None
+                assert value.startswith(("#", "data:image/png;base64,")), (tag, name, value[:60])
+            assert not name.startswith("on")
+    assert "@import" not in text
+    assert not re.search(r"url\((?!#)", text)
+
+
+def test_ids_are_unique_and_every_reference_has_its_target(drawn):
+    text = drawn.report_path.read_text(encoding="utf-8")
+    ids = [value for _, attributes in Page(text).tags if (value := attributes.get("id"))]
+    assert len(ids) == len(set(ids))
+    references = set(re.findall(r'href="#([^"]+)"', text)) | set(re.findall(r"url\(#([^)]+)\)", text))
+    assert references <= set(ids)
+
+
+def test_same_bytes_twice(drawn):
+    first = drawn.report_path.read_bytes()
+    pictures = {path.name: path.read_bytes() for path in drawn.figures_path.iterdir()}
+    write_report(drawn, example.config())
+    assert drawn.report_path.read_bytes() == first
+    assert {path.name: path.read_bytes() for path in drawn.figures_path.iterdir()} == pictures
+
+
+def test_pictures_of_an_earlier_report_go(drawn, undrawn, tmp_path):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    (run.figures_path / "old-3-gone.svg").write_text("<svg/>")
+    write_report(run, settings)
+    assert not (run.figures_path / "old-3-gone.svg").exists()
+
+
+def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+    identified = run.load_stage("identify").document["channels"]
+    for channel in identified:
+        for mode in channel["modes"]:
+            assert f"{mode['frequency_Hz']:.4g} {mode['omega_rad_s']:.4g} {mode['damping']:.3g}" in text
+        for name, fit in channel["fit_validation_percent"].items():
+            assert f"{fit:.3g} % ({name})" in text
+    for channel in run.load_stage("uncertainty").document["channels"]:
+        for band in channel["bands"]:
+            assert f"{band['median_radius_percent']:.3g}" in text
+        for test in channel["tests"]:
+            assert test["verdict"] in text
+    certificate = run.load_stage("certify").document["certificate"]
+    worst = certificate["plants"][0]["worst_margins"]
+    assert f"{worst['modulus']:.3g}" in text
+    assert f"{np.degrees(worst['phase_rad']):.3g}" in text
+    assert f"{1e3 * worst['delay_s']:.3g}" in text
+    for item in certificate["items"]:
+        assert f"{item['achieved']:.4g}" in text
+    for line in (*certificate["checked"], *certificate["not_checked"]):
+        assert line[1:] in text
+    loop = run.load_stage("closed_loop").document
+    assert f"{loop['predicted']['rise_time_s']:.3g}" in text
+    assert f"{loop['achieved'][0]['overshoot_percent']:.3g}" in text
+    manifest = run.manifest()
+    assert "ab" * 32 in text
+    assert manifest["versions"]["numpy"] in text
+    assert "# as given" in text
+
+
+def test_a_certified_run_says_so_and_why(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config())
+    assert "Certified All 3 runs on the simulated arm settled." in page.text
+    assert "no 95 % ellipse reaches -1, and all 2 items of the specification are met" in page.text
+    assert any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
+
+
+def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config(), gain=4.0)
+    assert "Not certified" in page.text
+    assert re.search(r"modulus margin, worst case: 0\.\d+ against 0\.5 at [\d.]+ rad/s: NOT met", page.text)
+    assert "blocks it" in page.text
+    assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
+
+
+def test_a_certificate_does_not_hide_a_loop_that_does_not_settle(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config(), settled=1)
+    assert "Certificate holds, but the loop does not settle" in page.text
+    assert "2 of 3 runs on the simulated arm did not settle" in page.text
+    assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
+
+
+def test_without_a_controller_the_page_still_tells_the_rest(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config(), impossible=True)
+    assert "Not certified: there is no controller" in page.text
+    assert "lies beyond the Nyquist frequency" in page.text
+    assert "There is no controller to certify." in page.text
+    run = RunDirectory.open(tmp_path / "run")
+    assert not list(run.figures_path.glob("nyquist*"))
+    assert list(run.figures_path.glob("bode*"))
+
+
+def test_without_validation_data_the_page_warns(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config(validation=False), scatter=False)
+    assert "No record was kept back for validation" in page.text
+    assert "no fresh data to test it on" in page.text
+    assert "this one was used in the fit" in page.text
+    assert not list((tmp_path / "run" / "figures").glob("repeats*"))
+
+
+def test_one_channel_alone(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config(channels=1))
+    assert "Channel hub" not in page.text
+    assert not list((tmp_path / "run" / "figures").glob("*-2-*"))
+
+
+def test_a_real_arm_is_not_said_to_have_run(undrawn, tmp_path):
+    page = page_for(tmp_path, example.config(machine="identified"))
+    assert "Nothing was run on the real machine here." in page.text
+    assert "The controller has not run on the real machine." in page.text
+    assert "on the simulated arm settled" not in page.text
+
+
+def test_hostile_names_are_escaped(tmp_path):
+    quote = '"><img src=x onerror=alert(1)>'
+    settings = example.config(
+        title=ATTACK,
+        outputs=(f"{ATTACK}_rad", quote),
+        labels=("hub --> $x$ ${y}", "tip & <b>tip</b>".replace("/", "|")),
+        records=("prbs <i>1", "&lt;b&gt;", "--> fresh"),
+        input_name=f"{{{{ 7 * 7 }}}} {quote}",
+        notes=(ATTACK, "{% raw %}"),
+        channels=1,
+    )
+    run = example.build_run(tmp_path / "run", settings, config_text=f"# {ATTACK}\n")
+    text = write_report(run, settings).read_text(encoding="utf-8")
+    assert ATTACK not in text
+    assert "<img src=x" not in text
+    page = Page(text)
+    assert not any(tag in ("script", "img", "b", "i") for tag, _ in page.tags)
+    assert ATTACK in page.text  # shown as it was written
+    assert "{{ 7 * 7 }}" in page.text  # no template runs inside user text
+    assert "{% raw %}" in page.text
+    for path in run.figures_path.iterdir():
+        assert re.fullmatch(r"[a-z0-9-]+\.(svg|png)", path.name)
+
+
+def test_missing_stage_is_one_line(tmp_path):
+    settings = example.config()
+    run = RunDirectory.begin(
+        tmp_path / "run", config_text="", config=settings.to_document(), seed=3, inputs={}
+    )
+    with pytest.raises(InputError, match="stage records is not there"):
+        write_report(run, settings)
+    assert not run.report_path.exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"),
+        (float("nan"), "not known"),
+        (float("inf"), "unlimited"),
+        (0.0, "0"),
+        (1234.6, "1235"),
+        (123456.7, "123457"),
+        (0.001234, "0.00123"),
+        (1.5e-7, "1.5e-07"),
+        (-2.0, "-2"),
+    ],
+)
+def test_numbers_in_words(value, text):
+    assert number(value) == text
+
+
+def test_small_phrases():
+    assert listing([]) == ""
+    assert listing(["a"]) == "a"
+    assert listing(["a", "b", "c"]) == "a, b and c"
+    assert count(0, "run") == "no runs"
+    assert count(1, "run") == "1 run"
+    assert count(2, "entry", "entries") == "2 entries"
+    assert decibels(2.0) == "2 (+6.0 dB)"
+    assert decibels(0.0) == "no lower limit"
+    assert frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
+    assert sentence("hub: it is") == "hub: it is."
+    assert sentence("stop!") == "Stop!"
