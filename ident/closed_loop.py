@@ -119,8 +119,9 @@ def two_stage(
     not touch. With shared = False each record gets its own sensitivity on common poles: the error of S_hat
     then differs between records and shows in their scatter, so `combine_posteriors` over the records accounts
     for it. With shared = True one sensitivity serves all, which is more accurate, but its error
-    (`relative_error`) is common and in no bound of the second stage. Raises ValueError when a record has not
-    exactly one reference and input.
+    (`relative_error`) is common and in no bound of the second stage: where the loop gain is large those bounds do
+    not cover. With a single record and a known feedback use `indirect`, whose bounds do. Raises ValueError when
+    a record has not exactly one reference and input.
     """
     plant_options = options or IdentOptions()
     stage = plant_options.model_copy(

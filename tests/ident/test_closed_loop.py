@@ -1,0 +1,126 @@
+"""Closed-loop logs: feedback check, bias of the direct method and its absence in the two-stage one, indirect map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from ident.closed_loop import check_feedback, indirect, two_stage
+from ident.conditions import combine_posteriors, record_posteriors
+from ident.embedding import EmbeddingOptions, tangent
+from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.identify import identify
+from ident.options import IdentOptions
+from ident.record import Record
+
+DT = 0.01
+B, A, GAIN = [0.0, 0.06, 0.05], [1.0, -1.62, 0.72], 1.5
+OMEGA = np.geomspace(1.0, 250.0, 60)
+TRUTH = signal.freqz(B, A, worN=OMEGA * DT)[1]
+OPTIONS = IdentOptions(n_real=0, n_pairs=1, estimate_offset=False, estimate_initial_state=False)
+BOUNDS = EmbeddingOptions(fir_length=20, coloured_noise=True)
+
+
+def log(rng, noise=0.3, n=3000):
+    r = rng.standard_normal(n)
+    e = noise * signal.lfilter([1.0], [1.0, -0.7], rng.standard_normal(n))
+    closed = np.polyadd(A, GAIN * np.asarray(B))
+    y = signal.lfilter(B, closed, r) + signal.lfilter(A, closed, e)
+    u = r - GAIN * y
+    return Record(
+        "log", u[:, None], y[:, None], DT, ("u",), ("y",), reference=r[:, None], reference_names=("r",)
+    )
+
+
+def test_feedback_check_estimates_the_law_and_notices_when_it_does_not_hold():
+    records = [log(np.random.default_rng(seed), n=400) for seed in range(2)]
+    found = check_feedback(records, tolerance=1e-9)
+    assert found.exact
+    assert (found.reference_gain, found.feedback_gain) == pytest.approx((1.0, GAIN), rel=1e-9)
+    assert "at every sample" in found.verdict
+    assert check_feedback(records, tolerance=1e-9, reference_gain=1.0, feedback_gain=GAIN).exact
+    wrong = check_feedback(records, tolerance=1e-9, feedback_gain=GAIN + 0.1)
+    assert not wrong.exact
+    assert "does not obey" in wrong.verdict
+    assert found.to_dict()["exact"] is True
+
+
+def test_two_stage_is_free_of_the_direct_method_s_bias():
+    records = [log(np.random.default_rng([1, seed])) for seed in range(4)]
+    stage = two_stage(records, OPTIONS, BOUNDS, shared=True)
+    assert "explains" in stage.verdict
+    assert all(record.reference is None for record in stage.records)
+    # The noise-free input itself is known here: S r with S = A / (A + g B).
+    closed = np.polyadd(A, GAIN * np.asarray(B))
+    ideal = signal.lfilter(A, closed, records[0].reference[:, 0])
+    error = np.linalg.norm(stage.records[0].input[:, 0] - ideal) / np.linalg.norm(ideal)
+    assert error < 0.06
+    assert np.linalg.norm(records[0].input[:, 0] - ideal) / np.linalg.norm(ideal) > 5 * error
+
+    def bounds(used):
+        return tangent(used, identify(used, OPTIONS).model, BOUNDS).at(OMEGA)
+
+    weak = np.abs(TRUTH) < 0.3
+    opened, direct = bounds(stage.records), bounds(records)
+    assert np.abs(opened.centre - TRUTH)[weak].mean() < 0.5 * np.abs(direct.centre - TRUTH)[weak].mean()
+    assert opened.contains(TRUTH)[weak].mean() > 0.8
+    assert direct.contains(TRUTH).mean() < 0.5
+    # Where the loop gain is large the error of the shared first stage shows, as the docstring warns.
+    assert not np.all(opened.contains(TRUTH)[~weak])
+
+
+def test_bounds_of_the_indirect_method_and_of_combined_records_cover_where_the_loop_gain_is_large():
+    indirect_hits, combined_hits = [], []
+    for seed in range(6):
+        records = [log(np.random.default_rng([5, seed, i]), n=1500) for i in range(5)]
+        closed = [Record("c", r.reference, r.output, DT, ("r",), ("y",)) for r in records]
+        loop = tangent(closed, identify(closed, OPTIONS).model, BOUNDS).at(OMEGA)
+        indirect_hits.append(indirect(loop, 1.0, GAIN).contains(TRUTH))
+        stage = two_stage(records, OPTIONS, BOUNDS)
+        model = identify(stage.records, OPTIONS).model
+        combined = combine_posteriors(
+            record_posteriors(stage.records, model, BOUNDS), small_sample_level=0.95
+        )
+        combined_hits.append(combined.at(OMEGA).contains(TRUTH))
+    # Few independent frequencies in a smooth response: 6 runs tell coverage to about 10 %.
+    assert np.mean(indirect_hits) > 0.85
+    assert np.mean(combined_hits) > 0.85
+
+
+def test_sensitivities_per_record_differ_and_shared_ones_do_not():
+    records = [log(np.random.default_rng([2, seed]), n=1500) for seed in range(2)]
+    own = two_stage(records, OPTIONS, BOUNDS)
+    shared = two_stage(records, OPTIONS, BOUNDS, shared=True)
+    assert len(own.sensitivities) == 2
+    assert not np.array_equal(own.sensitivities[0].mean, own.sensitivities[1].mean)
+    np.testing.assert_array_equal(shared.sensitivities[0].mean, shared.sensitivities[1].mean)
+    truth = signal.freqz(A, np.polyadd(A, GAIN * np.asarray(B)), worN=OMEGA * DT)[1]
+    assert shared.sensitivities[0].at(OMEGA).contains(truth).mean() > 0.8
+    assert np.median(shared.relative_error(OMEGA) / own.relative_error(OMEGA)) < 1.0
+
+
+def test_indirect_map_of_centre_and_of_a_small_ellipse():
+    closed = TRUTH / (1 + GAIN * TRUTH) * 2.0  # reference gain 2
+    rng = np.random.default_rng(3)
+    factor = 1e-4 * rng.standard_normal((OMEGA.size, 2, 2))
+    t = FrequencyUncertainty(OMEGA, closed, factor @ factor.transpose(0, 2, 1), DT)
+    g = indirect(t, 2.0, GAIN)
+    np.testing.assert_allclose(g.centre, TRUTH, rtol=1e-10)
+    # Boundary points through the exact map lie on the mapped ellipse, up to its second-order change of 1e-3.
+    boundary = t.ellipse().boundary(8)
+    for column in boundary.T:
+        exact = (closed + column) / (2.0 - GAIN * (closed + column))
+        np.testing.assert_allclose(g.normalised_distance(exact), 1.0, rtol=0.05)
+    lost = FrequencyUncertainty([1.0], [2.0 / GAIN], 0.1 * np.eye(2)[None], DT)
+    with pytest.raises(ValueError, match="tells nothing"):
+        indirect(lost, 2.0, GAIN)
+
+
+def test_records_without_reference_are_refused():
+    record = log(np.random.default_rng(4), n=100)
+    bare = Record("b", record.input, record.output, DT, ("u",), ("y",))
+    with pytest.raises(ValueError, match="exactly one reference"):
+        check_feedback([bare], tolerance=1.0)
+    with pytest.raises(ValueError, match="exactly one reference"):
+        two_stage([bare], OPTIONS)

@@ -1,0 +1,121 @@
+"""Scatter between conditions: coverage of the next condition, agreement of coefficient and frequency forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from ident.conditions import combine_posteriors, combine_responses, mean_record, record_posteriors
+from ident.embedding import EmbeddingOptions
+from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.model import GobfModel
+from ident.poles import Poles
+from ident.posterior import ResponsePosterior
+from ident.record import Record
+
+DT = 0.01
+OMEGA = np.geomspace(1.0, 300.0, 25)
+POLES = Poles([0.9], [0.9 * np.exp(0.4j)])
+SPREAD = np.array([0.2, 0.3, 0.1])
+
+
+def condition(rng, noise=0.02):
+    """A plant drawn from the random-effects model, and its estimate."""
+    true = np.array([1.0, -0.5, 0.8]) + SPREAD * rng.standard_normal(3)
+    estimate = true + noise * rng.standard_normal(3)
+    return true, ResponsePosterior(POLES, estimate, noise * np.eye(3), DT)
+
+
+@pytest.mark.parametrize(("level", "expected"), [(0.95, 0.95), (None, 0.79)])
+def test_next_condition_is_covered_at_the_small_sample_level(level, expected):
+    hits = []
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        posteriors = [condition(rng)[1] for _ in range(6)]
+        truth = condition(rng)[1].centre(OMEGA)
+        combined = combine_posteriors(posteriors, small_sample_level=level)
+        hits.append(combined.at(OMEGA).contains(truth).mean())
+    # One run counts about three independent frequencies: sd sqrt(0.05 x 0.95 / 1200) = 0.6 %, 4 of those.
+    # Without the level the exact value is P(2 (K-1)/(K-2) F(2, K-2) < chi2) = 0.79 for K = 6.
+    assert np.mean(hits) == pytest.approx(expected, abs=0.03)
+
+
+def test_coefficient_and_frequency_forms_agree():
+    rng = np.random.default_rng(1)
+    posteriors = [condition(rng)[1] for _ in range(4)]
+    for level in (None, 0.9):
+        one = combine_posteriors(posteriors, small_sample_level=level).at(OMEGA)
+        two = combine_responses([p.at(OMEGA) for p in posteriors], small_sample_level=level)
+        np.testing.assert_allclose(one.centre, two.centre, rtol=1e-12)
+        np.testing.assert_allclose(one.covariance, two.covariance, rtol=1e-9, atol=1e-14)
+
+
+def test_two_conditions_stretch_the_ellipse_along_their_difference():
+    grid = np.array([1.0])
+    small = 1e-6 * np.eye(2)[None]
+    pair = [FrequencyUncertainty(grid, [g], small, DT) for g in (1.0, 1.0 + 1.0j)]
+    combined = combine_responses(pair)
+    ellipse = combined.ellipse()
+    assert combined.centre[0] == pytest.approx(1 + 0.5j)
+    assert abs(ellipse.direction[0].imag) == pytest.approx(1.0, abs=1e-5)
+    # S = 0.5, times 1 + 1/2: sd 0.866, radius 2.448 of them
+    assert ellipse.semi_major[0] == pytest.approx(2.4477 * np.sqrt(0.75), rel=1e-4)
+    assert ellipse.semi_minor[0] == pytest.approx(2.4477 * 1e-3 / np.sqrt(2), rel=1e-3)
+    assert all(combined.contains(p.centre)[0] for p in pair)
+
+
+def records_of_two_plants(rng, n=600):
+    records = []
+    for gain in (0.9, 1.0, 1.1, 1.2):
+        u = rng.standard_normal(n)
+        y = gain * signal.lfilter([0.0, 0.3], [1.0, -0.9], u) + 0.01 * rng.standard_normal(n)
+        records.append(Record(f"g{gain}", u[:, None], y[:, None], DT, ("u",), ("y",)))
+    return records
+
+
+def test_records_of_different_gain_give_an_ellipse_of_that_gain_spread():
+    records = records_of_two_plants(np.random.default_rng(2))
+    model = GobfModel(Poles([0.9]), np.zeros(1), DT)
+    posteriors = record_posteriors(records, model, EmbeddingOptions(fir_length=20))
+    assert {p.fir_length for p in posteriors} == {20}
+    combined = combine_posteriors(posteriors).at(OMEGA)
+    ideal = 0.3 / (np.exp(1j * OMEGA * DT) - 0.9)
+    # Sample sd of the gains 0.129, times sqrt(1 + 1/4) and 2.448.
+    np.testing.assert_allclose(combined.ellipse().semi_major / np.abs(ideal), 0.353, rtol=0.05)
+    np.testing.assert_allclose(combined.centre / ideal, 1.05, atol=0.02)
+    unequal = record_posteriors([records[0], records[1].slice(0, 120)], model)
+    assert unequal[0].fir_length == unequal[1].fir_length < 150
+    assert combine_posteriors(posteriors).report.method == "tangent embedding, 4 conditions"
+
+
+def test_mean_record_averages_signals_and_noise():
+    rng = np.random.default_rng(3)
+    records = []
+    for _ in range(4):
+        u = rng.standard_normal((50, 1))
+        records.append(Record("a", u, 2 * u, DT, ("u",), ("y",), reference=u + 1, reference_names=("r",)))
+    mean = mean_record(records, "mean")
+    np.testing.assert_allclose(mean.output, 2 * mean.input, rtol=1e-12)
+    np.testing.assert_allclose(mean.reference, mean.input + 1, rtol=1e-12)
+    assert mean.name == "mean"
+    with pytest.raises(ValueError, match="differ in length"):
+        mean_record([records[0], records[1].slice(0, 40)], "m")
+    with pytest.raises(ValueError, match="at least one"):
+        mean_record([], "m")
+
+
+def test_what_cannot_be_combined_is_refused():
+    rng = np.random.default_rng(4)
+    one = condition(rng)[1]
+    other = ResponsePosterior(Poles([0.8, 0.7, 0.1]), one.mean, one.covariance_factor, DT)
+    with pytest.raises(ValueError, match="at least two"):
+        combine_posteriors([one])
+    with pytest.raises(ValueError, match="differ in poles"):
+        combine_posteriors([one, other])
+    with pytest.raises(ValueError, match="at least four"):
+        combine_posteriors([one, one, one], small_sample_level=0.95)
+    with pytest.raises(ValueError, match="different frequency grids"):
+        combine_responses([one.at(OMEGA), one.at(OMEGA[:-1])])
+    with pytest.raises(ValueError, match="at least two"):
+        combine_responses([one.at(OMEGA)])
