@@ -217,9 +217,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = app(arguments, standalone_mode=False)
         return int(code or EXIT_OK)
     except typer.Exit as leaving:
-        return int(leaving.exit_code)
+        # typer turns Ctrl-C into a silent exit of this code.
+        return _interrupted() if leaving.exit_code == _EXIT_INTERRUPTED else int(leaving.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        return _complain("interrupted; `flexlink run --out DIR --resume` continues", _EXIT_INTERRUPTED)
+        return _interrupted()
     except BrokenPipeError:
         sys.stderr.close()  # whoever read our output has left; there is nobody to tell
         return EXIT_OK
@@ -227,6 +228,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         return _complain(*_explain(error))
+
+
+def _interrupted() -> int:
+    return _complain("interrupted; `flexlink run --out DIR --resume` continues", _EXIT_INTERRUPTED)
 
 
 def _explain(error: Exception) -> tuple[str, int]:

@@ -18,7 +18,7 @@ from workflow.settings import InputPath, check, read_toml
 from workflow.simulated_rig import EffectTable, RigChoice
 
 Role = Literal["estimation", "validation", "repeat"]
-Name = Annotated[str, Field(pattern=r"^[^/\\\x00-\x1f]+$", max_length=80)]
+Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
 
 
 class Section(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from control_design.certificate import certify
 from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification
-from control_design.synthesis import Outcome, synthesise
+from control_design.synthesis import Outcome, SynthesisOptions, synthesise
 from ident.embedding import tangent
 from ident.identify import identify
 from ident.model import GobfModel
@@ -105,10 +106,15 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
         raise InputError(f"cannot write {out}: {error.strerror or error}") from error
     files = []
     for number, record in enumerate(records, start=1):
-        path = out / f"{number:02d}_{'_'.join(record.name.split())}.csv"
+        path = out / f"{number:02d}_{file_name(record.name)}.csv"
         storage.write_text(path, csv_text(record))
         files.append(path)
     return files
+
+
+def file_name(name: str) -> str:
+    """A record's name as part of a file name: everything but letters, digits, '_', '.' and '-' becomes '_'."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)
 
 
 def csv_text(record: Record) -> str:
@@ -218,9 +224,9 @@ def design_controller(
     if source.is_dir():
         run = RunDirectory.open(source)
         config = config_of(run)
-        plant, specification = load_plant(run, config), config.specification
+        plant, specification, options = load_plant(run, config), config.specification, config.synthesis
     else:
-        plant = load_plant_file(source)
+        plant, options = load_plant_file(source), SynthesisOptions()
         if specification_path is None:
             raise InputError(f"{source} holds no specification: give --specification FILE")
     if specification_path is not None:
@@ -229,7 +235,7 @@ def design_controller(
             Specification, document.get("specification", document), source=str(specification_path)
         )
     with naming("design"):
-        result = synthesise([plant], specification, rng=stage_rng(seed, "design"))
+        result = synthesise([plant], specification, options, rng=stage_rng(seed, "design"))
         design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": result.explain()}
         if result.outcome is Outcome.NOT_CONVERGED:
             certificate = None

@@ -8,9 +8,9 @@ load_frequency, load_empirical, load_plant, load_synthesis, load_certificate), o
 order of the configuration unless said otherwise.
 
 records.npz
-    document  source "simulated"|"files"; effects: list of effect tables as in the configuration;
-              records: list of {name, role "estimation"|"validation"|"repeat", condition|null, remark, kind
-              (prbs, multisine, log_chirp, doublet, bang_bang, file), file|null, samples, dt_s, duration_s,
+    document  source "simulated"|"files"; effects: list of effect tables as in the configuration; records:
+              list of {name, role "estimation"|"validation"|"repeat", condition|null, remark, kind (prbs,
+              multisine, log_chirp, doublet, bang_bang, file), file|null, samples, dt_s, duration_s,
               closed_loop (has a reference), units {signal: unit}}
     arrays    record/<i>/...                  ident.Record, as measured, all columns
               noise_free/<i>/output           (T, Y) before sensor effects and noise, simulated source only
@@ -18,39 +18,40 @@ records.npz
 identify.npz
     document  channels: list of {name, input, output, purpose "control"|"performance", increments, n_used,
               n_fresh, fit_estimation_percent {record: %}, fit_validation_percent {record: %},
-              fit_repeat_percent {record: %}, order, integrators, input_delay_samples, feedthrough, modes: list
-              of {frequency_Hz, omega_rad_s, damping} ascending, real_poles_per_s: list of decay rates,
+              fit_repeat_percent {record: %}, order, integrators, input_delay_samples, feedthrough, modes:
+              list of {frequency_Hz, omega_rad_s, damping} ascending, real_poles_per_s: list of decay rates,
               noise_std (output units), tangent_optimality, warnings: list of str, verdicts: list of str,
-              order_table: list of {n_real, n_pairs, rss, criterion}, search_evaluations, two_stage: null or a
-              sentence}
+              order_table: list of {n_real, n_pairs, rss, criterion}, search_evaluations, two_stage: null or
+              a sentence}
     arrays    channel/<k>/identification/...  ident.identify.Identification (model, residuals, search trace)
-              channel/<k>/used/<i>/...        ident.Record, SISO: what the fit saw; i counts estimation records
+              channel/<k>/used/<i>/...        ident.Record, SISO: what the fit saw; i counts estimation ones
               channel/<k>/fresh/<i>/...       ident.validation.FreshFit; i counts the other records in order
 
 uncertainty.npz
     document  channels: list of {name, method, level, report: EmbeddingReport.to_dict()|null, bands: list of
-              {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis over |G|),
-              tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()}, repeat_scatter: null or
-              list of ScatterRow.to_dict()}
+              {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis over
+              |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()},
+              repeat_scatter: null or list of ScatterRow.to_dict()}
     arrays    channel/<k>/posterior/...       ident.ResponsePosterior
               channel/<k>/frequency/...       ident.FrequencyUncertainty on the display grid
-              channel/<k>/empirical/...       ident.FrequencyUncertainty straight from the records; may be absent
+              channel/<k>/empirical/...       ident.FrequencyUncertainty without a model; may be absent
 
 design.json
     document  synthesis: SynthesisResult.to_dict(), or null where the specification is impossible from the
-              start; met (bool); reason (one line: met, or how far, and which frequency and requirement block it)
+              start; met (bool); reason (one line: met, or how far, and which frequency and requirement
+              block it)
 
 certify.json
     document  certificate: Certificate.to_dict(), or null with nothing to certify; certified (bool); reason
               (one line)
 
 closed_loop.npz, or closed_loop.json when there was nothing to run
-    document  skipped: null or the reason; machine "simulated"|"identified"; if not skipped also tracking (asked
-              for), draws, settled_draws, reference_step, disturbance, quantisation, input_limit|null,
-              predicted: {StepMetrics.to_dict(), disturbance_peak, disturbance_left, settled}, achieved: list of
-              the same, one per draw
-    arrays    time_s, reference, disturbance  (T,); the disturbance is added to the plant's input from T // 2 on
-              predicted/output, /command, /limited, /performance  (1, T): posterior mean of the identified model
+    document  skipped: null or the reason; machine "simulated"|"identified"; if not skipped also tracking
+              (asked for), draws, settled_draws, reference_step, disturbance, quantisation,
+              input_limit|null, predicted: {StepMetrics.to_dict(), disturbance_peak, disturbance_left,
+              settled}, achieved: list of the same, one per draw
+    arrays    time_s, reference, disturbance  (T,); the disturbance adds to the plant's input from T // 2 on
+              predicted/output, /command, /limited, /performance  (1, T): on the posterior mean
               achieved/...                    (R, T): R runs on the machine
               performance is absent without a performance channel
 

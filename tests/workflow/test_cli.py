@@ -1,0 +1,352 @@
+"""The command line: exit codes, one-line errors that leave nothing behind, JSON that is only JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.workflow.conftest import FAST_ARM, start_flexlink
+from workflow.cli import main
+
+FILES_CONFIG = """
+[run]
+name = "own"
+[source]
+kind = "files"
+time = "t_s"
+[[source.records]]
+path = "log.csv"
+[[channels]]
+input = "u"
+output = "y"
+identification = {{ n_real = {n_real}, n_pairs = 0 }}
+[specification]
+bandwidth_rad_s = 1.0
+{more}
+"""
+
+
+def good_table(samples: int = 200) -> dict[str, np.ndarray]:
+    """A first-order lag driven by a square wave."""
+    t = np.arange(samples) * 0.01
+    u = np.sign(np.sin(7 * t + 0.1))
+    y = np.zeros(samples)
+    for k in range(1, samples):
+        y[k] = 0.9 * y[k - 1] + 0.1 * u[k - 1]
+    return {"t_s": t, "u": u, "y": y + 1e-3 * np.random.default_rng(1).standard_normal(samples)}
+
+
+def write_case(folder, table, *, n_real=1, more=""):
+    names = list(table)
+    rows = zip(*(np.asarray(column).tolist() for column in table.values()), strict=True)
+    lines = [",".join(names), *(",".join(str(value) for value in row) for row in rows)]
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    path = folder / "own.toml"
+    path.write_text(FILES_CONFIG.format(n_real=n_real, more=more))
+    return path
+
+
+def with_value(name, row, value):
+    def change(table):
+        column = table[name].astype(object)
+        column[row] = value
+        return {**table, name: column}
+
+    return change
+
+
+def without(name):
+    return lambda table: {key: column for key, column in table.items() if key != name}
+
+
+# What is wrong with the log, and what the line must say (file lines count from 1, the header included).
+BAD_LOGS = {
+    "nan": (with_value("y", 10, "nan"), ["log.csv", "line 12", "'y'", "finite number"]),
+    "inf": (with_value("u", 4, "inf"), ["log.csv", "line 6", "'u'", "finite number"]),
+    "text": (with_value("y", 0, "high"), ["log.csv", "line 2", "'y'", "'high'"]),
+    "empty": (with_value("y", 3, ""), ["log.csv", "line 5", "empty"]),
+    "missing column": (without("y"), ["log.csv", "no column 'y'", "t_s", "u"]),
+    "missing time": (without("t_s"), ["log.csv", "no column 't_s'"]),
+    "time goes back": (with_value("t_s", 20, 0.05), ["log.csv", "line 22", "t_s"]),
+    "time jumps": (with_value("t_s", 199, 2.5), ["log.csv", "line 201", "t_s"]),
+    "constant input": (lambda t: {**t, "u": np.ones(t["u"].size)}, ["log.csv", "'u'", "constant"]),
+    "constant output": (lambda t: {**t, "y": np.ones(t["y"].size)}, ["log.csv", "'y'", "constant"]),
+    "no rows": (lambda t: {key: column[:0] for key, column in t.items()}, ["log.csv"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_LOGS)
+def test_bad_log_is_one_line_and_leaves_nothing(refused, tmp_path, case):
+    change, words = BAD_LOGS[case]
+    config = write_case(tmp_path, change(good_table()))
+    line = refused("run", "--config", config, "--out", tmp_path / "run")
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_too_few_samples_for_the_order(refused, tmp_path):
+    table = good_table(12)
+    table["u"][::3] *= -1
+    line = refused("run", "--config", write_case(tmp_path, table, n_real=8), "--out", tmp_path / "run")
+    assert "12 samples are too few for order 8" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_empty_directory_that_was_there_stays_and_is_usable_again(refused, tmp_path):
+    (tmp_path / "run").mkdir()
+    config = write_case(tmp_path, good_table(12), n_real=8)
+    refused("run", "--config", config, "--out", tmp_path / "run")
+    # Either gone or empty: the corrected attempt must not be refused.
+    assert not (tmp_path / "run").exists() or list((tmp_path / "run").iterdir()) == []
+
+
+BAD_CONFIGS = {
+    "unknown key": (
+        "[synthesis]\nstart = 3",
+        ["own.toml", "unknown key synthesis.start", "did you mean starts?"],
+    ),
+    "unknown table": ("[sythesis]\nstarts = 3", ["unknown key sythesis", "did you mean synthesis?"]),
+    "bad value": ("[closed_loop]\ndraws = 0", ["closed_loop.draws", "greater than or equal to 1", "got 0"]),
+    "bad type": ("[closed_loop]\ndraws = 'many'", ["closed_loop.draws", "integer", "'many'"]),
+    "contradiction": (
+        "effort_rolloff_rad_s = 3.0",
+        ["specification", "effort_rolloff_rad_s needs effort_limit"],
+    ),
+    "nan": ("modulus_margin = nan", ["specification.modulus_margin"]),
+    "syntax": ("[closed_loop\n", ["own.toml", "not valid TOML", "line"]),
+    "wrong machine": (
+        "[closed_loop]\nmachine = 'simulated'",
+        ["own.toml", "needs [source] kind = 'simulated'"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CONFIGS)
+def test_bad_config_is_one_line_naming_the_key(refused, tmp_path, case):
+    more, words = BAD_CONFIGS[case]
+    config = write_case(tmp_path, good_table(), more=more)
+    line = refused("run", "--config", config, "--out", tmp_path / "run")
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('time = "t_s"', "dt_s = 0.0", ["source.dt_s", "greater than 0", "got 0.0"]),
+        ('time = "t_s"', "dt_s = -1.0", ["source.dt_s", "greater than 0"]),
+        ('time = "t_s"', "", ["source", "no time base"]),
+        ('"log.csv"', '"absent.csv"', ["source.records[0].path", "no such file", "absent.csv"]),
+        ('"log.csv"', '"${NO_SUCH_VARIABLE}/log.csv"', ["NO_SUCH_VARIABLE is not set"]),
+        ('"log.csv"', '"own.toml"', ["own.toml", "unknown kind of file"]),
+        (
+            "n_pairs = 0",
+            "fixed_poles = [[1.2, 0.0]]",
+            ["channels[0].identification", "inside the unit circle"],
+        ),
+        ('kind = "files"', 'kind = "file"', ["source.kind", "'file'"]),
+        ('output = "y"', "", ["missing key channels[0].output"]),
+    ],
+)
+def test_bad_source(refused, tmp_path, monkeypatch, old, new, words):
+    monkeypatch.delenv("NO_SUCH_VARIABLE", raising=False)
+    config = write_case(tmp_path, good_table())
+    text = config.read_text()
+    assert old in text
+    config.write_text(text.replace(old, new))
+    line = refused("run", "--config", config, "--out", tmp_path / "run")
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("coefficient_Nms = 0.02", "coefficient_Nms = -1.0", ["source.effects[0]", "viscous_friction"]),
+        (
+            '"viscous_friction"',
+            '"vicious_friction"',
+            ["source.effects[0]", "unknown effect 'vicious_friction'"],
+        ),
+        ('rig = "paper_link"', 'rig = "paper_lnk"', ["source.rig", "no such rig file", "paper_link"]),
+        ('output = "hub_angle_rad"', 'output = "hub"', ["hub_angle_rad", "'hub'"]),
+    ],
+)
+def test_bad_simulated_source(refused, tmp_path, old, new, words):
+    text = FAST_ARM.read_text()
+    assert old in text
+    config = tmp_path / "arm.toml"
+    config.write_text(text.replace(old, new))
+    line = refused("run", "--config", config, "--out", tmp_path / "run")
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "--config", "absent.toml"], ["absent.toml", "No such file"]),
+        (["run", "--resume"], ["--resume needs --out"]),
+        (["run", "--resume", "--replace", "--out", "x"], ["contradict"]),
+        (["run", "--nonsense"], ["--nonsense"]),
+        (["fly"], ["fly"]),
+        (["report", "absent"], ["absent: no such run directory"]),
+        (["design", "absent.npz", "--specification", "absent.toml"], ["absent.npz"]),
+        (["identify", "absent.csv", "--input", "u", "--output", "y", "--dt-s", "0.1"], ["absent.csv"]),
+        (["identify", "absent.csv"], ["--input"]),
+    ],
+)
+def test_bad_arguments(refused, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    line = refused(*arguments)
+    for word in words:
+        assert word in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_output_is_refused_before_the_work(refused, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "is not a directory" in refused("run", "--config", FAST_ARM, "--out", tmp_path / "file" / "run")
+    assert "cannot write" in refused("run", "--config", FAST_ARM, "--out", tmp_path / "file")
+    assert "cannot write" in refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "file" / "x")
+
+
+def test_existing_directory_is_refused(refused, fast_run):
+    assert "not empty" in refused("run", "--config", FAST_ARM, "--out", fast_run[0])
+
+
+def test_run_prints_a_table_and_the_page(flexlink, fast_run):
+    answer = flexlink("run", "--config", FAST_ARM, "--out", fast_run[0], "--resume")
+    assert answer.code == 0, answer.err
+    for word in (
+        "mode",
+        "Hz, damping",
+        "fit, validation",
+        "residuals, whiteness",
+        "95 % radius",
+        "gamma",
+        "margins, nominal",
+        "margins, worst case",
+        "predicted",
+        "achieved",
+        "certified",
+        "report.html",
+    ):
+        assert word in answer.out
+    assert answer.err == ""  # no progress where nobody watches
+
+
+def test_run_json_is_only_json(flexlink, fast_run):
+    answer = flexlink("run", "--config", FAST_ARM, "--out", fast_run[0], "--resume", "--json")
+    document = json.loads(answer.out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert answer.code == 0
+    assert document["certified"] is True
+    assert document["report"].endswith("report.html")
+    assert document["numbers"]["design"]["gamma"] <= 1
+    assert document["numbers"]["channels"][0]["modes"][0]["frequency_Hz"] == pytest.approx(7.6, rel=0.03)
+
+
+def test_report_draws_the_page_anew(flexlink, fast_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(fast_run[0], run)
+    (run / "report.html").unlink()
+    answer = flexlink("report", run)
+    assert answer.code == 0, answer.err
+    assert (run / "report.html").is_file()
+
+
+def test_report_of_an_unfinished_run_says_what_is_missing(refused, fast_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(fast_run[0], run)
+    (run / "stages" / "design.json").unlink()
+    assert "stage design is not there" in refused("report", run)
+
+
+def test_impossible_specification_is_three_with_report(flexlink, tmp_path):
+    """40 rad/s cannot be had: the line says how far it is missed and where, and the page is written."""
+    config = tmp_path / "arm.toml"
+    config.write_text(FAST_ARM.read_text().replace("bandwidth_rad_s = 1.5", "bandwidth_rad_s = 40.0"))
+    answer = flexlink("run", "--config", config, "--out", tmp_path / "run")
+    assert answer.code == 3
+    assert answer.err.count("\n") == 1
+    assert "not met" in answer.err
+    assert "rad/s" in answer.err
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
+    made = flexlink("simulate", "--config", FAST_ARM, "--out", tmp_path / "logs", "--json")
+    assert made.code == 0, made.err
+    files = json.loads(made.out)["files"]
+    assert [name.rsplit("/", 1)[1] for name in files] == ["01_prbs.csv", "02_fresh_b_prbs_b_.csv"]
+    found = flexlink(
+        *("identify", files[0], "--input", "voltage_V", "--output", "hub_angle_rad", "--time", "time_s"),
+        *("--real", 1, "--pairs", 1, "--integrators", 1, "--validation", files[1]),
+        *("--out", tmp_path / "hub.npz", "--json"),
+    )
+    assert found.code == 0, found.err
+    numbers = json.loads(found.out)["numbers"]
+    assert numbers["modes"][0]["frequency_Hz"] == pytest.approx(7.6, rel=0.03)
+    assert min(numbers["fit_validation_percent"].values()) > 98
+    specification = tmp_path / "specification.toml"
+    specification.write_text("bandwidth_rad_s = 1.5\neffort_limit = 60.0\ncontroller_order = 2\n")
+    designed = flexlink(
+        *("design", tmp_path / "hub.npz", "--specification", specification),
+        *("--out", tmp_path / "controller.json", "--json"),
+    )
+    assert designed.code == 0, designed.err
+    assert json.loads(designed.out)["certified"] is True
+    from control_design.controller import Controller
+
+    assert Controller.from_json((tmp_path / "controller.json").read_text()).order == 2
+
+
+def test_design_from_a_run_directory(flexlink, fast_run, tmp_path):
+    answer = flexlink("design", fast_run[0], "--out", tmp_path / "controller.json", "--json")
+    assert answer.code == 0, answer.err
+    assert (tmp_path / "controller.json").is_file()
+
+
+def test_version_and_module_entry():
+    process = start_flexlink("--version")
+    out, err = process.communicate()
+    assert process.returncode == 0, err.decode()
+    assert out.decode().startswith("flexlink ")
+
+
+def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
+    import workflow.entry
+
+    def broken(*arguments, **options):
+        raise ZeroDivisionError("division\nby zero")
+
+    monkeypatch.setattr(workflow.entry, "run_from_files", broken)
+    answer = flexlink("run", "--out", tmp_path / "run")
+    assert answer.code == 1
+    assert (
+        answer.err == "flexlink: internal error: ZeroDivisionError: division by zero (--debug shows where)\n"
+    )
+    assert "Traceback" in flexlink("--debug", "run", "--out", tmp_path / "run").err
+
+
+def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
+    import workflow.entry
+
+    def stop(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflow.entry, "run_from_files", stop)
+    answer = flexlink("run", "--out", tmp_path / "run")
+    assert answer.code == 130
+    assert answer.err.count("\n") == 1
+
+
+def test_main_without_arguments_shows_help(capsys):
+    assert main([]) in (0, 2)

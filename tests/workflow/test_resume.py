@@ -1,0 +1,179 @@
+"""A run killed with SIGKILL at any point resumes and ends with the numbers of a run that was left alone."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.workflow.conftest import FAST_ARM, start_flexlink
+from workflow import storage
+from workflow.config import load_config
+from workflow.entry import run_from_files
+from workflow.errors import InputError
+from workflow.progress import Silence
+from workflow.run_directory import RunDirectory
+from workflow.stages import STAGES
+
+NAMES = [stage.name for stage in STAGES]
+
+
+def stage_bytes(run: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((run / "stages").iterdir())}
+
+
+def assert_same_run(left: Path, right: Path) -> None:
+    """Equal bytes, stage by stage; the report's page may differ (it names times), its stage file then differs too."""
+    first, second = stage_bytes(left), stage_bytes(right)
+    assert first.keys() == second.keys()
+    for name in first.keys() - {"report.json"}:
+        assert first[name] == second[name], f"{name} differs"
+
+
+def wait_for(path: Path, process, seconds: float = 120.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path.name} did not appear"
+        assert process.poll() is None, process.communicate()[1].decode()
+        time.sleep(0.002)
+
+
+def kill(process) -> None:
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+
+
+# A point is a file that has just appeared, and how long the next stage is then left working before the kill.
+@pytest.mark.parametrize(
+    ("appears", "pause_s"),
+    [
+        ("manifest.json", 0.0),
+        ("stages/records.npz", 0.02),
+        ("stages/uncertainty.npz", 0.2),
+        ("stages/certify.json", 0.0),
+    ],
+)
+def test_killed_run_resumes_with_identical_numbers(fast_run, tmp_path, plain_page, appears, pause_s):
+    out = tmp_path / "run"
+    process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
+    wait_for(out / appears, process)
+    time.sleep(pause_s)
+    kill(process)
+    done_before = {
+        path.name: path.stat().st_mtime_ns for path in (out / "stages").iterdir() if path.name[0] != "."
+    }
+    for path in out.rglob("*.npz"):
+        storage.read_npz(path)  # whatever has its final name is whole
+    assert not (out / "report.html").exists()
+
+    summary = run_from_files(FAST_ARM, out, resume=True)
+
+    assert_same_run(fast_run[0], out)
+    assert summary.numbers == fast_run[1].numbers
+    after = {path.name: path.stat().st_mtime_ns for path in (out / "stages").iterdir()}
+    assert {name: after[name] for name in done_before} == done_before, "a finished stage was made again"
+    assert RunDirectory.open(out).manifest()["status"].startswith("complete")
+
+
+@pytest.fixture
+def plain_page(monkeypatch):
+    """Resuming is about numbers: an empty page saves the seconds that drawing takes."""
+    import workflow.report
+
+    def write(run, config):
+        storage.write_text(run.report_path, "<html></html>\n")
+        return run.report_path
+
+    monkeypatch.setattr(workflow.report, "write_report", write)
+
+
+def test_resume_from_every_stage_boundary(fast_run, tmp_path, plain_page):
+    """The same without processes: every prefix of finished stages leads to the same end."""
+    for count in range(1, len(NAMES)):
+        out = tmp_path / f"after-{count}"
+        shutil.copytree(fast_run[0], out)
+        for name in NAMES[count:]:
+            RunDirectory(out).stage_file(name).unlink()
+        (out / "report.html").unlink()
+        watch = Watch()
+        run_from_files(FAST_ARM, out, resume=True, progress=watch)
+        assert watch.taken_up == NAMES[:count]
+        assert_same_run(fast_run[0], out)
+
+
+class Watch(Silence):
+    """Remembers which stages were taken up."""
+
+    def __init__(self) -> None:
+        self.taken_up: list[str] = []
+        self.made: list[str] = []
+
+    def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
+        (self.taken_up if taken_up else self.made).append(stage)
+
+
+def test_resuming_a_finished_run_makes_nothing_again(fast_run):
+    watch = Watch()
+    run_from_files(FAST_ARM, fast_run[0], resume=True, progress=watch)
+    assert watch.taken_up == NAMES
+
+
+def test_missing_page_is_drawn_again(fast_run, tmp_path, plain_page):
+    out = tmp_path / "run"
+    shutil.copytree(fast_run[0], out)
+    (out / "report.html").unlink()
+    watch = Watch()
+    run_from_files(FAST_ARM, out, resume=True, progress=watch)
+    assert watch.made == ["report"]
+    assert (out / "report.html").is_file()
+
+
+def test_resume_without_config_uses_the_one_in_the_directory(fast_run):
+    assert run_from_files(None, fast_run[0], resume=True).numbers == fast_run[1].numbers
+
+
+def test_changed_stage_file_makes_the_later_stages_again(fast_run, tmp_path, plain_page):
+    out = tmp_path / "run"
+    shutil.copytree(fast_run[0], out)
+    run = RunDirectory(out)
+    data = run.load_stage("closed_loop")
+    # Same input hash, other content: only what comes after it may change.
+    hash_before = str(storage.read_npz(run.stage_file("closed_loop"))["_input_hash"])
+    run.save_stage(
+        "closed_loop", type(data)({**data.arrays, "extra": np.zeros(1)}, data.document), hash_before
+    )
+    watch = Watch()
+    run_from_files(FAST_ARM, out, resume=True, progress=watch)
+    assert watch.made == ["report"]
+
+
+def test_changed_config_is_refused_and_nothing_is_touched(fast_run, tmp_path):
+    changed = tmp_path / "fast_arm.toml"
+    changed.write_text(FAST_ARM.read_text().replace("bandwidth_rad_s = 1.5", "bandwidth_rad_s = 1.6"))
+    before = stage_bytes(fast_run[0])
+    with pytest.raises(InputError, match=r"specification\.bandwidth_rad_s \(was 1\.5, now 1\.6\)"):
+        run_from_files(changed, fast_run[0], resume=True)
+    assert stage_bytes(fast_run[0]) == before
+
+
+def test_reformatted_config_is_not_a_changed_one(fast_run, tmp_path):
+    same = tmp_path / "other_name.toml"
+    same.write_text("# a comment more\n" + FAST_ARM.read_text().replace("= 1.5", "=  1.50"))
+    assert run_from_files(same, fast_run[0], resume=True).numbers == fast_run[1].numbers
+
+
+def test_two_runs_give_the_same_bytes_and_another_seed_does_not(fast_run, tmp_path, plain_page):
+    config, _ = load_config(FAST_ARM)
+    text = FAST_ARM.read_text()
+    (tmp_path / "again.toml").write_text(text)
+    (tmp_path / "other.toml").write_text(text.replace("seed = 7", "seed = 8"))
+    assert config.run.seed == 7
+    run_from_files(tmp_path / "again.toml", tmp_path / "again")
+    run_from_files(tmp_path / "other.toml", tmp_path / "other")
+    assert_same_run(fast_run[0], tmp_path / "again")
+    assert stage_bytes(fast_run[0])["records.npz"] != stage_bytes(tmp_path / "other")["records.npz"]
