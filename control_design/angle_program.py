@@ -1,10 +1,13 @@
-"""The nonlinear programme of the synthesis: angle form of the exact conditions on the ellipses, CasADi and IPOPT.
+"""The nonlinear programme of the synthesis: angle form of the exact conditions on the ellipses, CasADi and
+IPOPT.
 
 Distance from -1 to the convex set K E is the largest value over unit normals e^{jt} of
     m(t) = Re(e^{-jt} c) - sqrt(s1^2 Re(q)^2 + s2^2 Im(q)^2 + eps),   c = 1 + G K,  q = e^{-jt} K u1,
-so |W1 S| <= 1/g for every G in E  <=>  there is t with m(t) >= g |W1|, likewise g |W3 K| and g |W4 Gp| with an independent Gp.
-For the measured output itself (Gp = G) the S-lemma is used instead, exact for one quadratic on a ball:
-    |c + K e|^2 >= g^2 W4^2 |G + e|^2 on E  <=>  there is tau >= 0 with A_i + tau > 0 and C - tau - sum B_i^2/(A_i + tau) >= 0.
+so |W1 S| <= 1/g for every G in E  <=>  there is t with m(t) >= g |W1|, likewise g |W3 K| and g |W4 Gp| with
+an independent Gp. For the measured output itself (Gp = G) the S-lemma is used instead, exact for one
+quadratic on a ball:
+    |c + K e|^2 >= g^2 W4^2 |G + e|^2 on E  <=>  there is tau >= 0 with A_i + tau > 0 and C - tau - sum
+    B_i^2/(A_i + tau) >= 0.
 Variables: controller parameters, g, one t per frequency, one tau where W4 acts. Maximise log g.
 """
 
@@ -21,6 +24,8 @@ import numpy.typing as npt
 from control_design.biquads import Cascade, tustin_frequency
 from control_design.ellipses import Complex, Ellipses, Real
 
+Symbol = Any  # casadi.SX; its stubs disagree with its own arithmetic on numpy arrays
+
 _EPS = 1e-10  # under the root, relative to the row: errs on the safe side by at most 1e-5 of |1 + L|
 
 
@@ -28,8 +33,9 @@ _EPS = 1e-10  # under the root, relative to the row: errs on the safe side by at
 class Rows:
     """Everything the programme needs of one plant (or delayed copy) on its grid; all arrays (F,).
 
-    delay : z^-d times a delay copy, multiplies K. w1, w3, w4 : weight magnitudes, 0 = no row. gp_max : largest |Gp| of an independent
-    performance channel; None with w4 > 0 means Gp = G. phase_start : arg(1 + L) towards zero frequency for a stable loop.
+    delay : z^-d times a delay copy, multiplies K. w1, w3, w4 : weight magnitudes, 0 = no row. gp_max :
+    largest |Gp| of an independent performance channel; None with w4 > 0 means Gp = G. phase_start : arg(1 +
+    L) towards zero frequency for a stable loop.
     """
 
     ellipses: Ellipses
@@ -45,7 +51,8 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class NlpPoint:
-    """A solution or start of the programme: controller parameters, g = 1/gamma, angles per plant (unwrapped)."""
+    """A solution or start of the programme: controller parameters, g = 1/gamma, angles per plant
+    (unwrapped)."""
 
     parameters: Real
     g: float
@@ -69,6 +76,7 @@ class AngleProgram:
         self.plants = tuple(plants)
         x = ca.SX.sym("x", cascade.parameters)
         g = ca.SX.sym("g")
+        damping = ca.SX.sym("damping")
         variables, lower, upper = (
             [x, g],
             [-np.inf] * cascade.parameters + [1e-4],
@@ -76,12 +84,12 @@ class AngleProgram:
         )
         bound = _parameter_bounds(cascade)
         lower[: cascade.parameters], upper[: cascade.parameters] = list(bound[0]), list(bound[1])
-        rows: list[ca.SX] = []
-        s_lemma: list[tuple[Rows, ca.SX, ca.SX, ca.SX, ca.SX]] = []
+        rows: list[Symbol] = []
+        s_lemma: list[tuple[Rows, Symbol, Symbol, Symbol, Symbol]] = []
         row_lower: list[Real] = []
         row_upper: list[Real] = []
 
-        def add(expression: ca.SX, low: float, high: float) -> None:
+        def add(expression: Symbol, low: float, high: float) -> None:
             rows.append(expression)
             row_lower.append(np.full(expression.numel(), low))
             row_upper.append(np.full(expression.numel(), high))
@@ -92,7 +100,7 @@ class AngleProgram:
             k_re, k_im = self._response(x, e.omega_rad_s)
             d = plant.delay
             k_re, k_im = k_re * d.real - k_im * d.imag, k_re * d.imag + k_im * d.real
-            t = ca.SX.sym("t", n)
+            t: Symbol = ca.SX.sym("t", n)
             variables.append(t)
             low, high = np.full(n, -np.inf), np.full(n, np.inf)
             low[0], high[0] = plant.start_window
@@ -129,14 +137,14 @@ class AngleProgram:
             use_at = np.flatnonzero(plant.w4 > 0)
             pick = use_at.tolist()
             self._damped.append((self.plants.index(plant), use_at))
-            tau = ca.SX.sym("tau", use_at.size)
+            tau: Symbol = ca.SX.sym("tau", use_at.size)
             variables.append(tau)
             lower += [0.0] * use_at.size
             upper += [np.inf] * use_at.size
             first, second, value = _s_lemma_terms(
                 plant.ellipses.subset(use_at),
                 plant.row_scale[use_at],
-                (g * plant.w4[use_at]) ** 2,
+                (damping * g * plant.w4[use_at]) ** 2,
                 (k_re[pick], k_im[pick]),
                 (c_re[pick], c_im[pick]),
             )
@@ -144,10 +152,15 @@ class AngleProgram:
             add(p1, 0.0, np.inf)
             add(p2, 0.0, np.inf)
             add(value - tau - first[1] ** 2 / (p1 + 1e-14) - second[1] ** 2 / (p2 + 1e-14), 0.0, np.inf)
-        self._nlp = {"x": ca.vertcat(*variables), "f": -ca.log(g), "g": ca.vertcat(*rows)}
+        nlp: dict[str, Any] = {
+            "x": ca.vertcat(*variables),
+            "f": -ca.log(g),
+            "g": ca.vertcat(*rows),
+            "p": damping,
+        }
         self._bounds = np.array(lower), np.array(upper)
         self._row_bounds = np.concatenate(row_lower), np.concatenate(row_upper)
-        options = {
+        options: dict[str, Any] = {
             "ipopt": {
                 "print_level": 0,
                 "sb": "yes",
@@ -160,14 +173,17 @@ class AngleProgram:
             "print_time": False,
             "error_on_fail": False,
         }
-        self._solver = ca.nlpsol("angle_program", "ipopt", self._nlp, options)
+        self._solver = ca.nlpsol("angle_program", "ipopt", nlp, options)
 
-    def _response(self, x: ca.SX, omega: Real) -> tuple[ca.SX, ca.SX]:
+    def _response(self, x: Symbol, omega: Real) -> tuple[Symbol, Symbol]:
         """Real and imaginary part of K on the grid; sections in p or, above |p| = 1, in 1/p."""
         v = tustin_frequency(omega, self.cascade.dt_s) / self.cascade.scale_rad_s
         v = np.minimum(v, 1e12)
         size = np.maximum(1.0, v)
-        re, im = ca.SX.ones(omega.size), ca.SX.zeros(omega.size)
+        re: Symbol = ca.SX.ones(omega.size)
+        im: Symbol = ca.SX.zeros(omega.size)
+        num: tuple[Symbol, Symbol]
+        den: tuple[Symbol, Symbol]
         at = 0
         for kind in self.cascade.sections:
             if kind == "second_order":
@@ -198,7 +214,7 @@ class AngleProgram:
             re, im = re * f_re - im * f_im, re * f_im + im * f_re
         return re, im
 
-    def _multipliers(self, start: NlpPoint) -> list[Real]:
+    def _multipliers(self, start: NlpPoint, damping: float) -> list[Real]:
         """Best multipliers of the S-lemma rows at a start, so that only g decides its feasibility."""
         values = []
         for index, use in self._damped:
@@ -207,16 +223,25 @@ class AngleProgram:
             k = self.cascade.response(start.parameters, e.omega_rad_s) * plant.delay[use]
             c = 1 + e.centre * k
             first, second, _ = _s_lemma_terms(
-                e, plant.row_scale[use], (start.g * plant.w4[use]) ** 2, (k.real, k.imag), (c.real, c.imag)
+                e,
+                plant.row_scale[use],
+                (damping * start.g * plant.w4[use]) ** 2,
+                (k.real, k.imag),
+                (c.real, c.imag),
             )
             values.append(best_multiplier(first[0], first[1], second[0], second[1]))
         return values
 
-    def solve(self, start: NlpPoint) -> NlpPoint:
-        initial = np.concatenate([start.parameters, [start.g], *start.angles, *self._multipliers(start)])
+    def solve(self, start: NlpPoint, *, damping: float = 1.0) -> NlpPoint:
+        """Maximise log g from a start; `damping` scales the S-lemma rows' W4 (a path from a solution without
+        them)."""
+        initial = np.concatenate(
+            [start.parameters, [start.g], *start.angles, *self._multipliers(start, damping)]
+        )
         initial = np.clip(initial, self._bounds[0], self._bounds[1])
         answer = self._solver(
             x0=initial,
+            p=damping,
             lbx=self._bounds[0],
             ubx=self._bounds[1],
             lbg=self._row_bounds[0],
@@ -259,7 +284,8 @@ def _s_lemma_terms(
 
 
 def best_multiplier(a1: Real, b1: Real, a2: Real, b2: Real) -> Real:
-    """tau >= max(0, -A_i) that maximises -tau - sum B_i^2/(A_i + tau) (concave): bisection on its derivative, (F,)."""
+    """tau >= max(0, -A_i) that maximises -tau - sum B_i^2/(A_i + tau) (concave): bisection on its derivative,
+    (F,)."""
     floor = np.maximum(0.0, np.maximum(-a1, -a2))
     low, high = floor, floor + np.abs(b1) + np.abs(b2) + 1e-12
     for _ in range(60):

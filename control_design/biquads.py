@@ -1,8 +1,9 @@
 """Structured controllers: a cascade of first- and second-order sections in the Tustin plane.
 
 With p = (2/dt)(z - 1)/(z + 1)/scale (on the circle p = j (2/dt) tan(omega dt/2)/scale) the controller is
-K = prod (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b) times, for odd orders, (n1 p + n0)/(p + e^a), times (n1 p + n0)/p for an
-integrator, times notches (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b). Every parameter vector is a stable controller (apart from the wanted integrator), whatever the optimiser tries.
+K = prod (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b) times, for odd orders, (n1 p + n0)/(p + e^a), times (n1 p +
+n0)/p for an integrator, times notches (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b). Every parameter vector is a
+stable controller (apart from the wanted integrator), whatever the optimiser tries.
 """
 
 from __future__ import annotations
@@ -73,11 +74,15 @@ class Cascade:
     def state_space(self, x: Sequence[float] | Real) -> tuple[Real, Real, Real, Real]:
         """Discrete (A, B, C, D) of the cascade, every section mapped exactly by p -> z.
 
-        Each section is mapped as a continuous modal block with the trapezoidal rule, in delta-friendly numbers: for
-        x' = F x + g u the rule gives A = (I - F h)^-1 (I + F h), h = dt scale/2, without forming z-polynomials.
+        Each section is mapped as a continuous modal block with the trapezoidal rule, in delta-friendly
+        numbers: for x' = F x + g u the rule gives A = (I - F h)^-1 (I + F h), h = dt scale/2, without forming
+        z-polynomials.
         """
         h = self.dt_s * self.scale_rad_s / 2.0
-        a, b, c, d = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
+        a: Real = np.zeros((0, 0))
+        b: Real = np.zeros((0, 1))
+        c: Real = np.zeros((1, 0))
+        d: Real = np.ones((1, 1))
         for numerator, denominator in self.split(x):
             aj, bj, cj, dj = _tustin_section(numerator, denominator, h)
             n, m = a.shape[0], aj.shape[0]
@@ -95,6 +100,11 @@ class Cascade:
 def tustin_frequency(omega_rad_s: Real, dt_s: float) -> Real:
     """v = (2/dt) tan(omega dt/2): the imaginary axis of the Tustin plane."""
     return np.asarray(2.0 / dt_s * np.tan(np.asarray(omega_rad_s) * dt_s / 2.0), dtype=np.float64)
+
+
+def imaginary_axis(omega_rad_s: Real, dt_s: float) -> Complex:
+    """s = j (2/dt) tan(omega dt/2), where weights and sections are evaluated."""
+    return np.asarray(1j * tustin_frequency(omega_rad_s, dt_s), dtype=np.complex128)
 
 
 def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real, Real, Real, Real]:
@@ -119,4 +129,5 @@ def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real,
     b = root * np.linalg.solve(left, g)
     c = root * np.linalg.solve(left.T, row.T).T
     d = np.array([[direct]]) + h * row @ np.linalg.solve(left, g)
-    return a, b, c, d
+    matrices = [np.asarray(matrix, dtype=np.float64) for matrix in (a, b, c, d)]
+    return matrices[0], matrices[1], matrices[2], matrices[3]

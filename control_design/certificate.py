@@ -35,16 +35,18 @@ class SpecificationItem:
         where = "" if self.omega_rad_s is None else f" at {self.omega_rad_s:.4g} rad/s"
         verdict = "met" if self.met else "NOT met"
         unit = f" {self.unit}" if self.unit else ""
-        return f"{self.plant}: {self.requirement}: {self.achieved:.4g} against {self.required:.4g}{unit}{where}: {verdict}"
+        numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
+        return f"{self.plant}: {self.requirement}: {numbers}: {verdict}"
 
 
 @dataclass(frozen=True)
 class PlantVerdict:
     """Everything checked on one plant.
 
-    closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted value over the ellipses (<= 1 met,
-    0 = not asked), frequency of the largest. bandwidth_rad_s: up to here every member has |S| below -3 dB. own_grid_rad_s: range of a
-    user's own frequency grid, None if the uncertainty is known everywhere.
+    closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted
+    value over the ellipses (<= 1 met, 0 = not asked), frequency of the largest. bandwidth_rad_s: up to here
+    every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
+    uncertainty is known everywhere.
     """
 
     plant: str
@@ -68,8 +70,9 @@ class PlantVerdict:
 class Certificate:
     """Verdict on a controller for a set of uncertain plants.
 
-    certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches -1, and every item of
-    the specification is met, all on the grids named in `checked`. gamma: largest weighted worst case (<= 1 met).
+    certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches
+    -1, and every item of the specification is met, all on the grids named in `checked`. gamma: largest
+    weighted worst case (<= 1 met).
     """
 
     certified: bool
@@ -139,8 +142,8 @@ def certify(
 ) -> Certificate:
     """Check a controller from any source against plants and specification.
 
-    The grid is built here from the poles of plants, controller and closed loop and refined where the checks are worst; the optimiser's grid plays no
-    part.
+    The grid is built here from the poles of plants, controller and closed loop and refined where the checks
+    are worst; the optimiser's grid plays no part.
 
     Raises
     ------
@@ -183,7 +186,7 @@ def _check_plant(
     poles = closed_loop_poles(controller, plant)
     radius = float(np.max(np.abs(poles))) if poles.size else 0.0
     loop_modes = modes_of(poles, plant.dt_s, zeta_below=1.0)
-    own_modes = modes_of(np.linalg.eigvals(controller.A), plant.dt_s) if controller.order else ()
+    own_modes = modes_of(controller.poles, plant.dt_s)
     near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
     wanted = frequency_grid(
@@ -303,7 +306,8 @@ def _checked_words(verdicts: Sequence[PlantVerdict], specification: Specificatio
     words = [
         "nominal closed-loop poles of the full state space (plant, controller, computational delay)",
         "Nyquist count of the uncertainty centre against the count a stable loop needs",
-        "distance of every ellipse from -1 and every weighted worst case, exact on the ellipse, on a dense grid of "
+        "distance of every ellipse from -1 and every weighted worst case, exact on the ellipse, on "
+        "a dense grid of "
         + ", ".join(f"{v.frequencies} frequencies ({v.plant})" for v in verdicts)
         + ", refined around the maxima",
         "gain, phase, delay and modulus margins, nominal and worst case over the ellipses on that grid",
@@ -324,13 +328,15 @@ def _not_checked_words(plants: Sequence[UncertainPlant], verdicts: Sequence[Plan
         if verdict.own_grid_rad_s is not None:
             low, high = verdict.own_grid_rad_s
             words.append(
-                f"{plant.name}: the uncertainty is known on its own grid only; between its points nothing is known, and below "
+                f"{plant.name}: the uncertainty is known on its own grid only; between its points "
+                "nothing is known, and below "
                 f"{low:.4g} and above {high:.4g} rad/s the nominal alone was used, without uncertainty"
             )
         elif plant.uncertainty is None:
             words.append(f"{plant.name}: no uncertainty was given; only the nominal plant was checked")
         if plant.performance is not None:
             words.append(
-                f"{plant.name}: correlation between measured and performance channel is not used (any pair of members allowed)"
+                f"{plant.name}: correlation between measured and performance channel is not used "
+                "(any pair of members allowed)"
             )
     return tuple(words)

@@ -1,4 +1,5 @@
-"""Closed-loop simulation on anything that can be sampled: the nonlinear arm, a linear model, later a real machine."""
+"""Closed-loop simulation on anything that can be sampled: the nonlinear arm, a linear model, later a real
+machine."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from control_design.ellipses import Real, readonly_real
 
 
 class SampledMachine(Protocol):
-    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` is one."""
+    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` is
+    one."""
 
     @property
     def dt_s(self) -> float: ...
@@ -27,8 +29,8 @@ class SampledMachine(Protocol):
 class LinearMachine:
     """A discrete `control.StateSpace` as a SampledMachine.
 
-    Inputs: command, and optionally a second one driven by `hub_torque_Nm`; any number of outputs. The first column of D must be
-    zero: a sampled machine cannot answer at t_k to a command that is applied from t_k on.
+    Inputs: command, and optionally a second one driven by `hub_torque_Nm`; any number of outputs. The first
+    column of D must be zero: a sampled machine cannot answer at t_k to a command that is applied from t_k on.
     """
 
     def __init__(self, system: control.StateSpace) -> None:
@@ -75,8 +77,9 @@ class LinearMachine:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopTrajectory:
-    """What happened: time_s (T,), reference (T,), output (T, Y) as measured, command (T,) as applied during [t_k, t_{k+1}),
-    limited (T,) whether a limit was active when the command at t_k was computed; dt_s, measured_index of the controlled output."""
+    """What happened: time_s (T,), reference (T,), output (T, Y) as measured, command (T,) as applied during
+    [t_k, t_{k+1}), limited (T,) whether a limit was active when the command at t_k was computed; dt_s,
+    measured_index of the controlled output."""
 
     time_s: Real
     reference: Real
@@ -129,9 +132,10 @@ def simulate(
 ) -> ClosedLoopTrajectory:
     """Run u = K (r - y) on a machine from rest.
 
-    At t_k: measure y_k, add output_disturbance, quantise with measurement_step, compute the limited command, quantise it with
-    command_step, queue it for t_{k + delay}; then the machine holds the queued command (plus input_disturbance) until t_{k+1}.
-    With no limits and no quantisation this is exactly the feedback of K z^-delay and the machine used in the loop analysis.
+    At t_k: measure y_k, add output_disturbance, quantise with measurement_step, compute the limited command,
+    quantise it with command_step, queue it for t_{k + delay}; then the machine holds the queued command (plus
+    input_disturbance) until t_{k+1}. With no limits and no quantisation this is exactly the feedback of K
+    z^-delay and the machine used in the loop analysis.
 
     Parameters
     ----------
@@ -180,7 +184,7 @@ def simulate(
         else:
             machine.advance(applied + added[k])
     return ClosedLoopTrajectory(
-        np.arange(n) * controller.dt_s,
+        np.asarray(np.arange(n) * controller.dt_s, dtype=np.float64),
         wanted,
         np.array(output),
         command,
@@ -221,10 +225,11 @@ class StepMetrics:
 
 
 def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.02) -> StepMetrics:
-    """Rise time (10-90 %), overshoot, undershoot, settling time (into +-band of the step), steady error, peak command.
+    """Rise time (10-90 %), overshoot, undershoot, settling time (into +-band of the step), steady error, peak
+    command.
 
-    All relative to the reference's own step: from its first to its last value, timed from the first sample that differs from the
-    first value. Steady error is the mean error over the last tenth of the record.
+    All relative to the reference's own step: from its first to its last value, timed from the first sample
+    that differs from the first value. Steady error is the mean error over the last tenth of the record.
 
     Raises
     ------

@@ -1,4 +1,5 @@
-"""The controller as it runs: discrete state space with saturation, rate limit, anti-windup and one sample of delay."""
+"""The controller as it runs: discrete state space with saturation, rate limit, anti-windup and one sample of
+delay."""
 
 from __future__ import annotations
 
@@ -24,10 +25,11 @@ _FORMAT = "flexlink-controller-1"
 class Controller:
     """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, all SISO.
 
-    A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. input_limit, rate_limit: saturation (both signs) and largest change per second
-    of the command, or None. anti_windup_gain M (n, 1): back-calculation in observer form; the controller state then follows A - M C
-    while the command is limited, so M must make that stable; None = `observer_gain(A, B, C, D)`.
-    computational_delay_samples: the command computed from the measurement at t_k is applied from t_{k + delay} on.
+    A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
+    largest change per second of the command, or None. anti_windup_gain M (n, 1): back-calculation in observer
+    form; the controller state then follows A - M C while the command is limited, so M must make that stable;
+    None = `observer_gain(A, B, C, D)`. computational_delay_samples: the command computed from the measurement
+    at t_k is applied from t_{k + delay} on.
     """
 
     A: Real
@@ -78,6 +80,13 @@ class Controller:
     @property
     def order(self) -> int:
         return int(self.A.shape[0])
+
+    @property
+    def poles(self) -> Complex:
+        """Poles in z, (n,)."""
+        if self.order == 0:
+            return np.zeros(0, dtype=np.complex128)
+        return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
 
     def response(self, omega_rad_s: Real, *, with_delay: bool = True) -> Complex:
         """K(e^{j omega dt}), (F,), times z^-delay unless with_delay is False."""
@@ -217,8 +226,8 @@ class Controller:
 class ControllerStepper:
     """One running controller: feed the error at t_k, get the limited command computed at t_k.
 
-    The computational delay belongs to whoever applies the command (`closed_loop.simulate` queues it): a real-time
-    loop has it by itself.
+    The computational delay belongs to whoever applies the command (`closed_loop.simulate` queues it): a
+    real-time loop has it by itself.
     """
 
     def __init__(self, controller: Controller) -> None:
@@ -250,11 +259,12 @@ class ControllerStepper:
 
 
 def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
-    """Back-calculation gain M (n, 1) with A - M C stable: a Kalman gain for state noise through B and output noise D.
+    """Back-calculation gain M (n, 1) with A - M C stable: a Kalman gain for state noise through B and output
+    noise D.
 
-    For D != 0 and a minimum-phase controller the conditioning technique would take M = B/D, which places A - M C at the zeros of the
-    controller; a designed controller may have zeros outside the circle, where that winds up for ever. The Riccati gain is stable
-    for every observable (A, C) and comes close to it otherwise.
+    For D != 0 and a minimum-phase controller the conditioning technique would take M = B/D, which places A -
+    M C at the zeros of the controller; a designed controller may have zeros outside the circle, where that
+    winds up for ever. The Riccati gain is stable for every observable (A, C) and comes close to it otherwise.
     """
     n = A.shape[0]
     if n == 0:

@@ -1,8 +1,8 @@
 """Ellipses of frequency-response uncertainty and the exact geometry control needs of them.
 
-One frequency, one filled ellipse E = {centre + u1 s1 d1 + j u1 s2 d2 : d1^2 + d2^2 <= 1} in the complex plane, with
-|u1| = 1 and s1 >= s2 >= 0. Everything here is vectorised over F frequencies and exact up to rounding: no sampling of
-the boundary, no enclosing disc.
+One frequency, one filled ellipse E = {centre + u1 s1 d1 + j u1 s2 d2 : d1^2 + d2^2 <= 1} in the complex
+plane, with |u1| = 1 and s1 >= s2 >= 0. Everything here is vectorised over F frequencies and exact up to
+rounding: no sampling of the boundary, no enclosing disc.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class EvaluableUncertainty(Protocol):
 class Ellipses:
     """Filled uncertainty ellipses at F frequencies.
 
-    omega_rad_s (F,) ascending, centre (F,), semi_major >= semi_minor >= 0 (F,), direction (F,) unit complex: the
-    major axis. The minor axis is 1j * direction.
+    omega_rad_s (F,) ascending, centre (F,), semi_major >= semi_minor >= 0 (F,), direction (F,) unit complex:
+    the major axis. The minor axis is 1j * direction.
     """
 
     omega_rad_s: Real
@@ -97,7 +97,8 @@ class Ellipses:
         Raises
         ------
         ValueError
-            If level is outside (0, 1) or a covariance is not symmetric positive semi-definite (names the frequency).
+            If level is outside (0, 1) or a covariance is not symmetric positive semi-definite (names the
+            frequency).
         """
         if not 0 < level < 1:
             raise ValueError(f"{what}: level must lie in (0, 1); got {level}")
@@ -156,8 +157,9 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
     """Distance from `point` to the filled axis-parallel ellipse at the origin; 0 inside. All (F,).
 
     The nearest point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)) for the root t >= 0 of
-    (a x/(a^2 + t))^2 + (b y/(b^2 + t))^2 = 1 (first-order condition; t is the multiplier). The left side is convex and
-    decreasing, so Newton from the left never overshoots; degenerate axes (segments, points) are the limit b -> 0.
+    (a x/(a^2 + t))^2 + (b y/(b^2 + t))^2 = 1 (first-order condition; t is the multiplier). The left side is
+    convex and decreasing, so Newton from the left never overshoots; degenerate axes (segments, points) are
+    the limit b -> 0.
     """
     x, y = np.abs(np.real(point)), np.abs(np.imag(point))
     a = np.asarray(semi_major, dtype=np.float64)
@@ -194,8 +196,9 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
     """Distance from `point` to the farthest point of the axis-parallel ellipse at the origin. All (F,).
 
     Maximise |(a cos f + x, b sin f + y)| with x, y >= 0: the maximiser is in the first quadrant, and with
-    c = a^2 - b^2 >= 0 the secular equation (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1 has one root m > a^2, bracketed by
-    a^2 + a x ... a^2 + |(a x, b y)|-type bounds; solved by safeguarded Newton on the (convex) inverse square root.
+    c = a^2 - b^2 >= 0 the secular equation (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1 has one root m > a^2,
+    bracketed by a^2 + a x ... a^2 + |(a x, b y)|-type bounds; solved by safeguarded Newton on the (convex)
+    inverse square root.
     """
     x, y = np.abs(np.real(point)), np.abs(np.imag(point))
     a = np.asarray(semi_major, dtype=np.float64)
@@ -204,7 +207,8 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
     x, y, a, b = x / scale, y / scale, a / scale, b / scale
     ax, by = a * x, b * y
     gap = a * a - b * b
-    # Unknown n = m - a^2 >= 0. Bisection on log-free bounds: lower = larger single-term root, upper = sum of terms.
+    # Unknown n = m - a^2 >= 0. Bisection on log-free bounds: lower = larger single-term root, upper = sum of
+    # terms.
     low = np.maximum(ax, np.maximum(by - gap, 0.0))
     high = ax + by + 1e-300
     for _ in range(80):
@@ -232,7 +236,8 @@ def distance_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
     """min |1 + G k| over G in E at every frequency, (F,); 0 where some member puts the loop on -1. Exact."""
     size = np.abs(loop_gain)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k centre.
+        # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k
+        # centre.
         turned = np.where(
             size > 0,
             (1.0 + loop_gain * ellipses.centre)
@@ -244,11 +249,13 @@ def distance_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
 
 
 def largest_disturbance_gain(loop_gain: Complex, ellipses: Ellipses, *, iterations: int = 60) -> Real:
-    """max |G / (1 + G k)| over G in E at every frequency, (F,); inf where some member puts the loop on -1. Exact.
+    """max |G / (1 + G k)| over G in E at every frequency, (F,); inf where some member puts the loop on -1.
+    Exact.
 
-    |G| <= h |1 + G k| is, with q = h^2 |k|^2, an Apollonius set: |G - g0| >= r for q > 1, <= r for q < 1, with
-    g0 = h^2 conj(k)/(1 - q) and r = h/|1 - q|. The ellipse lies in it or not by its exact nearest/farthest distance from g0; h by
-    bisection (the same lossless statement as the S-lemma of the design notes, without multipliers).
+    |G| <= h |1 + G k| is, with q = h^2 |k|^2, an Apollonius set: |G - g0| >= r for q > 1, <= r for q < 1,
+    with g0 = h^2 conj(k)/(1 - q) and r = h/|1 - q|. The ellipse lies in it or not by its exact
+    nearest/farthest distance from g0; h by bisection (the same lossless statement as the S-lemma of the
+    design notes, without multipliers).
     """
     k = np.asarray(loop_gain, dtype=np.complex128)
     blocked = distance_to_minus_one(k, ellipses) <= 0.0

@@ -1,8 +1,9 @@
-"""A flexible link with uncertainty ellipses: published comparison plant for synthesis methods, no data needed.
+"""A flexible link with uncertainty ellipses: published comparison plant for synthesis methods, no data
+needed.
 
-200 Hz; poles at z = 0.9999 and -4 rad/s, one mode at 15 rad/s with 1.5 % damping, zeros at +10.8 (non-minimum phase) and
--11.5 rad/s. The covariance is the first-order propagation of parameter spreads plus a part that grows with frequency, so the
-ellipses are strongly elongated around the mode.
+200 Hz; poles at z = 0.9999 and -4 rad/s, one mode at 15 rad/s with 1.5 % damping, zeros at +10.8 (non-minimum
+phase) and -11.5 rad/s. The covariance is the first-order propagation of parameter spreads plus a part that
+grows with frequency, so the ellipses are strongly elongated around the mode.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class LinkUncertainty:
         centre = _response(omega, _NOMINAL)
         covariance = np.zeros((omega.size, 2, 2))
         for key, spread in _SPREAD[self.scenario].items():
-            step = 1e-5  # central difference: truncation 1e-10, rounding 1e-11, both far below the covariance itself
+            step = 1e-5  # central difference: truncation 1e-10, rounding 1e-11, far below the covariance
             up = _response(omega, _NOMINAL | {key: _NOMINAL[key] * (1 + step)})
             down = _response(omega, _NOMINAL | {key: _NOMINAL[key] * (1 - step)})
             slope = (up - down) / (2 * step) * spread
@@ -127,7 +128,8 @@ def flexible_link(scenario: Scenario = "A") -> UncertainPlant:
 
 
 def flexible_link_specification(order: int) -> Specification:
-    """The published weights W1 = (s/1.7 + 1.6)/(s + 0.0016), W3 = (s/40 + 1)/(6 (s/1500 + 1)), no computational delay."""
+    """The published weights W1 = (s/1.7 + 1.6)/(s + 0.0016), W3 = (s/40 + 1)/(6 (s/1500 + 1)), no
+    computational delay."""
     return Specification(
         sensitivity_weight=RationalWeight(numerator=(1 / 1.7, 1.6), denominator=(1.0, 0.0016)),
         effort_weight=RationalWeight(numerator=(1 / 40, 1.0), denominator=(6 / 1500, 6.0)),
@@ -137,7 +139,8 @@ def flexible_link_specification(order: int) -> Specification:
 
 
 def nominal_matches_centre(scenario: Scenario, omega_rad_s: Real) -> float:
-    """Largest relative difference of the nominal state space from the ellipse centres (a check of this module)."""
+    """Largest relative difference of the nominal state space from the ellipse centres (a check of this
+    module)."""
     plant = flexible_link(scenario)
     centre = LinkUncertainty(scenario).at(omega_rad_s, 0.95).centre
     return float(np.max(np.abs(frequency_response(plant.nominal, omega_rad_s) - centre) / np.abs(centre)))

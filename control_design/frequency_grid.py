@@ -12,7 +12,8 @@ from control_design.plant_set import Mode, UncertainPlant
 
 
 def mode_points(mode: Mode, count: int, half_widths: float = 20.0) -> Real:
-    """Frequencies spaced like sinh within +-half_widths half-bandwidths (zeta omega) of a mode, densest at its peak."""
+    """Frequencies spaced like sinh within +-half_widths half-bandwidths (zeta omega) of a mode, densest at
+    its peak."""
     width = max(mode.zeta, 1e-6) * mode.omega_rad_s
     reach = np.arcsinh(half_widths)
     points = mode.omega_rad_s + width * np.sinh(np.linspace(-reach, reach, count))
@@ -26,9 +27,10 @@ def frequency_grid(
     omega_min_rad_s: float,
     n_log: int,
     n_mode: int,
-    extra: Sequence[float] = (),
+    extra: npt.ArrayLike = (),
 ) -> Real:
-    """Ascending grid from omega_min to Nyquist inclusive; `n_mode` points are shared out over the modes (at least 20 each)."""
+    """Ascending grid from omega_min to Nyquist inclusive; `n_mode` points are shared out over the modes (at
+    least 20 each)."""
     parts = [np.geomspace(omega_min_rad_s, nyquist_rad_s, n_log), np.asarray(extra, dtype=np.float64)]
     if modes:
         each = max(20, n_mode // len(modes))
@@ -42,8 +44,8 @@ def frequency_grid(
 
 
 def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
-    """`wanted` where the uncertainty is known everywhere; else the nearest of its own frequencies, and `wanted` outside their
-    range, where `Channel.at` has the nominal response only."""
+    """`wanted` where the uncertainty is known everywhere; else the nearest of its own frequencies, and
+    `wanted` outside their range, where `Channel.at` has the nominal response only."""
     own = plant.own_grid
     if own is None:
         return wanted

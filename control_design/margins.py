@@ -1,6 +1,7 @@
 """Gain, phase and delay margins over ellipses of the loop gain, exact at every grid frequency.
 
-A crossing is a member x of the ellipse K E on the negative real axis (gain) or on the unit circle (phase, delay).
+A crossing is a member x of the ellipse K E on the negative real axis (gain) or on the unit circle (phase,
+delay).
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from control_design.ellipses import Complex, Ellipses, Real
 class Margins:
     """Margins of a loop; infinity where there is no crossing.
 
-    gain_up: factor the gain may rise (> 1). gain_down: factor it may fall to (< 1; 0 = no lower limit). phase_rad: smallest rotation to -1
-    either way. delay_s: smallest extra delay to -1. modulus: smallest distance from -1.
+    gain_up: factor the gain may rise (> 1). gain_down: factor it may fall to (< 1; 0 = no lower limit).
+    phase_rad: smallest rotation to -1 either way. delay_s: smallest extra delay to -1. modulus: smallest
+    distance from -1.
     """
 
     gain_up: float
@@ -48,7 +50,8 @@ class Margins:
 
 
 def crossing_margins(x: Complex, omega_rad_s: Real, modulus: float) -> Margins:
-    """Margins of loop values x already on a crossing: real negative ones count for gain, those of size 1 for phase."""
+    """Margins of loop values x already on a crossing: real negative ones count for gain, those of size 1 for
+    phase."""
     real = np.real(x[np.abs(np.imag(x)) <= 1e-7 * np.abs(x)])
     inside = -real[(real < 0) & (real > -1)]
     beyond = -real[real < -1]
@@ -68,7 +71,8 @@ def crossing_margins(x: Complex, omega_rad_s: Real, modulus: float) -> Margins:
 def nominal_margins(
     loop_gain: Callable[[Real], Complex], omega_rad_s: Real, *, refinable: bool = True
 ) -> Margins:
-    """Margins of one loop: crossings bracketed on the grid, then refined by root finding (or interpolated)."""
+    """Margins of one loop: crossings bracketed on the grid, then refined by root finding (or
+    interpolated)."""
     value = loop_gain(omega_rad_s)
     crossings: list[complex] = []
     places: list[float] = []
@@ -136,12 +140,14 @@ def _real_axis(centre: Complex, major: Complex, minor: Complex, omega: Real) -> 
         c.real + major.real[hit] * np.cos(f) + minor.real[hit] * np.sin(f)
         for f in (middle + spread, middle - spread)
     ]
-    # A segment that covers part of (-1, 0) or (-inf, -1) has its extreme there at an end: -1 itself is outside.
+    # A segment that covers part of (-1, 0) or (-inf, -1) has its extreme there at an end: -1 itself is
+    # outside.
     return np.concatenate(ends).astype(np.complex128), np.concatenate([omega, omega])
 
 
 def _unit_circle(centre: Complex, major: Complex, minor: Complex, omega: Real) -> tuple[Complex, Real]:
-    """Points of each ellipse's boundary on the unit circle: roots w = e^{jf} of |c + a w + b/w|^2 = 1 (quartic)."""
+    """Points of each ellipse's boundary on the unit circle: roots w = e^{jf} of |c + a w + b/w|^2 = 1
+    (quartic)."""
     reach = np.abs(major)
     hit = (np.abs(np.abs(centre) - 1.0) <= reach) & (reach > 1e-12)
     if not np.any(hit):

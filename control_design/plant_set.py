@@ -1,4 +1,5 @@
-"""The uncertain plant: a nominal state space for the poles, ellipses for everything that must hold on the machine."""
+"""The uncertain plant: a nominal state space for the poles, ellipses for everything that must hold on the
+machine."""
 
 from __future__ import annotations
 
@@ -17,8 +18,9 @@ from control_design.ellipses import Complex, Ellipses, EvaluableUncertainty, Rea
 class Channel:
     """One response with its uncertainty.
 
-    nominal: SISO discrete `control.StateSpace`. uncertainty: an object with `at(omega, level)` (any frequency), a
-    record with omega_rad_s, centre, covariance, level (its own frequencies only), or None (the nominal response is exact).
+    nominal: SISO discrete `control.StateSpace`. uncertainty: an object with `at(omega, level)` (any
+    frequency), a record with omega_rad_s, centre, covariance, level (its own frequencies only), or None (the
+    nominal response is exact).
     """
 
     nominal: control.StateSpace
@@ -29,11 +31,13 @@ class Channel:
         system = self.nominal
         if not isinstance(system, control.StateSpace):
             raise ValueError(
-                f"the nominal plant must be a control.StateSpace; got {type(system).__name__}, convert with control.ss"
+                f"the nominal plant must be a control.StateSpace; got {type(system).__name__}, "
+                "convert with control.ss"
             )
         if not (system.ninputs == 1 and system.noutputs == 1):
             raise ValueError(
-                f"the nominal plant must have one input and one output; got {system.ninputs} and {system.noutputs}"
+                f"the nominal plant must have one input and one output; got {system.ninputs} and "
+                f"{system.noutputs}"
             )
         if system.dt is None or system.dt is True or not system.dt > 0:
             raise ValueError(
@@ -47,7 +51,8 @@ class Channel:
         uncertainty = self.uncertainty
         if uncertainty is not None and not (hasattr(uncertainty, "at") or hasattr(uncertainty, "covariance")):
             raise ValueError(
-                "uncertainty needs a method at(omega_rad_s, level), or omega_rad_s, centre, covariance, level; "
+                "uncertainty needs a method at(omega_rad_s, level), or omega_rad_s, centre, "
+                "covariance, level; "
                 f"got {type(uncertainty).__name__}"
             )
         own = self.own_grid
@@ -58,7 +63,8 @@ class Channel:
                 )
             if not own[-1] <= np.pi / system.dt * (1 + 1e-9):
                 raise ValueError(
-                    f"the uncertainty's grid reaches {own[-1]:.5g} rad/s; the Nyquist frequency is {np.pi / system.dt:.5g}"
+                    f"the uncertainty's grid reaches {own[-1]:.5g} rad/s; the Nyquist frequency is "
+                    f"{np.pi / system.dt:.5g}"
                 )
 
     @property
@@ -77,8 +83,9 @@ class Channel:
         return frequency_response(self.nominal, omega_rad_s)
 
     def at(self, omega_rad_s: Real) -> Ellipses:
-        """Ellipses at omega (F,). On a record with its own grid, omega inside its range must be members of that grid;
-        outside the range the nominal response stands alone, without uncertainty (the certificate says so).
+        """Ellipses at omega (F,). On a record with its own grid, omega inside its range must be members of
+        that grid; outside the range the nominal response stands alone, without uncertainty (the certificate
+        says so).
 
         Raises
         ------
@@ -113,7 +120,8 @@ class Channel:
         missing = ~outside & (np.abs(own[index] - omega) > 1e-9 * np.maximum(omega, 1e-12))
         if np.any(missing):
             raise ValueError(
-                f"the uncertainty is known on its own grid only; {omega[np.argmax(missing)]:.6g} rad/s is not on it"
+                f"the uncertainty is known on its own grid only; {omega[np.argmax(missing)]:.6g} "
+                "rad/s is not on it"
             )
         centre = np.asarray(record.centre, dtype=np.complex128)[index]
         covariance = np.asarray(record.covariance, dtype=np.float64)[index]
@@ -126,8 +134,9 @@ class Channel:
 def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
     """C (zI - A)^-1 B + D on z = e^{j omega dt}, (F,), for a SISO discrete system.
 
-    zI - A is formed as (z - 1) I - (A - I) with z - 1 = expm1(j omega dt): at 1e-4 rad/s and 1 kHz the plain difference would keep
-    only nine digits, and slow poles live there. Solved batchwise (no polynomial, no eigenvector basis).
+    zI - A is formed as (z - 1) I - (A - I) with z - 1 = expm1(j omega dt): at 1e-4 rad/s and 1 kHz the plain
+    difference would keep only nine digits, and slow poles live there. Solved batchwise (no polynomial, no
+    eigenvector basis).
     """
     a = np.asarray(system.A, dtype=np.float64)
     b = np.asarray(system.B, dtype=np.float64)
@@ -152,8 +161,9 @@ def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex
 def count_integrators(poles_z: Complex) -> int:
     """Poles at z = 1.
 
-    A multiple pole splits by a root of the rounding error (1e-8 for two, 1e-5 for three) but the mean of the cluster stays
-    accurate; a true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is not mistaken for an integrator by that test.
+    A multiple pole splits by a root of the rounding error (1e-8 for two, 1e-5 for three) but the mean of the
+    cluster stays accurate; a true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is not mistaken for an
+    integrator by that test.
     """
     distance = np.asarray(poles_z, dtype=np.complex128) - 1.0
     distance = distance[np.argsort(np.abs(distance), kind="stable")]
@@ -176,7 +186,8 @@ class Mode:
 
 
 def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple[Mode, ...]:
-    """Oscillatory pole pairs of z-plane poles as s = ln(z)/dt, ascending in frequency; zeta < 0 is unstable."""
+    """Oscillatory pole pairs of z-plane poles as s = ln(z)/dt, ascending in frequency; zeta < 0 is
+    unstable."""
     poles = np.asarray(poles_z, dtype=np.complex128)
     upper = poles[(np.imag(poles) > 1e-9) & (np.abs(poles) > 1e-6)]
     s = np.log(upper) / dt_s
@@ -186,12 +197,14 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class UncertainPlant:
-    """Input -> measured output with ellipses; optionally input -> performance output for the damping requirement.
+    """Input -> measured output with ellipses; optionally input -> performance output for the damping
+    requirement.
 
     name : shown in reports (one plant per load or operating point).
     nominal, uncertainty, level : see `Channel`; the sampling time is the nominal's.
-    integrators : poles at z = 1, None = counted from the nominal; a number that contradicts the nominal is refused.
-    performance : the channel whose |Gp S| the damping weight bounds; None = the measured output itself.
+    integrators : poles at z = 1, None = counted from the nominal; a number that contradicts the nominal is
+    refused. performance : the channel whose |Gp S| the damping weight bounds; None = the measured output
+    itself.
     """
 
     name: str
@@ -210,13 +223,15 @@ class UncertainPlant:
             object.__setattr__(self, "integrators", counted)
         elif self.integrators != counted:
             raise ValueError(
-                f"plant {self.name!r}: {self.integrators} integrators declared, the nominal has {counted} poles at z = 1"
+                f"plant {self.name!r}: {self.integrators} integrators declared, the nominal has "
+                f"{counted} poles at z = 1"
             )
         if counted > 2:
             raise ValueError(f"plant {self.name!r}: at most two integrators are supported; got {counted}")
         if np.any(np.abs(np.abs(self._other_poles) - 1.0) < 1e-10):
             raise ValueError(
-                f"plant {self.name!r}: a nominal pole lies on the unit circle away from z = 1 (undamped mode); "
+                f"plant {self.name!r}: a nominal pole lies on the unit circle away from z = 1 "
+                "(undamped mode); "
                 "its response is infinite there, give it damping"
             )
         if self.performance is not None and self.performance.dt_s != channel.dt_s:

@@ -1,14 +1,15 @@
 """What the loop has to do, in the engineer's words, and the weights built from it.
 
-Everything is stated for the worst member of the uncertainty ellipses. Weights act on the circle through the Tustin frequency
-s = j (2/dt) tan(omega dt/2); a requirement is met where its weighted worst case is at most 1:
+Everything is stated for the worst member of the uncertainty ellipses. Weights act on the circle through the
+Tustin frequency s = j (2/dt) tan(omega dt/2); a requirement is met where its weighted worst case is at most
+1:
 
     |W1 S| <= 1   tracking and modulus margin    W1 = max(|(m s + wb)/(s + wb r)|, m)
     |W3 K S| <= 1 effort                         W3 = (s/wr + 1)/(s/(40 wr) + 1)/effort_limit
     |W4 Gp S| <= 1 damping of the flexible modes W4 = 1/(ratio x open-loop peak) inside the band, 0 outside
 
-with m the modulus margin, r the low-frequency rejection (0 with an integrator) and wb = bandwidth sqrt(2 - m^2), so that |W1| is at least
-sqrt 2 (-3 dB of S) up to the bandwidth.
+with m the modulus margin, r the low-frequency rejection (0 with an integrator) and wb = bandwidth sqrt(2 -
+m^2), so that |W1| is at least sqrt 2 (-3 dB of S) up to the bandwidth.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from control_design.biquads import SectionKind, tustin_frequency
+from control_design.biquads import SectionKind, imaginary_axis
 from control_design.ellipses import Complex, Real
 from control_design.plant_set import Mode, UncertainPlant, modes_of
 
+_INTEGRAL_SHARE = 0.05  # of the corner: where the controller's integrator takes over on an integrating plant
 _ROLLOFF_END = 40.0  # the effort weight flattens this far above its corner, so that it stays proper
 
 
@@ -32,7 +34,8 @@ class SpecificationError(ValueError):
 
 
 class RationalWeight(BaseModel):
-    """W(s) = numerator(s)/denominator(s), coefficients of s with the highest power first; stable and proper."""
+    """W(s) = numerator(s)/denominator(s), coefficients of s with the highest power first; stable and
+    proper."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     numerator: tuple[float, ...] = Field(min_length=1, description="coefficients, highest power of s first")
@@ -100,7 +103,7 @@ class Specification(BaseModel):
         default=None,
         gt=0,
         le=1,
-        description="peak of |Gp S| in the mode's band over the open-loop peak of |Gp| there (active damping)",
+        description="peak of |Gp S| in the mode's band over the open-loop peak of |Gp| there (damping)",
     )
     mode_band_rad_s: tuple[float, float] | None = Field(
         default=None,
@@ -121,7 +124,7 @@ class Specification(BaseModel):
     controller_order: int = Field(default=4, ge=1, le=16, description="number of controller states")
     structure: Literal["biquads", "pi_d_notch"] = Field(
         default="biquads",
-        description="biquads: free cascade; pi_d_notch: [integrator], lead/lag, then notches at free frequencies",
+        description="biquads: free cascade; pi_d_notch: [integrator], lead/lag, notches at free frequencies",
     )
     computational_delay_samples: int = Field(
         default=1, ge=0, le=10, description="samples between measuring and applying the command"
@@ -150,11 +153,13 @@ class Specification(BaseModel):
         smallest = 1 if self.structure == "biquads" else 1 + int(self.integrator)
         if self.controller_order < smallest:
             raise ValueError(
-                f"structure {self.structure!r} needs controller_order of at least {smallest}; got {self.controller_order}"
+                f"structure {self.structure!r} needs controller_order of at least {smallest}; got "
+                f"{self.controller_order}"
             )
         if self.structure == "pi_d_notch" and (self.controller_order - smallest) % 2:
             raise ValueError(
-                f"pi_d_notch has order {smallest} plus two per notch; got controller_order {self.controller_order}"
+                f"pi_d_notch has order {smallest} plus two per notch; got controller_order "
+                f"{self.controller_order}"
             )
         return self
 
@@ -162,12 +167,18 @@ class Specification(BaseModel):
         """Section kinds of the cascade, integrator first."""
         head: list[SectionKind] = ["integrator"] if self.integrator else []
         rest = self.controller_order - len(head)
-        if self.structure == "pi_d_notch":
-            return (*head, "first_order", *(["notch"] * ((rest - 1) // 2)))
-        return (*head, *(["first_order"] * (rest % 2)), *(["second_order"] * (rest // 2)))
+        real: list[SectionKind] = ["first_order"] * (1 if self.structure == "pi_d_notch" else rest % 2)
+        pair: SectionKind = "notch" if self.structure == "pi_d_notch" else "second_order"
+        return (*head, *real, *([pair] * ((rest - len(real)) // 2)))
 
-    def tracking_at(self, s: Complex) -> Complex:
-        """Rational part of W1 at complex s; the modulus margin where there is no tracking requirement."""
+    def tracking_at(self, s: Complex, plant_integrators: int = 0) -> Complex:
+        """Rational part of W1 at complex s; the modulus margin where there is no tracking requirement.
+
+        A plant that integrates by itself meets a weight of slope one without any action of the controller's
+        own integrator, which the optimiser would then make arbitrarily slow. Each plant integrator therefore
+        adds the factor (s + corner/20)/s when the integrator is asked for: integral action has to be there by
+        a twentieth of the bandwidth.
+        """
         s = np.asarray(s, dtype=np.complex128)
         if self.sensitivity_weight is not None:
             return self.sensitivity_weight.at(s)
@@ -177,16 +188,19 @@ class Specification(BaseModel):
         corner = self.bandwidth_rad_s * np.sqrt(2.0 - m**2)
         floor = 0.0 if self.integrator else self.low_frequency_rejection
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray((m * s + corner) / (s + corner * floor), dtype=np.complex128)
+            value = (m * s + corner) / (s + corner * floor)
+            if self.integrator:
+                value = value * ((s + _INTEGRAL_SHARE * corner) / s) ** plant_integrators
+        return np.asarray(value, dtype=np.complex128)
 
-    def sensitivity_magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
+    def sensitivity_magnitude(self, omega_rad_s: Real, dt_s: float, plant_integrators: int = 0) -> Real:
         """|W1| (F,): tracking and modulus margin together."""
-        s = 1j * tustin_frequency(omega_rad_s, dt_s)
-        return np.maximum(np.abs(self.tracking_at(s)), self.modulus_margin)
+        s = imaginary_axis(omega_rad_s, dt_s)
+        return np.maximum(np.abs(self.tracking_at(s, plant_integrators)), self.modulus_margin)
 
     def effort_magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
         """|W3| (F,); zeros where effort is not limited."""
-        s = 1j * tustin_frequency(omega_rad_s, dt_s)
+        s = imaginary_axis(omega_rad_s, dt_s)
         if self.effort_weight is not None:
             return np.abs(self.effort_weight.at(s))
         if self.effort_limit is None:
@@ -247,9 +261,9 @@ class Specification(BaseModel):
 
         Notes
         -----
-        At a zero w of G outside the circle (also the one at z = infinity that a sample of delay makes) S(w) = 1, hence
-        max|W1 S| >= |W1(w)| for a stable loop. On the circle 1 = S + G K S gives gamma >= 1/(1/|W1| + |G|/|W3|).
-        Both use the nominal plant, so they are necessary conditions only.
+        At a zero w of G outside the circle (also the one at z = infinity that a sample of delay makes) S(w) =
+        1, hence max|W1 S| >= |W1(w)| for a stable loop. On the circle 1 = S + G K S gives gamma >= 1/(1/|W1|
+        + |G|/|W3|). Both use the nominal plant, so they are necessary conditions only.
         """
         if not plants:
             raise SpecificationError("no plant given: the design needs at least one uncertain plant")
@@ -266,11 +280,13 @@ class Specification(BaseModel):
             value = getattr(self, name)
             if value is not None and not value < plant.nyquist_rad_s:
                 raise SpecificationError(
-                    f"{name} = {value:.4g} rad/s lies beyond the Nyquist frequency {plant.nyquist_rad_s:.4g} rad/s"
+                    f"{name} = {value:.4g} rad/s lies beyond the Nyquist frequency "
+                    f"{plant.nyquist_rad_s:.4g} rad/s"
                 )
         if self.mode_band_rad_s is not None and not self.mode_band_rad_s[0] < plant.nyquist_rad_s:
             raise SpecificationError(
-                f"mode_band_rad_s starts at {self.mode_band_rad_s[0]:.4g} rad/s, beyond the Nyquist frequency "
+                f"mode_band_rad_s starts at {self.mode_band_rad_s[0]:.4g} rad/s, beyond the Nyquist "
+                "frequency "
                 f"{plant.nyquist_rad_s:.4g} rad/s"
             )
         if self.mode_band_rad_s is not None and plant.n_integrators and self.mode_band_rad_s[0] < 1e-3:
@@ -293,7 +309,7 @@ class Specification(BaseModel):
             w = np.append(w, 2.0 / dt)
         if not w.size:
             return
-        bound = np.abs(self.tracking_at(w))
+        bound = np.abs(self.tracking_at(w, plant.n_integrators))
         worst = int(np.argmax(bound))
         if bound[worst] <= 1.0:
             return
@@ -301,13 +317,20 @@ class Specification(BaseModel):
         where = (
             "the sampling delay" if last else f"the non-minimum-phase zero at {np.abs(w[worst]):.4g} rad/s"
         )
-        message = f"plant {plant.name!r}: {where} makes the tracking requirement impossible by a factor {bound[worst]:.3g}"
+        message = (
+            f"plant {plant.name!r}: {where} makes the tracking requirement "
+            f"impossible by a factor {bound[worst]:.3g}"
+        )
         if self.bandwidth_rad_s is not None:
             low, high = 0.0, self.bandwidth_rad_s
             for _ in range(60):
                 mid = 0.5 * (low + high)
                 trial = self.model_copy(update={"bandwidth_rad_s": max(mid, 1e-300)})
-                low, high = (mid, high) if np.all(np.abs(trial.tracking_at(w)) <= 1.0) else (low, mid)
+                low, high = (
+                    (mid, high)
+                    if np.all(np.abs(trial.tracking_at(w, plant.n_integrators)) <= 1.0)
+                    else (low, mid)
+                )
             message += (
                 f": bandwidth_rad_s = {self.bandwidth_rad_s:.4g}, at most {low:.4g} with modulus_margin "
                 f"{self.modulus_margin:.3g}"
@@ -320,15 +343,17 @@ class Specification(BaseModel):
         if not np.any(effort > 0):
             return
         gain = np.abs(plant.channel.nominal_response(omega))
-        tracking = self.sensitivity_magnitude(omega, plant.dt_s)
+        tracking = self.sensitivity_magnitude(omega, plant.dt_s, plant.n_integrators)
         with np.errstate(divide="ignore", over="ignore"):
             bound = 1.0 / (1.0 / tracking + gain / np.maximum(effort, 1e-300))
         worst = int(np.argmax(bound))
         if bound[worst] > 1.0:
             needed = (1.0 - 1.0 / tracking[worst]) / gain[worst]
             raise SpecificationError(
-                f"plant {plant.name!r}: at {omega[worst]:.4g} rad/s tracking needs |K S| of at least {needed:.4g}, the effort "
-                f"limit there is {1.0 / effort[worst]:.4g}; the two contradict each other by a factor {bound[worst]:.3g}"
+                f"plant {plant.name!r}: at {omega[worst]:.4g} rad/s tracking needs |K S| of at "
+                f"least {needed:.4g}, the effort "
+                f"limit there is {1.0 / effort[worst]:.4g}; the two contradict each other by a "
+                f"factor {bound[worst]:.3g}"
             )
 
 

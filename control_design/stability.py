@@ -1,4 +1,5 @@
-"""Nominal stability two ways: closed-loop poles of the full state space, and the Nyquist count of the uncertainty centre."""
+"""Nominal stability two ways: closed-loop poles of the full state space, and the Nyquist count of the
+uncertainty centre."""
 
 from __future__ import annotations
 
@@ -46,8 +47,9 @@ def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
 class NyquistCount:
     """Half turns of 1 + L from zero frequency to Nyquist.
 
-    half_turns: phase change / pi, counted anticlockwise. required: unstable poles + integrators/2 for a stable loop. largest_step_rad:
-    largest phase step between neighbouring points (below pi/2 the count is trustworthy). matches: they agree.
+    half_turns: phase change / pi, counted anticlockwise. required: unstable poles + integrators/2 for a
+    stable loop. largest_step_rad: largest phase step between neighbouring points (below pi/2 the count is
+    trustworthy). matches: they agree.
     """
 
     half_turns: float
@@ -67,13 +69,15 @@ def nyquist_count(
 ) -> NyquistCount:
     """Count the half turns of F = 1 + L on the upper half of the circle.
 
-    F has as many zeros as poles (L is proper and F(infinity) is not 0). With the contour indented outside z = 1 the i integrators lie
-    inside, so a stable loop turns by 2 pi P over the whole contour, P the unstable poles of L; by symmetry pi P over the upper
-    half, of which the quarter of the indentation takes -i pi/2. Hence arg F(pi/dt) - arg F(0+) = pi P + i pi/2, where
-    arg F(0+) = -i pi/2 (mod pi). With i = 0, 1, 2 and P = 0 the phase therefore starts at 0, -pi/2, -pi and ends at 0.
+    F has as many zeros as poles (L is proper and F(infinity) is not 0). With the contour indented outside z =
+    1 the i integrators lie inside, so a stable loop turns by 2 pi P over the whole contour, P the unstable
+    poles of L; by symmetry pi P over the upper half, of which the quarter of the indentation takes -i pi/2.
+    Hence arg F(pi/dt) - arg F(0+) = pi P + i pi/2, where arg F(0+) = -i pi/2 (mod pi). With i = 0, 1, 2 and P
+    = 0 the phase therefore starts at 0, -pi/2, -pi and ends at 0.
 
-    start (F,): first grid, ascending, ending at Nyquist. If refinable, points are added until every phase step is below pi/8 and the lowest
-    frequency is lowered until F is within 0.1 rad of its limit direction there.
+    start (F,): first grid, ascending, ending at Nyquist. If refinable, points are added until every phase
+    step is below pi/8 and the lowest frequency is lowered until F is within 0.1 rad of its limit direction
+    there.
     """
     omega = np.asarray(start, dtype=np.float64)
     value = 1.0 + loop_gain(omega)
@@ -95,7 +99,8 @@ def nyquist_count(
             value = np.insert(value, wide + 1, 1.0 + loop_gain(middle))
     steps = np.angle(value[1:] / _nonzero(value[:-1]))
     turns = float(np.sum(steps) / np.pi)
-    # The remainders to the limit directions at both ends, known up to half turns, close the count to a multiple of 1/2.
+    # The remainders to the limit directions at both ends, known up to half turns, close the count to a
+    # multiple of 1/2.
     first = np.angle(value[0] * 1j**integrators)
     turns += (first - np.pi * np.round(first / np.pi)) / np.pi
     last = np.angle(value[-1])
@@ -108,11 +113,7 @@ def nyquist_count(
 
 def loop_integrators(controller: Controller, plant: UncertainPlant) -> tuple[int, int]:
     """(integrators, unstable poles) of the loop gain L = G K."""
-    poles = (
-        np.asarray(np.linalg.eigvals(controller.A), dtype=np.complex128)
-        if controller.order
-        else np.zeros(0, complex)
-    )
+    poles = controller.poles
     own = count_integrators(poles)
     others = poles[np.argsort(np.abs(poles - 1.0), kind="stable")][own:]
     return plant.n_integrators + own, plant.unstable_poles + int(np.sum(np.abs(others) >= 1.0))

@@ -1,4 +1,5 @@
-"""Structured robust synthesis: several starts of the angle programme, then exchange of violated frequencies."""
+"""Structured robust synthesis: several starts of the angle programme, then exchange of violated
+frequencies."""
 
 from __future__ import annotations
 
@@ -23,6 +24,8 @@ from control_design.worst_case import KINDS, PlantData, worst_of
 Progress = Callable[[float, str], None]
 
 _DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
+_DAMPING_STEP = 1.5  # W4 rises by at most this factor at a time
+_WELL_ABOVE = 1.05
 _STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
 
 
@@ -45,9 +48,15 @@ class SynthesisOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    starts: int = Field(default=8, ge=1, le=100, description="low-gain starts")
+    starts: int = Field(default=10, ge=1, le=100, description="low-gain starts")
     agreeing_starts: int = Field(
-        default=3, ge=1, description="stop early when so many starts reach the best value within 0.1 %"
+        default=4, ge=1, description="stop early when so many starts reach the best value within 0.1 %"
+    )
+    sufficient_gamma: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="stop as soon as a stable design reaches this gamma; 0 = look for the best",
     )
     exchange_rounds: int = Field(default=4, ge=0, le=20, description="rounds of adding violated frequencies")
     exchange_tolerance: float = Field(
@@ -80,7 +89,8 @@ class BlockingPoint:
 
 @dataclass(frozen=True)
 class StartReport:
-    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid (None = unstable)."""
+    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid (None =
+    unstable)."""
 
     start: int
     status: str
@@ -93,9 +103,10 @@ class StartReport:
 class SynthesisResult:
     """Best controller found and how good it is.
 
-    gamma: largest weighted worst case over plants, ellipses and the dense grid (<= 1: met; 1.2: requirements exceeded by 20 %). blocking: where
-    and which weight, worst first. gamma_history: dense gamma of the best point after the starts and each exchange round. grid_points: final size of
-    the programme's grids. outcome says what gamma means; certify with `certificate.certify` before use.
+    gamma: largest weighted worst case over plants, ellipses and the dense grid (<= 1: met; 1.2: requirements
+    exceeded by 20 %). blocking: where and which weight, worst first. gamma_history: dense gamma of the best
+    point after the starts and each exchange round. grid_points: final size of the programme's grids. outcome
+    says what gamma means; certify with `certificate.certify` before use.
     """
 
     outcome: Outcome
@@ -109,7 +120,7 @@ class SynthesisResult:
     def explain(self) -> str:
         """One line: met, or how far and which frequency and requirement block it."""
         if self.outcome is Outcome.NOT_CONVERGED:
-            return self.outcome.value
+            return str(self.outcome.value)
         first = self.blocking[0] if self.blocking else None
         where = (
             ""
@@ -186,9 +197,10 @@ def synthesise(
 
     Notes
     -----
-    Design: W1 and W3 (and W4 with an independent performance channel) in angle form, W4 of the measured output itself in S-lemma
-    form, from the best starts of the programme without W4. After the starts the dense check adds its violated local maxima and the
-    programme is solved again from the best point; a point is accepted only if all nominal loops are stable and gamma is not worse.
+    Design: W1 and W3 (and W4 with an independent performance channel) in angle form, W4 of the measured
+    output itself in S-lemma form, from the best starts of the programme without W4. After the starts the
+    dense check adds its violated local maxima and the programme is solved again from the best point; a point
+    is accepted only if all nominal loops are stable and gamma is not worse.
     """
     options = options or SynthesisOptions()
     specification.check_against(plants)
@@ -257,12 +269,13 @@ class _Search:
         found: list[_Candidate] = []
         needs_second = self._s_lemma_needed()
         share = 0.5 if needs_second else 0.7
+        first_kinds = KINDS[:3] if needs_second else KINDS
         for number in range(self.options.starts):
             self.progress(
                 share * number / self.options.starts, f"start {number + 1} of {self.options.starts}"
             )
             point = first.solve(self._start(first.plants))
-            gamma = self.gamma(point.parameters, without_damping=needs_second)
+            gamma = self.gamma(point.parameters, kinds=first_kinds)
             reports.append(
                 StartReport(
                     number + 1,
@@ -277,28 +290,49 @@ class _Search:
             best = min((c.gamma for c in found), default=np.inf)
             if sum(c.gamma <= best * 1.001 for c in found) >= self.options.agreeing_starts:
                 break
+            if best <= self.options.sufficient_gamma:
+                break
         found.sort(key=lambda c: c.gamma)
         if needs_second and found:
-            found = self._with_damping(_distinct(found, 3), share)
+            found = self._with_damping(_distinct(found, 2), share)
         if not found:
             return self._nothing_stable(tuple(reports))
         return self._exchange(found[0], tuple(reports))
 
     def _with_damping(self, candidates: Sequence[_Candidate], share: float) -> list[_Candidate]:
-        """Add the S-lemma rows, starting from solutions without them (cold starts rarely converge with ellipses)."""
+        """Add the S-lemma rows to solutions without them (cold starts rarely converge on elongated ellipses).
+
+        First in one jump; where that stays well above the gamma without W4, also along a path on which W4
+        rises from where the solution meets it already. Neither way wins always: on the published link the
+        path wins in scenario A, the jump in B.
+        """
         program = self._program(with_damping=True)
-        found = []
+        found: list[_Candidate] = []
         for number, candidate in enumerate(candidates):
             self.progress(
                 share + 0.2 * number / len(candidates), f"damping of the mode {number + 1}/{len(candidates)}"
             )
-            gamma = self.gamma(candidate.point.parameters)
-            start = self._at(candidate.point.parameters, program.plants, gamma)
-            point = program.solve(start)
-            reached = self.gamma(point.parameters)
-            found.append(_Candidate(point, reached) if reached < gamma else _Candidate(start, gamma))
-        found = [c for c in found if np.isfinite(c.gamma)]
-        return sorted(found, key=lambda c: c.gamma)
+            start = candidate.point
+            excess = max(1.0, self.gamma(start.parameters) / candidate.gamma)
+            found.append(self._follow(program, start, [1.0]))
+            if excess > _DAMPING_STEP and found[-1].gamma > _WELL_ABOVE * candidate.gamma:
+                steps = int(np.ceil(np.log(excess) / np.log(_DAMPING_STEP)))
+                path = excess ** -(1.0 - np.arange(1, steps + 1) / steps)
+                found.append(self._follow(program, start, path.tolist()))
+        return sorted((c for c in found if np.isfinite(c.gamma)), key=lambda c: c.gamma)
+
+    def _follow(self, program: AngleProgram, start: NlpPoint, path: Sequence[float]) -> _Candidate:
+        """Solve along scalings of W4, keeping a point only where it gains."""
+        point = start
+        for damping in path:
+            gamma = self._gamma_with_damping(point.parameters, damping)
+            trial = program.solve(self._at(point.parameters, program.plants, gamma), damping=damping)
+            if self._gamma_with_damping(trial.parameters, damping) < gamma:
+                point = trial
+        return _Candidate(point, self.gamma(point.parameters))
+
+    def _gamma_with_damping(self, parameters: Real, damping: float) -> float:
+        return max(self.gamma(parameters, kinds=KINDS[:3]), damping * self.gamma(parameters, kinds=KINDS[3:]))
 
     def _exchange(self, best: _Candidate, reports: tuple[StartReport, ...]) -> SynthesisResult:
         history = [best.gamma]
@@ -307,7 +341,8 @@ class _Search:
             done = 0.7 + 0.3 * number / max(1, self.options.exchange_rounds)
             self.progress(done, f"exchange {number + 1}: gamma {best.gamma:.4g}")
             added = self._add_violated(current)
-            if added == 0:
+            unfinished = current.point.status == "Maximum_Iterations_Exceeded"
+            if best.gamma <= self.options.sufficient_gamma or (added == 0 and not unfinished):
                 break
             program = self._program(with_damping=True)
             start = self._at(best.point.parameters, program.plants, best.gamma)
@@ -365,8 +400,9 @@ class _Search:
             rate_limit=self.spec.rate_limit,
         )
 
-    def gamma(self, parameters: Real, *, without_damping: bool = False) -> float:
-        """Weighted worst case on the dense grids; inf if some nominal loop is unstable or an ellipse reaches -1."""
+    def gamma(self, parameters: Real, *, kinds: Sequence[str] = KINDS) -> float:
+        """Weighted worst case on the dense grids; inf if some nominal loop is unstable or an ellipse reaches
+        -1."""
         try:
             controller = self._controller(parameters)
         except ValueError:
@@ -379,7 +415,6 @@ class _Search:
         worst = 0.0
         for data in self.dense:
             values = data.weighted(self.cascade.response(parameters, data.ellipses.omega_rad_s))
-            kinds = KINDS[:3] if without_damping else KINDS
             worst = max(worst, float(np.max([np.max(values[kind]) for kind in kinds])))
         return worst
 
@@ -399,7 +434,8 @@ class _Search:
         return tuple(sorted(points, key=lambda p: -p.value))
 
     def _add_violated(self, candidate: _Candidate, most: int = 12) -> int:
-        """Put local maxima of the dense check that exceed the programme's gamma on the grids; how many were new."""
+        """Put local maxima of the dense check that exceed the programme's gamma on the grids; how many were
+        new."""
         limit = (1.0 / candidate.point.g) * (1.0 + self.options.exchange_tolerance)
         added = 0
         for position, data in enumerate(self.dense):
@@ -456,27 +492,31 @@ class _Search:
         )
 
     def _row_scale(self, data: PlantData) -> Real:
-        """Positive factors that keep rows of one size where 1 + L grows: integrators and steep tracking weights.
+        """Positive factors that keep rows of one size where 1 + L grows: integrators and steep tracking
+        weights.
 
-        A positive factor on |D_L + N_L| instead of |1 + L| leaves the angles alone; (omega/scale)^i is |D_L| of i integrators.
+        A positive factor on |D_L + N_L| instead of |1 + L| leaves the angles alone; (omega/scale)^i is |D_L|
+        of i integrators.
         """
         integrators = data.plant.n_integrators + int(self.spec.integrator)
         slope = np.minimum(1.0, data.ellipses.omega_rad_s / self.scale) ** integrators
-        return np.minimum(slope, 1.0 / np.maximum(data.w1, 1.0))
+        return np.asarray(np.minimum(slope, 1.0 / np.maximum(data.w1, 1.0)), dtype=np.float64)
 
     def _start_window(self, plant: UncertainPlant) -> tuple[float, float]:
-        """Range of the first angle: arg(1 + L) of a stable loop starts at -pi (P + i/2), see `stability.nyquist_count`.
+        """Range of the first angle: arg(1 + L) of a stable loop starts at -pi (P + i/2), see
+        `stability.nyquist_count`.
 
-        The angle of a supporting normal may differ from arg(1 + L) by up to pi/2; windows are narrower than pi, so that they cannot
-        take the next branch. With integrators there is more room towards lead: at the lowest frequency the loop may have come
-        some way from its limit already.
+        The angle of a supporting normal may differ from arg(1 + L) by up to pi/2; windows are narrower than
+        pi, so that they cannot take the next branch. With integrators there is more room towards lead: at the
+        lowest frequency the loop may have come some way from its limit already.
         """
         integrators = plant.n_integrators + int(self.spec.integrator)
         centre = -np.pi * (plant.unstable_poles + integrators / 2.0)
         return (centre - 1.4, centre + 1.4) if integrators == 0 else (centre - 0.63, centre + 1.87)
 
     def _at(self, parameters: Real, rows: Sequence[Rows], gamma: float) -> NlpPoint:
-        """Programme point for given controller parameters: angles along the nearest unwrapped phase of 1 + L."""
+        """Programme point for given controller parameters: angles along the nearest unwrapped phase of 1 +
+        L."""
         angles = []
         for plant in rows:
             loop = self.cascade.response(parameters, plant.ellipses.omega_rad_s) * plant.delay
@@ -513,7 +553,7 @@ class _Search:
         lead_size = {"integrator": 2, "first_order": 2, "second_order": 3}[self.cascade.sections[0]]
         parameters[:lead_size] *= self._low_gain(parameters)
         for _ in range(12):
-            gamma = self.gamma(parameters, without_damping=True)
+            gamma = self.gamma(parameters, kinds=KINDS[:3])
             if np.isfinite(gamma):
                 break
             parameters[:lead_size] *= 0.5
@@ -547,7 +587,8 @@ def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specificat
 
 
 def _grid_modes(plant: UncertainPlant, specification: Specification) -> tuple[Mode, ...]:
-    """Modes that deserve dense points: the plant's, and the performance channel's where damping is asked for."""
+    """Modes that deserve dense points: the plant's, and the performance channel's where damping is asked
+    for."""
     modes = list(plant.modes)
     if specification.mode_peak_ratio is not None:
         modes += [

@@ -25,8 +25,8 @@ KINDS = ("tracking", "modulus", "effort", "mode damping")
 class PlantData:
     """One plant on one grid with everything that does not depend on the controller; all arrays (F,).
 
-    delay = e^{-j omega (dt samples)}; w1, modulus, w3, w4 the weight magnitudes (w1 without the modulus margin);
-    gp_max the largest |Gp| of an independent performance channel where w4 > 0, or None if Gp = G.
+    delay = e^{-j omega (dt samples)}; w1, modulus, w3, w4 the weight magnitudes (w1 without the modulus
+    margin); gp_max the largest |Gp| of an independent performance channel where w4 > 0, or None if Gp = G.
     """
 
     plant: UncertainPlant
@@ -51,7 +51,7 @@ class PlantData:
             use = w4 > 0
             if np.any(use):
                 gp_max[use] = plant.performance.at(omega[use]).farthest()
-        total = specification.sensitivity_magnitude(omega, dt)
+        total = specification.sensitivity_magnitude(omega, dt, plant.n_integrators)
         return cls(
             plant=plant,
             ellipses=plant.at(omega),
@@ -64,7 +64,8 @@ class PlantData:
         )
 
     def weighted(self, k: Complex) -> dict[str, Real]:
-        """Worst case over the ellipses of each weighted closed-loop function for controller values k (F,) without delay.
+        """Worst case over the ellipses of each weighted closed-loop function for controller values k (F,)
+        without delay.
 
         Keys `KINDS` plus "distance" = dist(-1, K E); inf where a member of the ellipse puts the loop on -1.
         """
@@ -73,7 +74,8 @@ class PlantData:
         safe = np.maximum(distance, 1e-300)
         with np.errstate(over="ignore"):
             inverse = np.where(distance > 0, 1.0 / safe, np.inf)
-            # An infinite weight (integrator asked of the loop) at an infinite loop gain never occurs: the grid starts above 0.
+            # An infinite weight (integrator asked of the loop) at an infinite loop gain never occurs: the
+            # grid starts above 0.
             values = {
                 "tracking": _product(self.w1, inverse),
                 "modulus": _product(self.modulus, inverse),
@@ -104,7 +106,8 @@ def worst_of(values: dict[str, Real]) -> Real:
 
 @dataclass(frozen=True, eq=False)
 class WorstCase:
-    """Weighted worst cases on an adaptively refined grid: omega (F,), values as `PlantData.weighted`, k (F,)."""
+    """Weighted worst cases on an adaptively refined grid: omega (F,), values as `PlantData.weighted`, k
+    (F,)."""
 
     omega_rad_s: Real
     ellipses: Ellipses
@@ -129,8 +132,8 @@ def worst_case(
 ) -> WorstCase:
     """Evaluate on `start` (F,) and refine around the largest local maxima of every kind.
 
-    response: controller without delay. Each round puts `inserted` points between the neighbours of the `peaks` largest local maxima (ten
-    times finer); plants known on their own grid only are not refined.
+    response: controller without delay. Each round puts `inserted` points between the neighbours of the
+    `peaks` largest local maxima (ten times finer); plants known on their own grid only are not refined.
     """
     data = PlantData.build(plant, specification, start)
     omega = np.asarray(start, dtype=np.float64)
