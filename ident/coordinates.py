@@ -20,6 +20,9 @@ from ident.poles import Poles
 
 # A pair this close to critical damping is two real poles in disguise; its two columns become dependent.
 ZETA_LIMIT = 0.98
+# Without a bound of the user no pair is less damped: links have more, and an undamped pair with a free
+# initial state fits any slow disturbance.
+ZETA_LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +103,7 @@ def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: 
         return SearchSpace(
             n_real, n_pairs, np.array([0.0, -edge, 0.0]), np.array([edge, edge, edge]), True, dt_s
         )
-    low = [np.log10(0.2 / n), np.log10(4 * np.pi / n), -3.0]
+    low = [np.log10(0.2 / n), np.log10(4 * np.pi / n), np.log10(ZETA_LEAST)]
     high = [np.log10(0.7), np.log10(0.9 * np.pi), np.log10(0.63)]
     if options.decay_min_per_s is not None:
         low[0] = np.log10(-np.expm1(-options.decay_min_per_s * dt_s))

@@ -15,7 +15,7 @@ from ident.input_checks import advice, refuse_unusable
 from ident.least_squares import fit, linearisation
 from ident.model import GobfModel
 from ident.options import IdentOptions
-from ident.order_selection import OrderSelection, OrderStep, Progress
+from ident.order_selection import OrderSelection, OrderStep, Progress, effective_samples
 from ident.pole_search import PoleSearch
 from ident.poles import Poles
 from ident.polish import Bounds, Polished, free_optimality
@@ -194,10 +194,10 @@ def _searched(data: Regression, options: IdentOptions, report: Progress) -> _Out
 
 @dataclass(frozen=True)
 class _NuisanceTest:
-    """Likelihood ratio N ln(J without / J with) of a nuisance against its chi-square quantile.
+    """Likelihood ratio Ne ln(J without / J with) of a nuisance against its chi-square quantile.
 
-    One degree of freedom per column. Coloured residuals make the statistic larger, so the test errs on the
-    side of estimating the nuisance, which costs only variance.
+    One degree of freedom per column; Ne is the number of independent samples the residual is worth
+    (`effective_samples`), so that slow disturbances do not pass for initial states.
     """
 
     name: str
@@ -225,8 +225,10 @@ def _nuisance_test(
 ) -> _NuisanceTest:
     order = without[1].poles.order
     columns = with_it[0].n_parameters(order) - without[0].n_parameters(order)
-    ratio = max(without[1].rss, 1e-300) / max(with_it[1].rss, 1e-300)
-    return _NuisanceTest(name, columns, float(without[0].n_samples * np.log(ratio)))
+    data, end = with_it
+    worth = effective_samples(linearisation(data, end.poles).residual, data.starts)
+    ratio = max(without[1].rss, 1e-300) / max(end.rss, 1e-300)
+    return _NuisanceTest(name, columns, float(worth * np.log(ratio)))
 
 
 def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, report: Progress) -> _Outcome:
@@ -362,7 +364,9 @@ def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> li
             )
         elif zeta >= bounds.zeta_max / close or zeta <= bounds.zeta_min * close:
             sentences.append(
-                f"the pole pair at {omega:.4g} rad/s sits on your bound of zeta ({zeta:.4g}): widen it"
+                f"the pole pair at {omega:.4g} rad/s sits on its bound of zeta ({zeta:.4g}): it may "
+                "describe a "
+                "disturbance; fit one pair less, or widen zeta_min or zeta_max if you trust it"
             )
         elif -np.log(abs(pole)) <= bounds.s_min * close:
             sentences.append(

@@ -97,8 +97,12 @@ class IdentOptions(BaseModel):
         return self
 
     def fixed(self) -> Poles:
-        """The fixed poles as a record; ValueError if one is not inside the unit circle."""
-        real = [re for re, im in self.fixed_poles if im == 0]
+        """The fixed poles; ValueError if one is not inside the unit circle.
+
+        Each integrator brings a pole at z = 0: its filter z/(z - 1) puts a zero there, and only together
+        with a pole is the numerator as free as if the integrator were one of the poles.
+        """
+        real = [0.0] * self.integrators + [re for re, im in self.fixed_poles if im == 0]
         pairs = [complex(re, im) for re, im in self.fixed_poles if im != 0]
         return Poles(real, pairs)  # type: ignore[arg-type]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import RealArray
 from ident.basis import block_parameters
-from ident.coordinates import ZETA_LIMIT
+from ident.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.least_squares import Linearisation, linearisation
 from ident.options import IdentOptions
 from ident.poles import Poles
@@ -57,7 +57,7 @@ class Bounds:
             distance_max=distance(options.decay_max_per_s, 1.95),
             omega_min=angle(options.omega_min_rad_s, 0.1 / longest),
             omega_max=min(angle(options.omega_max_rad_s, 0.995 * np.pi), 0.995 * np.pi),
-            zeta_min=0.0 if options.zeta_min is None else options.zeta_min,
+            zeta_min=ZETA_LEAST if options.zeta_min is None else options.zeta_min,
             zeta_max=ZETA_LIMIT if options.zeta_max is None else options.zeta_max,
             s_min=still,
         )

@@ -25,8 +25,9 @@ def band_limited(
 
     A linear system between input and output stays what it is, so a fit of the filtered record is a fit
     weighted to the band. Meant for drift and friction below `low_rad_s` and noise above `high_rad_s`; None
-    leaves that side open. The filter starts with its steady state for the first sample. Fit with an unknown
-    initial state, because what was before the record (and before `skip_s`) is not in it.
+    leaves that side open. The filter starts with its steady state for the first sample; what the plant did
+    before the record (and before `skip_s`) is not in it, so that a lightly damped plant not at rest then
+    needs an unknown initial state in the fit.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Known truths for identification tests, built with scipy only: P1 and P2 of the benchmark description.
 
-SNR = 20 log10(standard deviation of the noise-free output / standard deviation of the white output noise); with that
-reading the Cramer-Rao bounds of P1 come out as the published 0.97 and 0.063.
+SNR = 20 log10(standard deviation of the noise-free output / standard deviation of the white output noise);
+with that reading the Cramer-Rao bounds of P1 come out as the published 0.97 and 0.063.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ class Truth:
     def response(self, omega_rad_s):
         A, B, C, D = self.system
         eye = np.eye(A.shape[0])
-        return np.array([(C @ np.linalg.solve(np.exp(1j * w * DT_S) * eye - A, B) + D)[0, 0] for w in omega_rad_s])
+        return np.array(
+            [(C @ np.linalg.solve(np.exp(1j * w * DT_S) * eye - A, B) + D)[0, 0] for w in omega_rad_s]
+        )
 
 
 def run(system, u):

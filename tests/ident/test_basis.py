@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.basis import (
@@ -21,13 +21,15 @@ from ident.poles import Poles
 
 real_poles = st.lists(st.floats(-0.95, 0.95), max_size=3)
 pair_poles = st.lists(
-    st.tuples(st.floats(0.05, 0.95), st.floats(0.01, np.pi - 0.01)).map(lambda v: v[0] * np.exp(1j * v[1])), max_size=3
+    st.tuples(st.floats(0.05, 0.95), st.floats(0.01, np.pi - 0.01)).map(lambda v: v[0] * np.exp(1j * v[1])),
+    max_size=3,
 )
 poles_inside = st.builds(Poles, real_poles, pair_poles).filter(lambda poles: poles.order > 0)
 MIXED = Poles([0.5, 0.9, -0.3], [0.8 * np.exp(0.4j), 0.95 * np.exp(2.0j)])
 CIRCLE = np.exp(2j * np.pi * np.arange(4096) / 4096)
 
 
+@settings(deadline=None)
 @given(poles_inside)
 def test_realisation_is_lossless(poles):
     A, B, C, D = basis_state_space(poles)
@@ -42,6 +44,7 @@ def test_realisation_is_lossless_next_to_the_circle(gamma):
     assert np.linalg.norm(A @ A.T + B @ B.T - np.eye(poles.order)) <= 1e-14
 
 
+@settings(deadline=None)
 @given(poles_inside)
 def test_basis_is_orthonormal_on_the_circle(poles):
     basis = basis_response(poles, CIRCLE)
@@ -49,6 +52,7 @@ def test_basis_is_orthonormal_on_the_circle(poles):
     np.testing.assert_allclose(basis.conj().T @ basis / CIRCLE.size, np.eye(poles.order), atol=1e-11)
 
 
+@settings(deadline=None)
 @given(poles_inside)
 def test_kernel_identity(poles):
     z1, z2 = np.array([1.3 * np.exp(0.2j), -1.1, 1.05j]), np.array([1.2, 1.5 * np.exp(1j), -1.01j])

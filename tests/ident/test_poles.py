@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.poles import Poles
 
 
+@settings(deadline=None)
 @given(
     omega=st.floats(0.01, 500),
     zeta=st.floats(1e-4, 0.97),
@@ -18,7 +19,9 @@ def test_continuous_and_discrete_poles_correspond(omega, zeta, decay, dt_s):
     poles = Poles.from_continuous(decay_per_s=[decay], omega_rad_s=[omega], zeta=[zeta], dt_s=dt_s)
     # |p| is stored to 1e-16 next to 1, so a decay of 1e-8 per sample is known to 1e-8 of itself.
     np.testing.assert_allclose(poles.omega_rad_s(dt_s), omega, rtol=1e-6)
-    np.testing.assert_allclose(poles.zeta() * poles.omega_rad_s(dt_s), zeta * omega, rtol=1e-6, atol=1e-15 / dt_s)
+    np.testing.assert_allclose(
+        poles.zeta() * poles.omega_rad_s(dt_s), zeta * omega, rtol=1e-6, atol=1e-15 / dt_s
+    )
     np.testing.assert_allclose(poles.decay_per_s(dt_s), decay, rtol=1e-6)
 
 

@@ -30,7 +30,7 @@ def read(path, **kwargs):
 
 
 def complaint(path, **kwargs):
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the message is what the test looks at
+    with pytest.raises(ValueError) as caught:
         read(path, **kwargs)
     message = str(caught.value)
     assert "\n" not in message
@@ -63,7 +63,9 @@ def test_other_separator(tmp_path):
 def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
     rng = np.random.default_rng(0)
     stamps = 5.0 + 1e-3 * np.arange(50) + rng.uniform(-5e-8, 5e-8, 50)
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *(f"{t:.9f},{k % 3},{k}" for k, t in enumerate(stamps))])
+    path = write(
+        tmp_path / "log.csv", [f"{T},{U},{Y}", *(f"{t:.9f},{k % 3},{k}" for k, t in enumerate(stamps))]
+    )
     # The mean interval of 49 steps with end stamps off by 5e-8 s at most: 2e-9 s.
     assert read(path).dt_s == pytest.approx(1e-3, abs=2.1e-9)
 
@@ -81,7 +83,8 @@ def test_dt_must_be_positive(good, dt_s):
 
 
 @pytest.mark.parametrize(
-    ("text", "shown"), [("nan", "'nan'"), ("inf", "'inf'"), ("-Infinity", "'-Infinity'"), ("", "empty"), ("o.k.", "'o.k.'")]
+    ("text", "shown"),
+    [("nan", "'nan'"), ("inf", "'inf'"), ("-Infinity", "'-Infinity'"), ("", "empty"), ("o.k.", "'o.k.'")],
 )
 def test_bad_numbers_are_named_with_line_and_column(tmp_path, text, shown):
     body = rows()
@@ -200,9 +203,9 @@ def test_bad_npz_content(tmp_path, change, message):
 
 
 def test_files_of_another_kind(tmp_path, good):
-    with pytest.raises(ValueError, match="not a numpy .npz archive"):
+    with pytest.raises(ValueError, match=r"not a numpy .npz archive"):
         Record.from_npz(good, [U], [Y], time=T)
-    with pytest.raises(ValueError, match="not a MATLAB .mat file"):
+    with pytest.raises(ValueError, match=r"not a MATLAB .mat file"):
         Record.from_mat(good, [U], [Y], time=T)
     np.save(tmp_path / "one.npy", np.arange(3.0))
     with pytest.raises(ValueError, match="without column names"):
@@ -245,7 +248,15 @@ def test_record_round_trip_through_arrays(tmp_path):
         again = Record.from_arrays(dict(stored))
     for key in ("input", "output", "reference"):
         np.testing.assert_array_equal(getattr(again, key), getattr(record, key))
-    for key in ("name", "dt_s", "input_names", "output_names", "reference_names", "input_units", "output_units"):
+    for key in (
+        "name",
+        "dt_s",
+        "input_names",
+        "output_names",
+        "reference_names",
+        "input_units",
+        "output_units",
+    ):
         assert getattr(again, key) == getattr(record, key)
 
 

@@ -1,0 +1,298 @@
+"""The whole identification on data whose truth is known, and on data it must refuse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from ident.identify import Identification, identify
+from ident.input_checks import clipped_share, excitation_limit_rad_s
+from ident.options import IdentOptions
+from ident.order_selection import effective_samples
+from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
+
+OMEGA = np.geomspace(0.1, 600, 400)
+MIDDLE = (OMEGA >= 1) & (OMEGA <= 100)
+
+
+def relative_error(truth, model, omega=OMEGA[MIDDLE]):
+    response = truth.response(omega)
+    return np.sqrt(np.mean(np.abs(model.frequency_response(omega) / response - 1) ** 2))
+
+
+@pytest.fixture(scope="module")
+def p2_fit():
+    truth = p2(0)
+    return truth, identify([truth.record])
+
+
+def test_p1_without_prior_knowledge():
+    """No numbers given: two slow real poles and the 15 rad/s mode are found, and the response is right.
+
+    Cramer-Rao bound of the RMS relative error over 1-100 rad/s with 8 unknowns: 0.063. Measured over 50
+    seeds: median 0.034, 90th percentile 0.076.
+    """
+    errors = []
+    for seed in range(3):
+        truth = p1(seed)
+        result = identify([truth.record])
+        poles = result.model.poles
+        assert (poles.real.size, poles.pairs.size) == (2, 1)
+        assert poles.omega_rad_s(0.005)[0] == pytest.approx(15, rel=0.01)
+        assert poles.zeta()[0] == pytest.approx(0.015, abs=0.003)
+        assert result.noise_std == pytest.approx(truth.noise_std, rel=0.1)  # 4 sd of sqrt(1/2N)
+        errors.append(relative_error(truth, result.model))
+    assert np.median(errors) < 0.06
+
+
+@pytest.mark.slow
+def test_p1_monte_carlo():
+    errors, validation = [], []
+    fresh = max_length_sequence(77, 1000)
+    for seed in range(20):
+        truth = p1(seed)
+        model = identify([truth.record], IdentOptions(n_real=2, n_pairs=1)).model
+        assert 7.5 < model.poles.omega_rad_s(0.005)[0] < 30
+        errors.append(relative_error(truth, model))
+        y = run(truth.system, fresh)
+        validation.append(np.linalg.norm(y - model.simulate(fresh)) / np.linalg.norm(y - y.mean()))
+    assert np.median(errors) <= 0.042
+    assert np.quantile(errors, 0.9) <= 0.09
+    assert np.median(validation) <= 0.006
+
+
+def test_p1_with_integrators_known():
+    truth = p1(0)
+    result = identify([truth.record], IdentOptions(integrators=2, n_real=0, n_pairs=1))
+    assert relative_error(truth, result.model) < 0.06
+    fresh = max_length_sequence(77, 1000)
+    y = run(truth.system, fresh)
+    assert np.linalg.norm(y - result.model.simulate(fresh)) < 0.01 * np.linalg.norm(y - y.mean())
+
+
+def test_p2_all_modes_are_found_without_being_told(p2_fit):
+    truth, result = p2_fit
+    poles = result.model.poles
+    order = np.argsort(poles.omega_rad_s(0.005))
+    np.testing.assert_allclose(poles.omega_rad_s(0.005)[order] / 2 / np.pi, P2_HZ, rtol=0.01)
+    np.testing.assert_allclose(poles.zeta()[order], P2_ZETA, atol=0.008)
+    np.testing.assert_allclose(np.sort(poles.decay_per_s(0.005)), [0.1, 25], rtol=0.1)
+    # sqrt(1/2N) = 1.6 %, four of them.
+    assert result.noise_std == pytest.approx(truth.noise_std, rel=0.065)
+    assert result.tangent_optimality < 1e-3
+    assert relative_error(truth, result.model, np.geomspace(0.3, 190, 100)) < 0.15
+
+
+def test_p2_order_table_shows_the_choice(p2_fit):
+    _, result = p2_fit
+    best = min(result.order_table, key=lambda step: step.criterion)
+    assert (best.n_real, best.n_pairs) == (2, 3)
+    assert any(step.order > best.order for step in result.order_table)
+    assert [step.order for step in result.order_table] == sorted(step.order for step in result.order_table)
+
+
+def test_p2_residuals_and_fit_belong_together(p2_fit):
+    truth, result = p2_fit
+    (residual,), y = result.residuals, truth.record.output[:, 0]
+    assert residual @ residual == pytest.approx(result.rss)
+    assert result.fit_percent[0] == pytest.approx(
+        100 * (1 - np.linalg.norm(residual) / np.linalg.norm(y - y.mean()))
+    )
+    assert not result.structure.estimate_initial_state
+    np.testing.assert_allclose(y - result.model.simulate(truth.record.input[:, 0]), residual, atol=1e-12)
+
+
+def test_identification_round_trip_through_npz(p2_fit, tmp_path):
+    _, result = p2_fit
+    np.savez(tmp_path / "fit.npz", **result.to_arrays())
+    with np.load(tmp_path / "fit.npz", allow_pickle=False) as stored:
+        again = Identification.from_arrays(dict(stored))
+    first, second = result.to_arrays(), again.to_arrays()
+    assert first.keys() == second.keys()
+    for key, value in first.items():
+        np.testing.assert_array_equal(second[key], value)
+    assert again.structure == result.structure
+    assert again.order_table == result.order_table
+
+
+def test_the_same_data_give_the_same_numbers():
+    truth = p1(4)
+    options = IdentOptions(n_real=2, n_pairs=1, algorithm="GN_DIRECT_L_RAND")
+    first, second = (identify([truth.record], options).to_arrays() for _ in range(2))
+    for key, value in first.items():
+        np.testing.assert_array_equal(second[key], value)
+
+
+def test_progress_is_reported():
+    seen = []
+    identify([p1(0).record], IdentOptions(n_real=2, n_pairs=1), progress=lambda f, m: seen.append((f, m)))
+    fractions = [fraction for fraction, _ in seen]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert all(isinstance(message, str) and message for _, message in seen)
+
+
+def test_unknown_initial_states_and_offsets_are_taken_care_of():
+    """The middle of a record starts from a state nobody knows, on an output with a bias."""
+    truth = p2(1, 3000)
+    pieces = [truth.record.slice(1000, 2000), truth.record.slice(2000, 3000)]
+    pieces = [
+        replace(piece, output=piece.output + bias) for piece, bias in zip(pieces, (2.0, -1.0), strict=True)
+    ]
+    result = identify(pieces, IdentOptions(n_real=2, n_pairs=3))
+    assert result.structure.estimate_initial_state
+    assert result.structure.estimate_offset
+    assert len(result.verdicts) == 2
+    # The mode at 2.5 Hz to its precision, and the noise level: nothing of the transients is left in the
+    # residual.
+    assert np.min(np.abs(result.model.poles.omega_rad_s(0.005) / 2 / np.pi - 2.5)) < 0.01
+    assert result.noise_std == pytest.approx(truth.noise_std, rel=0.065)
+
+
+def test_records_are_fitted_together():
+    """Two records halve the variance: the joint fit is nearer to the truth than the worse of the single
+    fits."""
+    options = IdentOptions(n_real=2, n_pairs=3)
+    truths = [p2(seed, 1000) for seed in (7, 8)]
+    omega = np.geomspace(1, 100, 60)
+    single = [relative_error(truth, identify([truth.record], options).model, omega) for truth in truths]
+    joint = relative_error(truths[0], identify([truth.record for truth in truths], options).model, omega)
+    assert joint < max(single)
+
+
+def test_long_records_are_searched_on_a_part_and_polished_on_all():
+    truth = p2(3, 6000)
+    whole = identify([truth.record], IdentOptions(n_real=2, n_pairs=3))
+    part = identify([truth.record], IdentOptions(n_real=2, n_pairs=3, search_samples=2000))
+    assert part.rss == pytest.approx(whole.rss, rel=1e-6)
+    assert part.residuals[0].size == 6000
+
+
+def test_noise_free_data_end_at_rounding_without_spurious_poles():
+    truth = p2(0)
+    clean = as_record(truth.record.input[:, 0], truth.clean)
+    result = identify([clean])
+    assert np.sqrt(result.rss) < 1e-6 * np.linalg.norm(truth.clean)
+    np.testing.assert_allclose(np.sort(result.model.poles.omega_rad_s(0.005)) / 2 / np.pi, P2_HZ, rtol=1e-4)
+
+
+def test_delay_and_feedthrough():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=800)
+    y = scipy.signal.lfilter([0, 0, 0, 0.5, 0.3], [1, -0.8], u) + 0.01 * rng.normal(size=800)
+    result = identify(
+        [as_record(u, y)], IdentOptions(n_real=1, n_pairs=0, input_delay_samples=3, feedthrough=True)
+    )
+    assert result.model.poles.real[0] == pytest.approx(0.8, abs=0.005)
+    assert result.model.feedthrough == pytest.approx(0.5, abs=0.002)
+    assert result.residuals[0].size == 797
+    np.testing.assert_allclose(result.model.simulate(u)[3:], y[3:], atol=0.06)
+
+
+def test_known_poles_stay_where_they_are():
+    truth = p1(0)
+    slow = 1 - 1e-6
+    result = identify(
+        [truth.record], IdentOptions(fixed_poles=((slow, 0.0), (slow, 0.0)), n_real=0, n_pairs=1)
+    )
+    np.testing.assert_array_equal(result.model.poles.real, [slow, slow])
+    assert result.model.poles.omega_rad_s(0.005)[0] == pytest.approx(15, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fixed_poles": ((1.2, 0.0),)}, "inside the unit circle"),
+        ({"fixed_poles": ((0.5, -0.1),)}, "positive imaginary part"),
+        ({"omega_min_rad_s": 5.0, "omega_max_rad_s": 4.0}, "omega_min_rad_s must be below"),
+        ({"coordinates": "raw", "zeta_min": 0.1}, "need coordinates = 'log'"),
+        ({"n_poles": 3}, "n_poles"),
+        ({"algorithm": "DIRECT"}, "algorithm"),
+        ({"n_real": -1}, "n_real"),
+    ],
+)
+def test_bad_options_are_refused_by_name(options, message):
+    with pytest.raises(ValueError, match=message):
+        IdentOptions(**options)
+
+
+def test_constant_signals_are_refused():
+    k = np.arange(100.0)
+    with pytest.raises(ValueError, match=r"record 'test': input column 'u' is constant \(2\)"):
+        identify([as_record(np.full(100, 2.0), k)])
+    with pytest.raises(ValueError, match="output column 'y' is constant"):
+        identify([as_record(k, np.full(100, 2.0))])
+
+
+def test_too_few_samples_for_the_order_are_refused():
+    rng = np.random.default_rng(0)
+    record = as_record(rng.normal(size=12), rng.normal(size=12))
+    with pytest.raises(
+        ValueError, match=r"record 'test': 12 samples are too few for order 8, which has 17 unknowns"
+    ):
+        identify([record], IdentOptions(n_real=2, n_pairs=3))
+
+
+def test_poles_at_a_bound_come_with_advice():
+    truth = p1(1)
+    result = identify([truth.record], IdentOptions(n_real=2, n_pairs=1, omega_min_rad_s=20.0))
+    assert any("bound of its frequency" in warning for warning in result.warnings)
+    result = identify([truth.record], IdentOptions(n_real=2, n_pairs=1, zeta_min=0.05))
+    assert any("bound of zeta" in warning for warning in result.warnings)
+
+
+def test_an_overdamped_pair_is_named():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=1000)
+    y = scipy.signal.lfilter([0, 1, 0.4], np.polymul([1, -0.95], [1, -0.6]), u) + 0.05 * rng.normal(size=1000)
+    result = identify([as_record(u, y)], IdentOptions(n_real=0, n_pairs=1))
+    assert any("overdamped" in warning and "two real poles" in warning for warning in result.warnings)
+
+
+def test_weak_excitation_is_named():
+    k = np.arange(4000) * 0.005
+    u = sum(np.sin(w * k + w) for w in (3.0, 7.0, 11.0, 17.0, 23.0))
+    assert 20 < excitation_limit_rad_s([as_record(u, u)]) < 60
+    rng = np.random.default_rng(0)
+    y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u) + 1e-3 * rng.normal(size=4000)
+    result = identify([as_record(u, y)], IdentOptions(n_real=1, n_pairs=0))
+    assert any("not exciting above" in warning for warning in result.warnings)
+    assert not any(
+        "not exciting" in w for w in identify([p1(0).record], IdentOptions(n_real=2, n_pairs=1)).warnings
+    )
+
+
+def test_clipped_samples_are_named():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=250), 4)
+    y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u)
+    limit = np.quantile(np.abs(y), 0.9)
+    result = identify([as_record(u, np.clip(y, -limit, limit))], IdentOptions(n_real=1, n_pairs=0))
+    (sentence,) = [warning for warning in result.warnings if "clipped" in warning]
+    assert "output 'y'" in sentence
+
+
+def test_what_is_no_clipping():
+    k = np.arange(5000)
+    assert clipped_share(np.sign(np.sin(k))) == 0  # binary by design
+    assert clipped_share(np.round(50 * np.sin(0.01 * k))) == 0  # a slow sine in a converter's steps
+    assert clipped_share(np.random.default_rng(0).normal(size=5000)) == 0
+    assert clipped_share(np.clip(np.sin(0.01 * k), -0.9, 2)) == pytest.approx(0.144, abs=0.01)
+
+
+def test_few_samples_per_unknown_come_with_advice():
+    result = identify([p2(0, 80).record], IdentOptions(n_real=2, n_pairs=1))
+    assert any("record longer" in warning for warning in result.warnings)
+
+
+def test_effective_samples_of_white_and_coloured_noise():
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=20_000)
+    starts = np.array([0, 10_000, 20_000])
+    assert effective_samples(white, starts) > 0.9 * 20_000
+    coloured = scipy.signal.lfilter([1], [1, -0.9], white)
+    # AR(1): 1 + 2 sum 0.81^k = (1 + 0.81)/(1 - 0.81) = 9.5.
+    assert effective_samples(coloured, starts) == pytest.approx(20_000 / 9.53, rel=0.15)

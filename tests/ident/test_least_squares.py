@@ -1,0 +1,234 @@
+"""Fits and their derivatives against dense linear algebra and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.linalg import lstsq, qr
+
+from ident.basis import block_parameters, free_response, regressor
+from ident.kernels import candidate_rss
+from ident.least_squares import driving_signal, fit, linearisation, project
+from ident.options import IdentOptions
+from ident.poles import Poles
+from ident.polish import Bounds, free_optimality, pole_system, polish
+from ident.regression import prepare, thinned
+from ident.structure import Structure
+from tests.ident.benchmark_plants import as_record, p2
+
+STRUCTURES = {
+    "plain": Structure(),
+    "offset": Structure(estimate_offset=True),
+    "initial state": Structure(estimate_initial_state=True),
+    "all": Structure(
+        integrators=2,
+        input_delay_samples=2,
+        feedthrough=True,
+        estimate_offset=True,
+        estimate_initial_state=True,
+    ),
+}
+POLES = Poles([0.7, 0.95], [0.9 * np.exp(0.5j)])
+
+
+def records():
+    """Two records of unequal length whose output has nothing to do with any model."""
+    rng = np.random.default_rng(0)
+    return [as_record(rng.normal(size=n), 1 + rng.normal(size=n)) for n in (150, 90)]
+
+
+def dense(data, poles):
+    """Every column of the regression, record by record, as one explicit matrix; shared columns last."""
+    structure, blocks = data.structure, []
+    for i in range(data.n_records):
+        here = data.segment(i)
+        n = here.stop - here.start
+        local = [np.linspace(-1, 1, n) ** k for k in range(structure.n_polynomials)]
+        if structure.estimate_initial_state:
+            local += list(free_response(poles, n).T)
+        for column in local:
+            whole = np.zeros(data.n_samples)
+            whole[here] = column
+            blocks.append(whole)
+    shared = [np.concatenate([regressor(poles, data.u[data.segment(i)]) for i in range(data.n_records)])]
+    if structure.feedthrough:
+        shared.append(data.u[:, None])
+    return np.column_stack([*blocks, *shared])
+
+
+def dense_residual(data, poles):
+    columns = dense(data, poles)
+    columns = columns / np.linalg.norm(columns, axis=0)
+    return data.y - columns @ lstsq(columns, data.y, rcond=1e-13)[0]
+
+
+@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
+def test_fit_is_the_dense_least_squares_fit(structure):
+    data = prepare(records(), structure)
+    expected = dense_residual(data, POLES)
+    linear = fit(data, POLES)
+    # Integrating twice makes columns of very different directions nearly parallel: 1e-9 instead of 1e-12.
+    np.testing.assert_allclose(linear.residual, expected, atol=1e-9)
+    columns = dense(data, POLES)
+    theta = lstsq(columns, data.y, rcond=None)[0]
+    n_shared = POLES.order + structure.feedthrough
+    found = [*linear.coefficients, linear.feedthrough] if structure.feedthrough else linear.coefficients
+    np.testing.assert_allclose(found, theta[-n_shared:], rtol=1e-6)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
+def test_compiled_cost_and_linearisation_agree_with_the_fit(structure):
+    data = prepare(records(), structure)
+    expected = dense_residual(data, POLES)
+    here = linearisation(data, POLES)
+    assert here.rss == pytest.approx(expected @ expected, rel=1e-9)
+    np.testing.assert_allclose(here.residual, expected, atol=1e-9)
+    frozen = project(data, Poles())
+    cost = candidate_rss(
+        block_parameters(POLES),
+        2,
+        data.u,
+        frozen.residual,
+        data.starts,
+        frozen.local_q,
+        frozen.shared_q,
+        structure.estimate_initial_state,
+    )
+    assert cost == pytest.approx(expected @ expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
+def test_cost_with_frozen_poles_is_the_cost_of_all(structure):
+    data = prepare(records(), structure)
+    kept, pair = Poles(POLES.real), Poles([], POLES.pairs)
+    frozen = project(data, kept)
+    cost = candidate_rss(
+        block_parameters(pair),
+        0,
+        driving_signal(data, kept),
+        frozen.residual,
+        data.starts,
+        frozen.local_q,
+        frozen.shared_q,
+        structure.estimate_initial_state,
+    )
+    expected = dense_residual(data, POLES)
+    assert cost == pytest.approx(expected @ expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
+def test_gradient_is_the_difference_quotient(structure):
+    """dJ/dp = -2 r^T s_p for 1 - a of the real poles and (s, f) of the pair."""
+    data = prepare(records(), structure)
+    _, slope = pole_system(linearisation(data, POLES), POLES)
+
+    def cost(x):
+        poles = Poles(1 - x[:2], [np.exp(-x[2] + 1j * x[3])])
+        residual = dense_residual(data, poles)
+        return residual @ residual
+
+    log = np.log(POLES.pairs[0])
+    x = np.array([*(1 - POLES.real), -log.real, log.imag])
+    for i in range(4):
+        step = np.zeros(4)
+        step[i] = 1e-5
+        quotient = (cost(x + step) - cost(x - step)) / 2e-5
+        # Truncation (1e-5)^2 times third derivatives, rounding 1e-12 J / 1e-5 with J about 240.
+        assert -2 * slope[i] == pytest.approx(quotient, rel=1e-5, abs=1e-3)
+
+
+def test_tangent_space_is_the_doubled_basis():
+    """span{Phi, d(Phi theta)/dx} = span Phi2: difference quotients of the fitted output lie in it, and fill
+    it."""
+    u = records()[0].input[:, 0]
+    theta = np.array([0.3, -0.5, 0.8, 0.4])
+    q2, _ = qr(regressor(POLES.doubled(), u))
+    columns = [regressor(POLES, u)]
+    for i in range(4):
+        step = np.zeros(4)
+        step[i] = 1e-6
+
+        def output(sign, step=step):
+            moved = Poles(POLES.real + sign * step[:2], POLES.pairs + sign * (step[2] + 1j * step[3]))
+            return regressor(moved, u) @ theta
+
+        columns.append((output(1) - output(-1))[:, None] / 2e-6)
+    together = np.column_stack(columns)
+    outside = together - q2 @ (q2.T @ together)
+    # The quotient is off by rounding 1e-16/1e-6 times the size of the output (about 20).
+    assert np.abs(outside).max() < 1e-8
+    assert np.linalg.matrix_rank(together, tol=1e-6) == 8
+
+
+def test_certificate_is_the_projection_on_the_doubled_basis():
+    """For records from rest the reported optimality is |Phi2^T r|/|r| with orthonormal Phi2."""
+    data = prepare(records(), Structure(estimate_offset=True))
+    here = linearisation(data, POLES)
+    doubled = project(data, POLES.doubled())
+    tangent = np.sqrt(here.rss - doubled.residual @ doubled.residual)
+    bounds = Bounds.from_options(IdentOptions(), 150, 0.005)
+    assert free_optimality(here, POLES, bounds) == pytest.approx(tangent / np.sqrt(here.rss), rel=1e-8)
+    assert tangent / np.sqrt(here.rss) > 0.05  # so that the comparison says something
+
+
+def test_polish_finds_the_poles_of_noise_free_data():
+    truth = Poles([0.7, 0.98], [0.95 * np.exp(0.4j)])
+    u = records()[0].input[:, 0]
+    data = prepare([as_record(u, regressor(truth, u) @ np.array([1.0, 0.5, -0.7, 0.3]))], Structure())
+    start = Poles([0.6, 0.97], [0.93 * np.exp(0.43j)])
+    end = polish(data, start, Bounds.from_options(IdentOptions(), u.size, 0.005), tolerance=1e-14)
+    np.testing.assert_allclose(np.sort(end.poles.real), truth.real, atol=1e-9)
+    np.testing.assert_allclose(end.poles.pairs, truth.pairs, atol=1e-9)
+
+
+def test_polish_leaves_fixed_poles_alone_and_keeps_bounds():
+    data = prepare([p2(0, 500).record], Structure())
+    options = IdentOptions(omega_min_rad_s=30.0, omega_max_rad_s=50.0, zeta_min=0.05)
+    start = Poles([0.9, 0.5], Poles.from_continuous(omega_rad_s=[35.0], zeta=[0.2], dt_s=0.005).pairs)
+    end = polish(data, start, Bounds.from_options(options, 500, 0.005), n_fixed_real=1)
+    assert end.poles.real[0] == 0.9
+    assert end.poles.real[1] != 0.5
+    assert 30 * (1 - 1e-9) <= end.poles.omega_rad_s(0.005)[0] <= 50 * (1 + 1e-9)
+    assert end.poles.zeta()[0] >= 0.05 * (1 - 1e-9)
+    assert end.rss < linearisation(data, start).rss
+
+
+def test_integrators_filter_the_input_exactly():
+    u = np.random.default_rng(1).normal(size=40)
+    structure = Structure(integrators=2, input_delay_samples=3)
+    expected = np.cumsum(np.cumsum(np.concatenate([np.zeros(3), u[:-3]])))
+    np.testing.assert_allclose(structure.filter_input(u), expected, atol=1e-12)
+    data = prepare([as_record(u, u)], structure)
+    np.testing.assert_allclose(data.u, expected[3:], atol=1e-12)
+    np.testing.assert_array_equal(data.y, u[3:])
+
+
+def test_records_must_fit_together():
+    a, b = records()
+    with pytest.raises(ValueError, match=r"dt_s = 0.01, but the first record has 0.005"):
+        prepare([a, replace(b, dt_s=0.01)], Structure())
+    with pytest.raises(ValueError, match="at least one record"):
+        prepare([], Structure())
+    with pytest.raises(ValueError, match="not more than the input delay"):
+        prepare([a], Structure(input_delay_samples=150))
+    wide = replace(a, input=np.ones((150, 2)), input_names=("a", "b"))
+    with pytest.raises(ValueError, match=r"choose with Record\.siso"):
+        prepare([wide], Structure())
+
+
+def test_thinning_keeps_whole_records_or_the_most_exciting_stretch():
+    a, b = records()
+    assert thinned([a, b], 1000) == ([a, b], False)
+    assert thinned([a, b, a, b], 250) == ([a, a], False)
+    quiet = np.concatenate([0.01 * a.input[:, 0], a.input[:, 0]])
+    (part,), in_mid_record = thinned([as_record(quiet, quiet)], 150)
+    assert in_mid_record
+    np.testing.assert_array_equal(part.input[:, 0], quiet[148:298])
+
+
+def test_too_few_samples_are_refused():
+    data = prepare([as_record(np.arange(8.0), np.arange(8.0))], Structure())
+    with pytest.raises(ValueError, match="too few samples: 8 for 8 unknowns with 4 poles"):
+        fit(data, POLES)
