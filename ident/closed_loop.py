@@ -1,4 +1,4 @@
-"""Logs taken in closed loop with a known reference: check of the feedback, two-stage and indirect identification."""
+"""Logs taken in closed loop with a known reference: feedback check, two-stage and indirect identification."""
 
 from __future__ import annotations
 
@@ -119,9 +119,9 @@ def two_stage(
     not touch. With shared = False each record gets its own sensitivity on common poles: the error of S_hat
     then differs between records and shows in their scatter, so `combine_posteriors` over the records accounts
     for it. With shared = True one sensitivity serves all, which is more accurate, but its error
-    (`relative_error`) is common and in no bound of the second stage: where the loop gain is large those bounds do
-    not cover. With a single record and a known feedback use `indirect`, whose bounds do. Raises ValueError when
-    a record has not exactly one reference and input.
+    (`relative_error`) is common and in no bound of the second stage: where the loop gain is large those
+    bounds do not cover. With a single record and a known feedback use `indirect`, whose bounds do. Raises
+    ValueError when a record has not exactly one reference and input.
     """
     plant_options = options or IdentOptions()
     stage = plant_options.model_copy(
@@ -140,8 +140,8 @@ def two_stage(
         fits.append(100 * (1 - float(np.linalg.norm(u - u_hat)) / spread))
         opened.append(replace(record, input=u_hat[:, None], reference=None, reference_names=()))
     verdict = (
-        f"The reference explains {min(fits):.1f} to {max(fits):.1f} % of the input: the rest is noise and distortion "
-        "that the loop fed back, and no longer drives the estimate."
+        f"The reference explains {min(fits):.1f} to {max(fits):.1f} % of the input: the rest is noise and "
+        "distortion that the loop fed back, and no longer drives the estimate."
     )
     return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits), first, verdict)
 

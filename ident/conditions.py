@@ -22,7 +22,7 @@ from ident.record import Record
 
 
 def mean_record(records: Sequence[Record], name: str) -> Record:
-    """Average of records repeated with the same reference: the same linear system, less noise, fewer samples to fit.
+    """Average of records repeated with the same reference: the same linear system, less noise, fewer samples.
 
     Raises ValueError when lengths, sampling times or channels differ.
     """
@@ -50,7 +50,7 @@ def mean_record(records: Sequence[Record], name: str) -> Record:
 def record_posteriors(
     records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[ResponsePosterior]:
-    """`tangent` for every record alone, all with the model's poles and one fir_length, so that they can be combined."""
+    """`tangent` for every record alone, all with the model's poles and one fir_length, fit to be combined."""
     options = options or EmbeddingOptions()
     length = min(common_fir_length([record], model.poles.doubled(), options) for record in records)
     shared = options.model_copy(update={"fir_length": length})

@@ -28,7 +28,8 @@ class Ellipses:
     def __post_init__(self) -> None:
         if not (self.semi_major.shape == self.semi_minor.shape == self.direction.shape):
             raise ValueError(
-                f"need three (F,) arrays; got {self.semi_major.shape}, {self.semi_minor.shape}, {self.direction.shape}"
+                f"need three (F,) arrays; got {self.semi_major.shape}, {self.semi_minor.shape}, "
+                f"{self.direction.shape}"
             )
         if not np.all((self.semi_major >= self.semi_minor) & (self.semi_minor >= 0)):
             raise ValueError("need semi_major >= semi_minor >= 0 at every frequency")
@@ -50,7 +51,7 @@ def chi2_radius(level: float) -> float:
 
 
 def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexArray]:
-    """Standard deviations along the principal axes of (F,2,2) covariances, major first, and the major direction.
+    """Standard deviations along the principal axes of (F,2,2) covariances, major first, and its direction.
 
     The larger eigenvalue is a sum of positive terms; the smaller one is det / larger, so that it never comes
     out as a difference of nearly equal eigenvalues; what rounding leaves below zero is set to zero.
@@ -70,7 +71,7 @@ def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexA
 
 
 def relative_deficit(covariance: RealArray) -> RealArray:
-    """-(smallest eigenvalue) / trace of (F,2,2) symmetric matrices; positive where a matrix is not a covariance."""
+    """-(smallest eigenvalue) / largest entry of symmetric (F,2,2); positive where it is not a covariance."""
     trace = covariance[:, 0, 0] + covariance[:, 1, 1]
     k = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
     smallest = 0.5 * trace - np.hypot(0.5 * (covariance[:, 0, 0] - covariance[:, 1, 1]), k)

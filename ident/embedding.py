@@ -104,7 +104,7 @@ def classical(
 
 
 def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
-    """Taps of the kernel: as given, else 150 or a third of the rows the regressors (of these poles) leave over."""
+    """Taps of the kernel: as given, else 150 or a third of the rows that the regressors leave over."""
     if options.fir_length is not None:
         return options.fir_length
     spare = sum(record.n_samples for record in records) - (len(records) + 1) * (poles.order + 2)
@@ -113,7 +113,7 @@ def common_fir_length(records: Sequence[Record], poles: Poles, options: Embeddin
 
 @dataclass(frozen=True, eq=False)
 class _Regression:
-    """How to make the unwhitened matrices; made anew for each pass, so that only one record's are in memory."""
+    """How to make the unwhitened matrices; made anew for each pass: only one record's are in memory."""
 
     records: tuple[Record, ...]
     model: GobfModel
@@ -210,7 +210,7 @@ def _block(
 
 
 def _whitened(block: RegressionBlock, whitening: RealArray) -> RegressionBlock:
-    """Every column filtered by A(q), first rows dropped: exact for any state of the noise before the record."""
+    """Every column filtered by A(q), first rows dropped: exact for any noise before the record."""
     skip = whitening.size - 1
     if skip == 0:
         return block

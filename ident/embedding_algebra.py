@@ -1,4 +1,4 @@
-"""Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of kernel coefficients.
+"""Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of the kernel.
 
 Model y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), v ~ N(0, s2 I)
 (Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Ct = alpha B B^T, and
@@ -38,10 +38,11 @@ class RegressionBlock:
 class ReducedRegression:
     """[F Psi y] after projecting the nuisance out and QR: the sufficient statistics.
 
-    r11 (p,p) upper triangular in units of the original columns, r12 (p,L), r1 (p,), r22 (L,L), z (L,),
-    rest = squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank. kept (p,) are the
-    columns of F that stayed, of n_columns: one that these records cannot tell from the others (a pole nearly four
-    times in the doubled set) is left out, its coefficient zero, and changes the response at no excited frequency.
+    r11 (p,p) upper triangular in units of the original columns, r12 (p,L), r1 (p,), r22 (L,L), z (L,), rest =
+    squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank. kept (p,) are the
+    columns of F that stayed, of n_columns: one that these records cannot tell from the others (a pole nearly
+    four times in the doubled set) is left out, its coefficient zero, and changes the response at no excited
+    frequency.
     """
 
     r11: RealArray
@@ -70,11 +71,12 @@ class ReducedRegression:
 
 @dataclass(frozen=True, eq=False)
 class KernelPosterior:
-    """Gaussian for (theta, eta): theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w), eta = mean + factor w'.
+    """Gaussian of theta and eta.
 
-    w, w' standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the
-    classical recipe) mean 0 and the prior factor. alpha and lam are those of largest weight;
-    probability_no_remainder the weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
+    eta = kernel_mean + kernel_factor w', theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w); w, w'
+    standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the classical
+    recipe) mean 0 and the prior factor. alpha and lam are those of largest weight; probability_no_remainder
+    the weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
     """
 
     kernel_mean: RealArray
@@ -100,14 +102,14 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
 
 
 def without_nuisance(columns: RealArray, basis: RealArray) -> RealArray:
-    """Columns minus their projection on an orthonormal basis, applied twice so that rounding is removed too."""
+    """Columns minus their projection on an orthonormal basis, twice, so that rounding is removed too."""
     for _ in range(2):
         columns = columns - basis @ (basis.T @ columns)
     return np.asarray(columns, dtype=np.float64)
 
 
 def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
-    """One QR for all records: each block's nuisance is projected out, its triangle stacked under the previous.
+    """One QR for all records: each block, its nuisance projected out, is stacked under the last triangle.
 
     Cost O(N (p + L)^2), memory that of the largest block. Raises ValueError when rows do not exceed p + L or
     the input does not excite a regressor.
@@ -191,7 +193,7 @@ def kernel_spectrum(reduced: ReducedRegression, lam: float, factor: RealArray) -
 def restricted_log_likelihood(
     reduced: ReducedRegression, spectrum: KernelSpectrum, alpha: RealArray
 ) -> tuple[RealArray, RealArray]:
-    """log L (up to a constant shared by all kernels) and s2, both (A,), for alphas (A,) with C = s2 alpha B B^T.
+    """log L (up to a constant shared by all kernels) and s2, both (A,), for alpha (A,), C = s2 alpha B B^T.
 
     -2 log L = nu log s2 + log det M + nu, M = I + R22 Ct R22^T, s2 = (S + z^T M^-1 z) / nu.
     """
@@ -286,7 +288,7 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
 
 
 def prior_posterior(grid: KernelGrid) -> KernelPosterior:
-    """The classical recipe: alpha, lam of largest restricted likelihood, eta left at its prior (unconditional)."""
+    """The classical recipe: alpha, lam of largest restricted likelihood, eta left at its prior."""
     best = np.unravel_index(int(np.argmax(grid.log_likelihood)), grid.log_likelihood.shape)
     spectrum = grid.spectra[best[0]]
     s2, alpha = float(grid.noise_variance[best]), float(grid.alpha[best])
@@ -316,7 +318,10 @@ def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tupl
     mean = np.zeros(reduced.n_columns + length)
     factor = np.zeros((mean.size, p + posterior.kernel_factor.shape[1]))
     mean[reduced.kept], factor[reduced.kept] = solved[:, 0], solved[:, 1:]
-    mean[reduced.n_columns :], factor[reduced.n_columns :, p:] = posterior.kernel_mean, posterior.kernel_factor
+    mean[reduced.n_columns :], factor[reduced.n_columns :, p:] = (
+        posterior.kernel_mean,
+        posterior.kernel_factor,
+    )
     return mean, factor
 
 

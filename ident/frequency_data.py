@@ -17,7 +17,7 @@ _CROSS = "covariance_real_imag"
 
 
 def read_frequency_table(path: Path) -> tuple[RealArray, ComplexArray, RealArray]:
-    """omega (F,), response (F,), covariance (F,2,2) from the CSV columns of `FrequencyUncertainty.from_csv`."""
+    """omega (F,), response (F,), covariance (F,2,2) from the columns of `FrequencyUncertainty.from_csv`."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -73,7 +73,7 @@ def mean_of_repeats(
     pool_neighbours: int = 0,
     outlier_threshold: float | None = None,
 ) -> tuple[RealArray, ComplexArray, RealArray]:
-    """Frequencies (F,), means (F,) and widened covariances of the mean (F,2,2) of points grouped by frequency.
+    """Frequencies (F,), means (F,), widened covariances of the mean (F,2,2) of points grouped by frequency.
 
     Contract as `FrequencyUncertainty.from_frf_repeats`.
     """
@@ -104,8 +104,8 @@ def mean_of_repeats(
     if np.any(short):
         at = int(np.argmax(short))
         raise ValueError(
-            f"at omega = {grid[at]:.6g} rad/s there are {count[at]} repeats: a 2x2 covariance needs at least 3 "
-            "(or pool_neighbours > 0)"
+            f"at omega = {grid[at]:.6g} rad/s there are {count[at]} repeats: a 2x2 covariance needs "
+            "at least 3 (or pool_neighbours > 0)"
         )
     # Hotelling: n (mean - G)^T S^-1 (mean - G) ~ 2 f / (f - 1) F(2, f - 1) with f degrees of freedom in S.
     hotelling = 2 * freedom / (freedom - 1) * f_distribution.ppf(level, 2, freedom - 1)

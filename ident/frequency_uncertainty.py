@@ -1,4 +1,4 @@
-"""A frequency response with a 2x2 covariance at every frequency: what identification hands to control design."""
+"""A frequency response with a 2x2 covariance at every frequency: what identification hands to control."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class FrequencyUncertainty:
             object.__setattr__(self, name, array)
 
     def ellipse(self, level: float | None = None) -> Ellipses:
-        """Axes of the ellipses that hold the response with probability `level` (default: this record's own)."""
+        """Axes of the ellipses that hold the response with probability `level` (default: the record's)."""
         s1, s2, u1 = standard_axes(self.covariance)
         radius = chi2_radius(self.level if level is None else level)
         return Ellipses(semi_major=radius * s1, semi_minor=radius * s2, direction=u1)
@@ -118,7 +118,7 @@ class FrequencyUncertainty:
         return replace(self, level=level)
 
     def to_control(self) -> control.FrequencyResponseData:
-        """The centre as python-control frequency response data with this dt (the covariance has no place there)."""
+        """The centre as python-control frequency response data (covariances have no place there)."""
         return control.FrequencyResponseData(self.centre, self.omega_rad_s, dt=self.dt_s)
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:

@@ -50,7 +50,7 @@ class EmbeddingReport:
 
 @dataclass(frozen=True, eq=False)
 class ResponsePosterior:
-    """G(z) = [sum_i a_i L_i(z) + d + sum_k h_k z^-k] (z / (z - 1))^integrators z^-delay with Gaussian coefficients.
+    """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
 
     poles are those of the basis functions L_i (the doubled ones for the tangent method); has_feedthrough says
     whether d is among the coefficients; fir_length = L. mean (P,) and covariance_factor S (P,P') with
@@ -155,7 +155,7 @@ class ResponsePosterior:
     def joint_level(
         self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
     ) -> float:
-        """Per-frequency level whose ellipses hold the whole response over omega (F,) with probability `level`.
+        """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`.
 
         The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses,
         as a per-frequency level; the sampling error of the joint probability is sqrt(level (1 - level) /

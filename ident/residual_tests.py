@@ -1,4 +1,4 @@
-"""Is anything left in the residuals? Whiteness and independence from the input, with 99 % bands and a sentence."""
+"""Is anything left in the residuals? Whiteness and independence from the input, with bands and a sentence."""
 
 from __future__ import annotations
 
@@ -73,8 +73,9 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
         )
     else:
         verdict = (
-            f"The residuals are not white (p = {probability:.2g}, largest correlation {correlation[largest]:+.2f} at "
-            f"lag {lags[largest]}): bounds that assume white noise are too narrow; use coloured_noise."
+            f"The residuals are not white (p = {probability:.2g}, largest correlation "
+            f"{correlation[largest]:+.2f} at lag {lags[largest]}): bounds that assume white "
+            "noise are too narrow; use coloured_noise."
         )
     return ResidualTest(
         "whiteness", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
@@ -117,7 +118,8 @@ def independence_test(
     else:
         verdict = (
             f"The residuals depend on the input {worst} samples before (correlation "
-            f"{correlation[max_lag + worst]:+.2f}, p = {probability:.2g}): the model lacks dynamics or delay there."
+            f"{correlation[max_lag + worst]:+.2f}, p = {probability:.2g}): the model lacks dynamics or delay "
+            "there."
         )
     before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
     if before > deviation * norm.ppf(1 - (1 - level) / (2 * max(max_lag, 1))):

@@ -1,4 +1,4 @@
-"""Does the model hold on other data? Fit on fresh records, invalidation by a measured response, repeat scatter."""
+"""Does the model hold on other data? Fit on fresh records, invalidation by a response, repeat scatter."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) 
 
 @dataclass(frozen=True)
 class ScatterRow:
-    """One band of `repeat_scatter`; all radii are RMS over the band, at one standard deviation, relative to |G|.
+    """One band of `repeat_scatter`; radii are RMS over the band, at one standard deviation, relative to |G|.
 
     predicted: of one repeat's own covariance; measured: scatter of the repeats around their mean, unbiased;
     ratio = measured / predicted, about 1 if the bounds are honest about noise. between: distance of the

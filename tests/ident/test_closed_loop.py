@@ -1,4 +1,4 @@
-"""Closed-loop logs: feedback check, bias of the direct method and its absence in the two-stage one, indirect map."""
+"""Closed-loop logs: feedback check, bias of the direct method, two-stage and indirect without it."""
 
 from __future__ import annotations
 

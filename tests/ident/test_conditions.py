@@ -1,4 +1,4 @@
-"""Scatter between conditions: coverage of the next condition, agreement of coefficient and frequency forms."""
+"""Scatter between conditions: coverage of the next one, agreement of coefficient and frequency forms."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from .three_mode_arm import BANDS, DT, OMEGA, per_band, random_arm
 
 
 def slightly_wrong_model(arm, rng, size):
-    """True poles moved by `size` of their distance from the circle: what a fit would give, without the fit."""
+    """True poles moved by `size` of their distance from the circle: what a fit might give."""
     rates = -np.log(np.abs(arm.poles)) * np.exp(size * rng.standard_normal(5))
     angles = np.angle(arm.poles) + size * rates * rng.standard_normal(5) * (np.imag(arm.poles) > 0)
     moved = np.exp(-rates + 1j * angles)
@@ -37,8 +37,8 @@ def coverage(estimator, runs, options=None, noise_pole=0.0):
 
 def test_tangent_covers_and_classical_does_not():
     tangent_hits, classical_hits = coverage(tangent, 16), coverage(classical, 16)
-    # Whole responses are strongly correlated over frequency, so 16 runs decide coverage to a few per cent only:
-    # 98 and 75 % were measured. The Monte Carlo below is the tight test.
+    # Whole responses are strongly correlated over frequency, so 16 runs decide coverage to a few per cent
+    # only: 98 and 75 % were measured. The Monte Carlo below is the tight test.
     assert tangent_hits.mean() > 0.9
     assert classical_hits.mean() < 0.85
     # What the classical recipe misses is where the data are best: the first band and the modes.
@@ -167,8 +167,8 @@ def test_bad_input_is_refused():
         tangent([arm.record], GobfModel(model.poles, np.zeros(8), 2 * DT))
     with pytest.raises(ValueError, match="do not determine"):
         tangent([arm.record], model, EmbeddingOptions(fir_length=400))
+    wide = Record("w", np.zeros((50, 2)), np.zeros((50, 1)), DT, ("a", "b"), ("y",))
     with pytest.raises(ValueError, match="one input"):
-        wide = Record("w", np.zeros((50, 2)), np.zeros((50, 1)), DT, ("a", "b"), ("y",))
         tangent([wide], model)
     short = tangent([arm.record], model)
     assert 0 < short.fir_length < 150

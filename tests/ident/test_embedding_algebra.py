@@ -80,7 +80,9 @@ def test_reduced_posterior_and_likelihood_equal_the_dense_ones(shape):
     kept = slice(nuisance.shape[1], None)
     scale = np.sqrt(np.diag(dense_cov)[kept])
     np.testing.assert_allclose((mean - dense_mean[kept]) / scale, 0, atol=1e-9)
-    np.testing.assert_allclose((factor @ factor.T - dense_cov[kept, kept]) / np.outer(scale, scale), 0, atol=1e-9)
+    np.testing.assert_allclose(
+        (factor @ factor.T - dense_cov[kept, kept]) / np.outer(scale, scale), 0, atol=1e-9
+    )
 
     # Restricted likelihood = likelihood of contrasts orthogonal to all flat columns, maximal over s2.
     orthogonal = np.linalg.svd(flat)[0][:, flat.shape[1] :]
@@ -147,7 +149,9 @@ def test_all_weight_on_no_remainder_is_ordinary_least_squares():
 def test_classical_posterior_keeps_the_prior_of_the_kernel():
     reduced = reduce_regression(problem(5))
     grid = evaluate_grid(
-        reduced, [kernel_spectrum(reduced, lam, exponential_factor(lam, L)) for lam in (0.6, 0.9)], np.geomspace(0.01, 100, 9)
+        reduced,
+        [kernel_spectrum(reduced, lam, exponential_factor(lam, L)) for lam in (0.6, 0.9)],
+        np.geomspace(0.01, 100, 9),
     )
     prior = prior_posterior(grid)
     expected = prior.noise_variance * prior.alpha * prior.lam ** np.arange(1, L + 1)

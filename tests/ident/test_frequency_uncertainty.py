@@ -79,7 +79,9 @@ def test_ellipse_holds_the_fraction_it_promises():
 
 
 def test_boundary_points_lie_at_distance_one():
-    record = FrequencyUncertainty(OMEGA, np.ones(3), np.stack([covariance_of(1, r, 0.3) for r in (1, 0.1, 1e-3)]), DT)
+    record = FrequencyUncertainty(
+        OMEGA, np.ones(3), np.stack([covariance_of(1, r, 0.3) for r in (1, 0.1, 1e-3)]), DT
+    )
     for column in record.ellipse().boundary(16).T:
         np.testing.assert_allclose(record.normalised_distance(record.centre + column), 1.0, rtol=1e-8)
 
@@ -96,7 +98,9 @@ def test_offset_disc_radius_against_the_noncentral_chi_square_and_against_sampli
         draws = rng.multivariate_normal([m.real, m.imag], covariance, size=200_000)
         rho = offset_disc_radius(np.array([m]), covariance[None], 0.9)[0]
         assert np.mean(np.hypot(*draws.T) <= rho) == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 200_000))
-    assert offset_disc_radius(np.array([3 - 4j]), np.zeros((1, 2, 2)), 0.95)[0] == pytest.approx(5.0, rel=1e-6)
+    assert offset_disc_radius(np.array([3 - 4j]), np.zeros((1, 2, 2)), 0.95)[0] == pytest.approx(
+        5.0, rel=1e-6
+    )
     with pytest.raises(ValueError, match="level"):
         offset_disc_radius(np.array([1j]), np.zeros((1, 2, 2)), 1.0)
 
@@ -139,7 +143,10 @@ def test_to_control_and_round_trip(tmp_path):
         ({"omega_rad_s": [-1.0, 2.0, 4.0]}, "negative"),
         ({"omega_rad_s": [1.0, np.nan, 4.0]}, "not finite"),
         ({"centre": [1.0, np.inf, 1.0]}, r"centre is not finite.*omega = 2"),
-        ({"covariance": [np.eye(2), np.diag([1.0, -1.0]), np.eye(2)]}, r"not positive semidefinite.*omega = 2"),
+        (
+            {"covariance": [np.eye(2), np.diag([1.0, -1.0]), np.eye(2)]},
+            r"not positive semidefinite.*omega = 2",
+        ),
         ({"covariance": [np.eye(2), [[1, 2], [2, 1]], np.eye(2)]}, "not positive semidefinite"),
         ({"covariance": [np.eye(2), [[1, 0.2], [0, 1]], np.eye(2)]}, "not symmetric"),
         ({"covariance": [np.eye(2)]}, "need omega"),

@@ -37,7 +37,9 @@ def random_arm(rng, n_samples=2000, snr_db=35.0, noise_pole=0.0):
     A, B, C, D, _ = signal.cont2discrete(signal.tf2ss(b * numerator, np.polymul(denominator, [1.0, b])), DT)
     u = np.repeat(rng.choice([-1.0, 1.0], n_samples // 2 + 2), 2)[rng.integers(0, 2) :][:n_samples]
     y = signal.dlsim((A, B, C, D, DT), u[:, None])[1][:, 0]
-    noise = signal.lfilter([np.sqrt(1 - noise_pole**2)], [1, -noise_pole], rng.standard_normal(n_samples + 200))
+    noise = signal.lfilter(
+        [np.sqrt(1 - noise_pole**2)], [1, -noise_pole], rng.standard_normal(n_samples + 200)
+    )
     y = y + np.sqrt(np.mean(y**2)) * 10 ** (-snr_db / 20) * noise[200:]
     points = np.exp(1j * OMEGA * DT)
     eye = np.eye(A.shape[0])
