@@ -1,0 +1,65 @@
+"""Cascades against scipy's bilinear transform and python-control; the symbolic programme against numpy."""
+
+from __future__ import annotations
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+from scipy.signal import bilinear
+
+from control_design.angle_program import AngleProgram, Rows
+from control_design.biquads import Cascade
+from control_design.ellipses import Ellipses
+
+_SECTIONS = [
+    ("second_order",),
+    ("first_order", "second_order"),
+    ("integrator", "first_order", "second_order"),
+    ("integrator", "first_order", "notch", "notch"),
+]
+
+
+@pytest.mark.parametrize("sections", _SECTIONS)
+def test_cascade_is_the_bilinear_transform_of_its_sections(sections):
+    rng = np.random.default_rng(5)
+    dt, scale = 0.01, 7.0
+    cascade = Cascade(sections, dt, scale)
+    x = rng.standard_normal(cascade.parameters)
+    z = np.exp(1j * np.array([0.05, 1.0, 30.0, 200.0]) * dt)
+    expected = np.ones(z.size, complex)
+    for numerator, denominator in cascade.split(x):
+        powers = scale ** -np.arange(denominator.size - 1, -1.0, -1)
+        b, a = bilinear(numerator * powers, denominator * powers, fs=1 / dt)
+        expected = expected * np.polyval(b, z) / np.polyval(a, z)
+    omega = np.angle(z) / dt
+    np.testing.assert_allclose(cascade.response(x, omega), expected, rtol=1e-8)
+    system = cascade.to_control(x)
+    assert system.nstates == cascade.order
+    np.testing.assert_allclose(control.evalfr(system, z[1]), expected[1], rtol=1e-8)
+    radius = np.abs(system.poles())
+    assert np.all(radius <= 1) and np.sum(radius == 1) == sections.count("integrator")
+
+
+def test_response_at_nyquist_is_the_limit():
+    cascade = Cascade(("first_order", "second_order"), 0.005, 10.0)
+    x = np.random.default_rng(6).standard_normal(cascade.parameters)
+    a, b, c, d = cascade.state_space(x)
+    at_minus_one = (c @ np.linalg.solve(-np.eye(3) - a, b) + d).item()
+    np.testing.assert_allclose(cascade.response(x, np.array([np.pi / 0.005])), at_minus_one, rtol=1e-9)
+
+
+@pytest.mark.parametrize("sections", _SECTIONS)
+def test_symbolic_and_numeric_response_agree(sections):
+    cascade = Cascade(sections, 0.01, 7.0)
+    omega = np.array([1e-4, 0.3, 6.0, 8.0, 250.0, np.pi / 0.01])
+    zero = np.zeros(omega.size)
+    ellipses = Ellipses(omega, zero + 0j, zero, zero, zero + 1 + 0j)
+    rows = Rows(ellipses, zero + 1 + 0j, zero + 0.5, zero, zero, None, zero + 1, (-1.4, 1.4), True)
+    program = AngleProgram(cascade, [rows])
+    x = ca.SX.sym("x", cascade.parameters)
+    value = np.random.default_rng(7).standard_normal(cascade.parameters)
+    real, imag = ca.Function("k", [x], list(program._response(x, omega)))(value)
+    got = np.asarray(real).ravel() + 1j * np.asarray(imag).ravel()
+    # The clip of p at Nyquist (1e12) leaves 1e-12 of the next power.
+    np.testing.assert_allclose(got, cascade.response(value, omega), rtol=1e-9)

@@ -1,0 +1,113 @@
+"""Weights by hand, and contradictions refused in one line with their numbers."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from control_design import RationalWeight, Specification, SpecificationError, UncertainPlant
+from control_design.example_plants import flexible_link
+
+from .plants import hub_arm, tip_acceleration
+
+
+def test_bandwidth_means_minus_three_decibels():
+    for integrator in (False, True):
+        spec = Specification(bandwidth_rad_s=3.0, modulus_margin=0.5, integrator=integrator)
+        # At s = j bandwidth the weight is sqrt 2 up to the tiny low-frequency floor.
+        value = abs(spec.tracking_at(np.array([3j]))[0])
+        assert value == pytest.approx(np.sqrt(2), rel=1e-5)
+        high = spec.sensitivity_magnitude(np.array([500.0]), 0.001)
+        assert high[0] == pytest.approx(0.5, rel=1e-3)
+    low = abs(Specification(bandwidth_rad_s=3.0).tracking_at(np.array([1e-9j]))[0])
+    assert low == pytest.approx(1000, rel=1e-6)
+
+
+def test_effort_limit_and_rolloff():
+    spec = Specification(effort_limit=4.0, effort_rolloff_rad_s=10.0)
+    limit = 1 / spec.effort_magnitude(np.array([0.01, 10.0, 100.0]), 1e-5)
+    np.testing.assert_allclose(limit, [4, 4 / np.sqrt(2), 4 / np.sqrt(101)], rtol=0.05)
+    assert np.all(Specification().effort_magnitude(np.array([1.0]), 0.01) == 0)
+
+
+def test_damping_weight_is_relative_to_the_open_loop_peak():
+    plant = UncertainPlant("arm", hub_arm())
+    spec = Specification(mode_peak_ratio=0.25)
+    weight = spec.damping_magnitude(np.array([5.0, 16.0, 100.0]), plant)
+    omega = np.linspace(16 / 1.5, 24, 400_001)
+    peak = np.max(np.abs(control.frequency_response(hub_arm(), omega).complex))
+    np.testing.assert_allclose(weight, [0, 4 / peak, 0], rtol=1e-3)  # peak found on 121 points of the mode
+
+
+def test_bandwidth_beyond_the_right_half_plane_zero_says_by_how_much():
+    plant = flexible_link("A")
+    Specification(bandwidth_rad_s=3.0, modulus_margin=0.5).check_against([plant])
+    spec = Specification(bandwidth_rad_s=12.0, modulus_margin=0.5)
+    with pytest.raises(SpecificationError, match=r"non-minimum-phase zero at 10.8.* = 12, at most 4.08"):
+        spec.check_against([plant])
+    # By hand: (m z + wb)/(z + wb r) = 1 at z = 10.8 gives wb = z (1 - m)/(1 - r), bandwidth = wb/sqrt(2 - m^2).
+    by_hand = 10.8 * 0.5 / 0.999 / np.sqrt(1.75)
+    assert by_hand == pytest.approx(4.08, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"bandwidth_rad_s": 700.0}, "beyond the Nyquist frequency"),
+        ({"bandwidth_rad_s": 400.0}, "sampling delay"),
+        ({"bandwidth_rad_s": 3.0, "effort_limit": 0.01}, r"tracking needs \|K S\| of at least"),
+        ({"mode_peak_ratio": 0.5, "mode_band_rad_s": (700.0, 800.0)}, "beyond the Nyquist"),
+        ({"mode_peak_ratio": 0.5, "mode_band_rad_s": (1e-4, 20.0)}, "integrates"),
+    ],
+)
+def test_contradictions_with_the_plant(fields, message):
+    with pytest.raises(SpecificationError, match=message) as caught:
+        Specification(**fields).check_against([UncertainPlant("arm", hub_arm())])
+    assert "\n" not in str(caught.value)
+
+
+def test_integrator_against_a_zero_at_one_and_damping_without_mode():
+    plant = UncertainPlant("acceleration", tip_acceleration())
+    with pytest.raises(SpecificationError, match="zero at z = 1"):
+        Specification(integrator=True).check_against([plant])
+    lag = UncertainPlant("lag", control.ss(0.9, 0.1, 1, 0, 0.01))
+    with pytest.raises(SpecificationError, match="no lightly damped mode"):
+        Specification(mode_peak_ratio=0.5).check_against([lag])
+    with pytest.raises(SpecificationError, match="no plant"):
+        Specification().check_against([])
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"bandwidth_rad_s": -1.0},
+        {"bandwidth_rad_s": float("nan")},
+        {"effort_rolloff_rad_s": 10.0},
+        {"mode_band_rad_s": (2.0, 1.0), "mode_peak_ratio": 0.5},
+        {"mode_band_rad_s": (1.0, 2.0)},
+        {"structure": "pi_d_notch", "controller_order": 5, "integrator": True},
+        {"unknown": 1},
+        {
+            "bandwidth_rad_s": 1.0,
+            "sensitivity_weight": RationalWeight(numerator=(1.0,), denominator=(1.0, 1.0)),
+        },
+    ],
+)
+def test_fields_that_do_not_fit_are_refused(fields):
+    with pytest.raises(ValidationError):
+        Specification(**fields)
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "message"),
+    [
+        ((1.0, 0.0, 0.0), (1.0, 1.0), "improper"),
+        ((1.0,), (1.0, -2.0), "unstable"),
+        ((1.0,), (0.0, 1.0), "non-zero"),
+    ],
+)
+def test_weights_must_be_stable_and_proper(numerator, denominator, message):
+    with pytest.raises(ValidationError, match=message):
+        RationalWeight(numerator=numerator, denominator=denominator)
