@@ -113,7 +113,7 @@ def common_fir_length(records: Sequence[Record], poles: Poles, options: Embeddin
 
 @dataclass(frozen=True, eq=False)
 class _Regression:
-    """How to make the unwhitened matrices; made anew for each pass: only one record's are in memory."""
+    """How to make the matrices; made anew for each pass: only one record's are in memory."""
 
     records: tuple[Record, ...]
     model: GobfModel
@@ -122,9 +122,11 @@ class _Regression:
     feedthrough: bool
     fir_length: int
 
-    def blocks(self) -> Iterator[RegressionBlock]:
+    def blocks(self, whitening: RealArray) -> Iterator[RegressionBlock]:
         for record in self.records:
-            yield _block(record, self.model, self.poles, self.options, self.feedthrough, self.fir_length)
+            yield _block(
+                record, self.model, self.poles, self.options, self.feedthrough, self.fir_length, whitening
+            )
 
 
 def _embed(
@@ -187,41 +189,49 @@ def _build(
 
 
 def _block(
-    record: Record, model: GobfModel, poles: Poles, options: EmbeddingOptions, feedthrough: bool, length: int
+    record: Record,
+    model: GobfModel,
+    poles: Poles,
+    options: EmbeddingOptions,
+    feedthrough: bool,
+    length: int,
+    whitening: RealArray,
 ) -> RegressionBlock:
-    n_samples = record.input.shape[0]
-    u = filter_input(record.input[:, 0], model.integrators, model.input_delay_samples)
+    """Matrices of one record, every column filtered by A(q), its first rows dropped.
+
+    That is exact for any noise before the record. Columns driven by the input from rest commute with the
+    filter, so for them the input is filtered; only the nuisance columns are filtered one by one.
+    """
+    n_samples, skip = record.n_samples, whitening.size - 1
+    u = _filtered(filter_input(record.input[:, 0], model.integrators, model.input_delay_samples), whitening)
     delayed = np.concatenate([np.zeros(1), u[:-1]])
     columns = [regressor(poles, u)]
     if feedthrough:
         columns.append(u[:, None])
-    nuisance = []
     degrees = max(int(options.estimate_offset), model.integrators if options.estimate_initial_state else 0)
     ramp = np.linspace(-1.0, 1.0, n_samples)
-    nuisance += [ramp[:, None] ** degree for degree in range(degrees)]
+    nuisance = [ramp[:, None] ** degree for degree in range(degrees)]
     if options.estimate_initial_state:
         nuisance.append(free_response(poles, n_samples))
+    known = np.hstack(nuisance) if nuisance else np.zeros((n_samples, 0))
     return RegressionBlock(
-        nuisance=np.hstack(nuisance) if nuisance else np.zeros((n_samples, 0)),
-        regressors=np.hstack(columns),
-        kernel=toeplitz(delayed, np.zeros(length)),
-        output=record.output[:, 0],
+        nuisance=_filtered(known, whitening)[skip:],
+        regressors=np.hstack(columns)[skip:],
+        kernel=toeplitz(delayed, np.zeros(length))[skip:],
+        output=_filtered(record.output[:, 0], whitening)[skip:],
     )
 
 
-def _whitened(block: RegressionBlock, whitening: RealArray) -> RegressionBlock:
-    """Every column filtered by A(q), first rows dropped: exact for any noise before the record."""
-    skip = whitening.size - 1
-    if skip == 0:
-        return block
-    parts = (block.nuisance, block.regressors, block.kernel, block.output)
-    return RegressionBlock(*(lfilter(whitening, np.ones(1), part, axis=0)[skip:] for part in parts))
+def _filtered(signal: RealArray, whitening: RealArray) -> RealArray:
+    if whitening.size == 1 or signal.size == 0:
+        return signal
+    return np.asarray(lfilter(whitening, np.ones(1), signal, axis=0), dtype=np.float64)
 
 
 def _solve(
     regression: _Regression, whitening: RealArray, options: EmbeddingOptions, classical_recipe: bool
 ) -> tuple[ReducedRegression, KernelPosterior]:
-    reduced = reduce_regression(_whitened(block, whitening) for block in regression.blocks())
+    reduced = reduce_regression(regression.blocks(whitening))
     length = regression.fir_length
     # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
     decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
@@ -250,12 +260,14 @@ def _residuals(
     mean, _ = joint_factor(reduced, kernel)
     p = reduced.n_columns
     residuals = []
-    for block in regression.blocks():
+    for block in regression.blocks(np.ones(1)):
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
-        # The nuisance is fitted where it was estimated, in the whitened rows, and taken off the plain ones.
-        filtered = _whitened(RegressionBlock(block.nuisance, rest[:, None], rest[:, None], rest), whitening)
         if block.nuisance.shape[1]:
-            coefficients, *_ = np.linalg.lstsq(filtered.nuisance, filtered.output, rcond=1e-10)
+            # The nuisance is fitted where it was estimated, in the whitened rows, and taken off the plain
+            # ones.
+            skip = whitening.size - 1
+            columns, target = (_filtered(part, whitening)[skip:] for part in (block.nuisance, rest))
+            coefficients, *_ = np.linalg.lstsq(columns, target, rcond=1e-10)
             rest = rest - block.nuisance @ coefficients
         residuals.append(rest)
     return residuals

@@ -36,8 +36,8 @@ def coverage(estimator, runs, options=None, noise_pole=0.0):
 
 
 def test_tangent_covers_and_classical_does_not():
-    tangent_hits, classical_hits = coverage(tangent, 16), coverage(classical, 16)
-    # Whole responses are strongly correlated over frequency, so 16 runs decide coverage to a few per cent
+    tangent_hits, classical_hits = coverage(tangent, 12), coverage(classical, 12)
+    # Whole responses are strongly correlated over frequency, so 12 runs decide coverage to a few per cent
     # only: 98 and 75 % were measured. The Monte Carlo below is the tight test.
     assert tangent_hits.mean() > 0.9
     assert classical_hits.mean() < 0.85
@@ -46,8 +46,8 @@ def test_tangent_covers_and_classical_does_not():
 
 
 def test_coloured_noise_needs_the_noise_model():
-    white = coverage(tangent, 8, noise_pole=0.9)
-    coloured = coverage(tangent, 8, EmbeddingOptions(coloured_noise=True), noise_pole=0.9)
+    white = coverage(tangent, 6, noise_pole=0.9)
+    coloured = coverage(tangent, 6, EmbeddingOptions(coloured_noise=True), noise_pole=0.9)
     assert white.mean() < 0.6  # 35 % measured
     assert coloured.mean() > 0.85
 
@@ -195,7 +195,7 @@ def test_autoregression_is_stable_even_for_a_growing_signal():
 
 @pytest.mark.slow
 def test_coverage_with_poles_from_the_same_data():
-    runs = 100
+    runs = 64
     hits, classical_hits = [], []
     for seed in range(runs):
         arm = random_arm(np.random.default_rng([2024, seed]))
@@ -203,7 +203,7 @@ def test_coverage_with_poles_from_the_same_data():
         hits.append(tangent([arm.record], model).at(OMEGA).contains(arm.truth))
         classical_hits.append(classical([arm.record], model).at(OMEGA).contains(arm.truth))
     bands = per_band(np.array(hits))
-    # Over the bands one run counts once or little more: sd sqrt(0.95 * 0.05 / 100) = 2.2 %; 3 of those below.
-    assert np.array(hits).mean() == pytest.approx(0.95, abs=0.03)
-    assert np.all(bands > 0.88), dict(zip(BANDS, bands, strict=True))
+    # Over the bands one run counts once or little more: sd sqrt(0.95 * 0.05 / 64) = 2.7 %; 3 of those below.
+    assert np.array(hits).mean() == pytest.approx(0.95, abs=0.03)  # all bands together: about a third of that
+    assert np.all(bands > 0.87), dict(zip(BANDS, bands, strict=True))
     assert per_band(np.array(classical_hits)).min() < 0.6
