@@ -41,19 +41,25 @@ def block_parameters(poles: Poles) -> RealArray:
     |re|) - im^2 from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 =
     1 and gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
     """
-    blocks = np.zeros((poles.real.size + poles.pairs.size, 4))
-    n_real = poles.real.size
-    blocks[:n_real, 0] = poles.real
-    blocks[:n_real, 1] = np.sqrt((1 - poles.real) * (1 + poles.real))
-    re, im = poles.pairs.real, poles.pairs.imag
-    gamma = re**2 + im**2
-    # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis
-    # function.
-    one_minus_gamma = np.maximum((1 - np.abs(re)) * (1 + np.abs(re)) - im**2, np.finfo(np.float64).eps / 4)
-    blocks[n_real:, 0] = gamma
-    blocks[n_real:, 1] = 2 * re / (1 + gamma)
-    blocks[n_real:, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
-    blocks[n_real:, 3] = np.sqrt(one_minus_gamma**2 + 4 * im**2) / (1 + gamma)
+    return np.asarray(_blocks(poles.real, poles.pairs))
+
+
+@numba.njit(cache=True)
+def _blocks(real: Any, pairs: Any) -> Any:
+    blocks = np.zeros((real.size + pairs.size, 4))
+    for i in range(real.size):
+        blocks[i, 0] = real[i]
+        blocks[i, 1] = np.sqrt((1 - real[i]) * (1 + real[i]))
+    for i in range(pairs.size):
+        re, im = pairs[i].real, pairs[i].imag
+        gamma = re**2 + im**2
+        # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis
+        # function.
+        one_minus_gamma = max((1 - abs(re)) * (1 + abs(re)) - im**2, 5e-17)
+        blocks[real.size + i, 0] = gamma
+        blocks[real.size + i, 1] = 2 * re / (1 + gamma)
+        blocks[real.size + i, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
+        blocks[real.size + i, 3] = np.sqrt(one_minus_gamma**2 + 4 * im**2) / (1 + gamma)
     return blocks
 
 

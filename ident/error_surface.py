@@ -9,9 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ident.arrays import RealArray, readonly_real
-from ident.coordinates import blocks_of_point
-from ident.kernels import candidate_rss
-from ident.least_squares import driving_signal, project
+from ident.candidate_cost import CandidateCost
+from ident.coordinates import SearchSpace
 from ident.model import GobfModel
 from ident.poles import Poles
 from ident.record import Record
@@ -131,7 +130,7 @@ def error_surface(
             second = 1 - np.geomspace(min(30 * width, 1.0), width / 30, n_points)
         names = ("beta", "gamma")
         proper = np.all(np.abs(first) < 1) and np.all((second >= 0) & (second < 1))
-        to_unit_box = np.array([[0.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+        box = np.array([[0.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
         values_first, values_second = first, second
     else:
         own = (float(model.poles.omega_rad_s(model.dt_s)[pair]), float(model.poles.zeta()[pair]))
@@ -141,7 +140,7 @@ def error_surface(
             second = np.geomspace(max(own[1] / 30, 1e-5), min(30 * own[1], 0.95), n_points)
         names = ("omega_rad_s", "zeta")
         proper = np.all((first > 0) & (first < nyquist)) and np.all((second > 0) & (second < 1))
-        to_unit_box = np.array([[-1.0, -12.0, -12.0], [0.0, 1.0, 0.0]])
+        box = np.array([[-1.0, -12.0, -12.0], [0.0, 1.0, 0.0]])
         values_first, values_second = np.log10(first * model.dt_s), np.log10(second)
     if not proper:
         raise ValueError(
@@ -149,20 +148,9 @@ def error_surface(
         )
     data = prepare(records, structure)
     kept = Poles(model.poles.real, np.delete(model.poles.pairs, pair))
-    frozen, drive = project(data, kept), driving_signal(data, kept)
-    low, high = to_unit_box
-    mean_square = np.empty((first.size, second.size))
-    for i, a in enumerate(values_first):
-        for j, b in enumerate(values_second):
-            unit = np.array([(a - low[1]) / (high[1] - low[1]), (b - low[2]) / (high[2] - low[2])])
-            mean_square[i, j] = candidate_rss(
-                blocks_of_point(unit, 0, low, high, coordinates == "raw"),
-                0,
-                drive,
-                frozen.residual,
-                data.starts,
-                frozen.local_q,
-                frozen.shared_q,
-                structure.estimate_initial_state,
-            )
-    return ErrorSurface(first, second, names, mean_square / data.n_samples, own)
+    low, high = box
+    space = SearchSpace(0, 1, low, high, coordinates == "raw", model.dt_s)
+    grid = np.array([[a, b] for a in values_first for b in values_second])
+    cost = CandidateCost(data, space, kept, kept)
+    rss = cost.rss((grid - low[1:]) / (high[1:] - low[1:])).reshape(first.size, second.size)
+    return ErrorSurface(first, second, names, rss / data.n_samples, own)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import combinations_with_replacement
 
 import numpy as np
 
 from ident.arrays import RealArray
-from ident.coordinates import SearchSpace, blocks_of_point, search_space
+from ident.candidate_cost import CandidateCost
+from ident.coordinates import SearchSpace, search_space
 from ident.direct import best_apart, minimise
-from ident.kernels import candidate_rss
-from ident.least_squares import Projection, driving_signal, project
 from ident.options import IdentOptions
 from ident.poles import Poles
 from ident.polish import Bounds, Polished, polish
@@ -43,7 +41,6 @@ class PoleSearch:
         self.stages: list[SearchStage] = []
         self.minima: list[PolishedMinimum] = []
         self.evaluations = 0
-        self._power = float(data.y @ data.y)
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self.options)
@@ -54,25 +51,25 @@ class PoleSearch:
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
-        cost = self.candidate_cost(space, self.fixed, self.fixed)
-        points = self._global(title, space, cost, self.options.evaluations)
+        cost = CandidateCost(self.data, space, self.fixed, self.fixed)
+        points = self._global(title, cost, self.options.evaluations)
         return self._best_descent([self.fixed.appended(space.poles(point)) for point in points], title)
 
     def add_pair(self, poles: Poles) -> Polished:
         """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
-        cost = self.candidate_cost(space, poles.doubled(), poles)
-        points = self._global(title, space, cost, min(_PAIR_EVALUATIONS, self.options.evaluations))
+        cost = CandidateCost(self.data, space, poles.doubled(), poles)
+        points = self._global(title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations))
         return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
 
     def add_real(self, poles: Poles) -> Polished:
         """Best descent from the given poles and one more real pole."""
         space = self.space(1, 0)
-        cost = self.candidate_cost(space, poles.doubled(), poles)
+        cost = CandidateCost(self.data, space, poles.doubled(), poles)
         grid = np.linspace(0, 1, 2 * _REAL_GRID)[:, np.newaxis]
-        costs = np.array([cost(point) for point in grid])
-        points = best_apart(grid, costs, 2)
+        points = best_apart(grid, cost.rss(grid), 2)
+        self.evaluations += cost.evaluations
         return self._best_descent(
             [poles.appended(space.poles(point)) for point in points], "one more real pole"
         )
@@ -98,36 +95,26 @@ class PoleSearch:
             chosen = list(range(n_fixed + first, n_fixed + min(first + together, n_real)))
             kept = Poles(np.delete(best.poles.real, chosen), best.poles.pairs)
             space = self.space(len(chosen), 0)
-            cost = self.candidate_cost(space, kept, kept)
-            levels = np.linspace(0, 1, _REAL_GRID)
-            grid = [
-                np.array([low, 0.0 if low == 1 else (high - low) / (1 - low)])[: len(chosen)]
-                for low, high in combinations_with_replacement(levels, 2)
-            ]
-            best = self._descend_from_grid(best, np.array(grid), cost, space, kept, n_starts=2)
+            cost = CandidateCost(self.data, space, kept, kept)
+            best = self._descend_from_grid(best, _real_grid(len(chosen)), cost, kept, n_starts=2)
         return best
 
     def _rescan_pair(self, best: Polished, index: int) -> Polished:
         kept = Poles(best.poles.real, np.delete(best.poles.pairs, index))
         space = self.space(0, 1)
-        cost = self.candidate_cost(space, kept, kept)
+        cost = CandidateCost(self.data, space, kept, kept)
         omegas, zetas = np.linspace(0, 1, _PAIR_GRID[0]), np.linspace(0, 1, _PAIR_GRID[1] + 2)[1:-1]
         grid = np.array([[omega, zeta] for omega in omegas for zeta in zetas])
-        return self._descend_from_grid(best, grid, cost, space, kept, n_starts=1)
+        return self._descend_from_grid(best, grid, cost, kept, n_starts=1)
 
     def _descend_from_grid(
-        self,
-        best: Polished,
-        grid: RealArray,
-        cost: Callable[[RealArray], float],
-        space: SearchSpace,
-        kept: Poles,
-        n_starts: int,
+        self, best: Polished, grid: RealArray, cost: CandidateCost, kept: Poles, n_starts: int
     ) -> Polished:
-        costs = np.array([cost(point) for point in grid])
+        costs = cost.rss(grid)
+        self.evaluations += cost.evaluations
         found = best
         for point in best_apart(grid, costs, n_starts):
-            trial = self.descend(kept.appended(space.poles(point)), "rescan", _ROUGH)
+            trial = self.descend(kept.appended(cost.space.poles(point)), "rescan", _ROUGH)
             if trial.rss < found.rss * (1 - _GAIN):
                 found = self.descend(trial.poles, "rescan")
         return found
@@ -150,34 +137,18 @@ class PoleSearch:
         rough = min((self.descend(start, stage, _ROUGH) for start in starts), key=lambda end: end.rss)
         return self.descend(rough.poles, stage)
 
-    def _global(
-        self, title: str, space: SearchSpace, cost: Callable[[RealArray], float], evaluations: int
-    ) -> RealArray:
-        points, costs = minimise(cost, space.dimension, self.options.algorithm, evaluations)
-        self.stages.append(SearchStage(title, space.names, space.coordinates(points), costs))
+    def _global(self, title: str, cost: CandidateCost, evaluations: int) -> RealArray:
+        points, costs = minimise(cost, cost.space.dimension, self.options.algorithm, evaluations)
+        self.evaluations += cost.evaluations
+        self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
         return best_apart(points, costs, self.options.starts)
 
-    def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> Callable[[RealArray], float]:
-        """log J over the unit cube of `space`, with the columns of the frozen poles taken out beforehand."""
-        frozen: Projection = project(self.data, shared, local)
-        drive = driving_signal(self.data, shared)
-        data, n_real, low, high, raw = self.data, space.n_real, space.low, space.high, space.raw
-        free = data.structure.estimate_initial_state
-        # Below this the Gram matrix knows nothing; the descents see the true residual.
-        floor = 1e-13 * self._power
 
-        def cost(unit: RealArray) -> float:
-            self.evaluations += 1
-            rss = candidate_rss(
-                blocks_of_point(unit, n_real, low, high, raw),
-                n_real,
-                drive,
-                frozen.residual,
-                data.starts,
-                frozen.local_q,
-                frozen.shared_q,
-                free,
-            )
-            return float(np.log(max(rss, floor)))
-
-        return cost
+def _real_grid(n_poles: int) -> RealArray:
+    """Levels of one real pole, or all ordered couples of levels of two, as points of the unit cube."""
+    levels = np.linspace(0, 1, _REAL_GRID)
+    if n_poles == 1:
+        return levels[:, np.newaxis]
+    # The triangular map of the search space turns (low, 1) into equal poles at the top.
+    couples = combinations_with_replacement(levels, 2)
+    return np.array([[low, 0.0 if low == 1 else (high - low) / (1 - low)] for low, high in couples])

@@ -1,0 +1,82 @@
+"""The cost of candidate poles on top of frozen ones, for single points and whole grids of a search space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from ident.arrays import RealArray
+from ident.coordinates import SearchSpace, blocks_of_point
+from ident.kernels import candidate_rss
+from ident.least_squares import driving_signal, project
+from ident.poles import Poles
+from ident.regression import Regression
+
+# Below this fraction of |y|^2 the Gram matrix of the candidates knows nothing; descents see the true
+# residual.
+_FLOOR = 1e-13
+
+
+class CandidateCost:
+    """Residual sum of squares over the unit cube of a search space, with other poles frozen.
+
+    `shared` are the frozen poles driven by the input, `local` those of the free responses; their columns
+    are taken out of the output once, here.
+    """
+
+    def __init__(self, data: Regression, space: SearchSpace, shared: Poles, local: Poles) -> None:
+        self.space = space
+        self.evaluations = 0
+        self._data = data
+        self._frozen = project(data, shared, local)
+        self._drive = driving_signal(data, shared)
+        self._floor = _FLOOR * float(data.y @ data.y)
+
+    def rss(self, units: RealArray) -> RealArray:
+        """Residual sums of squares (E,) at points (E, D) of the unit cube."""
+        self.evaluations += len(units)
+        space, frozen = self.space, self._frozen
+        values = _scan(
+            units,
+            space.n_real,
+            space.low,
+            space.high,
+            space.raw,
+            self._drive,
+            frozen.residual,
+            self._data.starts,
+            frozen.local_q,
+            frozen.shared_q,
+            self._data.structure.estimate_initial_state,
+        )
+        return np.asarray(values, dtype=np.float64)
+
+    def log(self, units: RealArray) -> RealArray:
+        """log J (E,) at points (E, D), as DIRECT sees it."""
+        return np.log(np.maximum(self.rss(units), self._floor))
+
+    def __call__(self, unit: RealArray) -> float:
+        return float(self.log(unit[np.newaxis])[0])
+
+
+@numba.njit(cache=True)
+def _scan(
+    units: Any,
+    n_real: int,
+    low: Any,
+    high: Any,
+    raw: bool,
+    drive: Any,
+    residual: Any,
+    starts: Any,
+    local_q: Any,
+    shared_q: Any,
+    free: bool,
+) -> Any:
+    values = np.empty(units.shape[0])
+    for i in range(units.shape[0]):
+        blocks = blocks_of_point(units[i], n_real, low, high, raw)
+        values[i] = candidate_rss(blocks, n_real, drive, residual, starts, local_q, shared_q, free)
+    return values
