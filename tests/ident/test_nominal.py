@@ -1,0 +1,70 @@
+"""Nominal model from a posterior: recovers a model in its span, weighs frequencies by the ellipses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.basis import basis_response
+from ident.model import GobfModel
+from ident.nominal import nominal_near
+from ident.poles import Poles
+from ident.posterior import ResponsePosterior
+
+DT = 0.01
+OMEGA = np.geomspace(0.5, 200.0, 60)
+POLES = Poles([0.95], [0.9 * np.exp(0.5j)])
+
+
+@pytest.mark.parametrize(("integrators", "delay", "direct"), [(0, 0, False), (1, 2, True)])
+def test_a_model_in_the_span_is_recovered(integrators, delay, direct):
+    rng = np.random.default_rng(0)
+    size = 6 + direct + 3
+    mean = np.zeros(size)
+    mean[:6] = rng.standard_normal(6)
+    mean[6] = 0.3 if direct else 0.0
+    posterior = ResponsePosterior(
+        POLES.doubled(), mean, 0.1 * rng.standard_normal((size, size)), DT, 3, direct, integrators, delay
+    )
+    model = nominal_near(posterior, POLES.doubled(), OMEGA)
+    np.testing.assert_allclose(model.coefficients, mean[:6], atol=1e-9)
+    assert model.feedthrough == pytest.approx(mean[6] if direct else 0.0, abs=1e-9)
+    np.testing.assert_allclose(model.frequency_response(OMEGA), posterior.centre(OMEGA), rtol=1e-8)
+
+
+def test_low_order_model_goes_where_the_ellipses_are_small():
+    # Two coefficient directions known badly: the nominal may leave the mean there and nowhere else.
+    rng = np.random.default_rng(1)
+    true = GobfModel(POLES, [1.0, 0.5, -0.3], DT)
+    doubled = POLES.doubled()
+    wide = np.zeros((6, 2))
+    wide[:, 0] = rng.standard_normal(6)
+    exact = nominal_near(ResponsePosterior(doubled, np.zeros(6), np.eye(6), DT), doubled, OMEGA)
+    assert np.all(np.abs(exact.coefficients) < 1e-12)
+    z = np.exp(1j * OMEGA * DT)
+    # The true model in the doubled basis, plus an error of three standard deviations in the wide direction.
+    big = basis_response(doubled, z)
+    target = true.frequency_response(OMEGA)
+    coefficients, *_ = np.linalg.lstsq(
+        np.vstack([big.real, big.imag]), np.concatenate([target.real, target.imag]), rcond=None
+    )
+    posterior = ResponsePosterior(
+        doubled, coefficients + 3 * wide[:, 0], np.hstack([wide, 1e-3 * np.eye(6)]), DT
+    )
+    model = nominal_near(posterior, POLES, OMEGA)
+    weighted = posterior.at(OMEGA).normalised_distance(model.frequency_response(OMEGA))
+    plain, *_ = np.linalg.lstsq(
+        np.vstack([(b := basis_response(POLES, z)).real, b.imag]),
+        np.concatenate([(c := posterior.centre(OMEGA)).real, c.imag]),
+        rcond=None,
+    )
+    unweighted = posterior.at(OMEGA).normalised_distance(
+        GobfModel(POLES, plain, DT).frequency_response(OMEGA)
+    )
+    assert np.mean(weighted**2) < np.mean(unweighted**2)
+
+
+def test_too_few_frequencies_are_refused():
+    posterior = ResponsePosterior(POLES, np.zeros(3), np.eye(3), DT)
+    with pytest.raises(ValueError, match="do not determine"):
+        nominal_near(posterior, POLES.doubled(), OMEGA[:2])
