@@ -214,11 +214,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if debug:
         arguments.remove("--debug")
     try:
-        code = app(arguments, standalone_mode=False)
-        return int(code or EXIT_OK)
-    except typer.Exit as leaving:
+        code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         # typer turns Ctrl-C into a silent exit of this code.
-        return _interrupted() if leaving.exit_code == _EXIT_INTERRUPTED else int(leaving.exit_code)
+        return _interrupted() if code == _EXIT_INTERRUPTED else code
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted()
     except BrokenPipeError:

@@ -186,6 +186,7 @@ class ClosedLoopOptions(Section):
     quantisation: float = Field(
         0.0, ge=0, description="step of the converter at the plant's input, in its units"
     )
+    measurement_step: float = Field(0.0, ge=0, description="step of the measured output, e.g. an encoder's")
     duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
 

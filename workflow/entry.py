@@ -113,7 +113,7 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
 
 
 def file_name(name: str) -> str:
-    """A record's name as part of a file name: everything but letters, digits, '_', '.' and '-' becomes '_'."""
+    """A record's name in a file name: all but letters, digits, '_', '.' and '-' becomes '_'."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)
 
 
@@ -166,7 +166,7 @@ def identify_logs(
         "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
         "fit_repeat_percent": {},
     }
-    tests = residual_tests(ChannelResult(output_name, found, tuple(used), fresh))
+    tests = residual_tests(ChannelResult(output_name, found, tuple(used), fresh), posterior)
     spread = {
         "level": level,
         "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from workflow import storage
+from workflow.code_version import code_digest
 from workflow.config import RunConfig
 from workflow.errors import InputError, one_line
 from workflow.progress import Progress, Silence
-from workflow.run_directory import LAYOUT_VERSION, RunDirectory, StageData, hash_of, package_versions
+from workflow.run_directory import LAYOUT_VERSION, RunDirectory, StageData, hash_of
 from workflow.stages import STAGES, Stage, StageInput
 from workflow.summary import RunSummary, summarise
 
@@ -111,11 +112,11 @@ def _perform(
 
 
 def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs: Mapping[str, str]) -> str:
-    """SHA-256 over all that a stage's result depends on."""
+    """SHA-256 over all that a stage's result depends on, our own code included."""
     return hash_of(
         {
             "layout": LAYOUT_VERSION,
-            "flexlink": package_versions().get("flexlink", ""),
+            "code": code_digest(drawing=bool(stage.also_writes(run))),
             "stage": stage.name,
             "seed": config.run.seed,
             "settings": stage.settings(config),

@@ -139,9 +139,11 @@ def channel_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
         for mode in found["modes"]
     ]
     if found["real_poles_per_s"]:
-        rows.append(
-            Row("real poles", ", ".join(f"{rate:.4g}" for rate in found["real_poles_per_s"]) + " 1/s")
-        )
+        rates = ", ".join(f"{rate:.4g}" for rate in found["real_poles_per_s"])
+        rows.append(Row("real poles", f"{rates} 1/s"))
+    no_rate = [value for value in found["real_poles_z"] if value <= 0]
+    if no_rate:
+        rows.append(Row("real poles, z plane", ", ".join(f"{value:.4g}" for value in no_rate)))
     for role in ("estimation", "validation", "repeat"):
         fits = list(found[f"fit_{role}_percent"].values())
         if fits:
@@ -164,11 +166,8 @@ def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:
     ]
     for test in spread["tests"]:
         if test["data"] == "estimation":
-            rows.append(
-                Row(
-                    f"residuals, {test['name']}", f"{'pass' if test['passed'] else 'FAIL'}: {test['verdict']}"
-                )
-            )
+            passed = "pass" if test["passed"] else "FAIL"
+            rows.append(Row(f"residuals, {test['name']}", f"{passed}: {test['verdict']}"))
     if spread["repeat_scatter"]:
         ratios = [row["ratio"] for row in spread["repeat_scatter"]]
         rows.append(Row("repeat scatter", f"{_range(ratios, '')} times the predicted (by band)"))

@@ -27,7 +27,7 @@ def stage_bytes(run: Path) -> dict[str, bytes]:
 
 
 def assert_same_run(left: Path, right: Path) -> None:
-    """Equal bytes, stage by stage; the report's page may differ (it names times), its stage file then differs too."""
+    """Equal bytes, stage by stage, but for the hash of the page: the page names times."""
     first, second = stage_bytes(left), stage_bytes(right)
     assert first.keys() == second.keys()
     for name in first.keys() - {"report.json"}:

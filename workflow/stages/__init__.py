@@ -19,18 +19,18 @@ identify.npz
     document  channels: list of {name, input, output, purpose "control"|"performance", increments, n_used,
               n_fresh, fit_estimation_percent {record: %}, fit_validation_percent {record: %},
               fit_repeat_percent {record: %}, order, integrators, input_delay_samples, feedthrough, modes:
-              list of {frequency_Hz, omega_rad_s, damping} ascending, real_poles_per_s: list of decay rates,
-              noise_std (output units), tangent_optimality, warnings: list of str, verdicts: list of str,
-              order_table: list of {n_real, n_pairs, rss, criterion}, search_evaluations, two_stage: null or
-              a sentence}
+              list of {frequency_Hz, omega_rad_s, damping} ascending, real_poles_per_s: decay rates,
+              real_poles_z, noise_std (output units), tangent_optimality, warnings: list of str, verdicts:
+              list of str, order_table: list of {n_real, n_pairs, rss, criterion}, search_evaluations,
+              two_stage: null or a sentence}
     arrays    channel/<k>/identification/...  ident.identify.Identification (model, residuals, search trace)
               channel/<k>/used/<i>/...        ident.Record, SISO: what the fit saw; i counts estimation ones
               channel/<k>/fresh/<i>/...       ident.validation.FreshFit; i counts the other records in order
 
 uncertainty.npz
-    document  channels: list of {name, method, level, report: EmbeddingReport.to_dict()|null, bands: list of
-              {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis over
-              |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()},
+    document  channels: list of {name, method, level, report: EmbeddingReport.to_dict()|null, bands: list
+              of {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis
+              over |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()},
               repeat_scatter: null or list of ScatterRow.to_dict()}
     arrays    channel/<k>/posterior/...       ident.ResponsePosterior
               channel/<k>/frequency/...       ident.FrequencyUncertainty on the display grid
@@ -42,12 +42,12 @@ design.json
               block it)
 
 certify.json
-    document  certificate: Certificate.to_dict(), or null with nothing to certify; certified (bool); reason
-              (one line)
+    document  certificate: Certificate.to_dict(), or null with nothing to certify; certified (bool);
+              reason (one line)
 
 closed_loop.npz, or closed_loop.json when there was nothing to run
     document  skipped: null or the reason; machine "simulated"|"identified"; if not skipped also tracking
-              (asked for), draws, settled_draws, reference_step, disturbance, quantisation,
+              (asked for), draws, settled_draws, reference_step, disturbance, quantisation, measurement_step,
               input_limit|null, predicted: {StepMetrics.to_dict(), disturbance_peak, disturbance_left,
               settled}, achieved: list of the same, one per draw
     arrays    time_s, reference, disturbance  (T,); the disturbance adds to the plant's input from T // 2 on

@@ -13,7 +13,7 @@ from control_design.closed_loop import ClosedLoopTrajectory, SampledMachine, sim
 from control_design.controller import Controller
 from control_design.stability import closed_loop_poles
 from ident.uncertainty import ResponsePosterior
-from workflow.config import RunConfig, SimulatedSource
+from workflow.config import ClosedLoopOptions, RunConfig, SimulatedSource
 from workflow.errors import naming
 from workflow.run_directory import StageData
 from workflow.sampled_plant import StateSpaceMachine, realise
@@ -91,7 +91,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
         posterior = load_posterior(stage.results, config.control_index)
         performance = config.performance_index
         tip = None if performance is None else load_posterior(stage.results, performance)
-        predicted = run_on_draws(controller, posterior, tip, [posterior.mean], _means(tip), trial, 0.0)
+        predicted = run_on_draws(controller, posterior, tip, [posterior.mean], _means(tip), trial, None)
         stage.progress.update("closed_loop", 0.1, "machine")
         achieved = (
             run_on_arm(stage, controller, trial)
@@ -108,6 +108,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
         "reference_step": trial.step,
         "disturbance": float(trial.disturbance[-1]),
         "quantisation": config.closed_loop.quantisation,
+        "measurement_step": config.closed_loop.measurement_step,
         "input_limit": controller.input_limit,
         "predicted": describe(predicted, trial)[0],
         "achieved": rows,
@@ -172,7 +173,7 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> Runs:
         arm = EncodedArm(
             source, config.closed_loop.effects, stage.rng("closed_loop", "noise", str(draw)), rig=rig
         )
-        runs.append(_loop(controller, arm, trial, measured, config.closed_loop.quantisation))
+        runs.append(_loop(controller, arm, trial, measured, config.closed_loop))
     outputs = np.stack([run.output for run in runs])
     return Runs(
         outputs[:, :, measured],
@@ -194,9 +195,7 @@ def run_on_posterior(
     draws = stage.config.closed_loop.draws
     control = posterior.sample(stage.rng("closed_loop", "control"), draws)
     shown = None if tip is None else tip.sample(stage.rng("closed_loop", "performance"), draws)
-    return run_on_draws(
-        controller, posterior, tip, control, shown, trial, stage.config.closed_loop.quantisation
-    )
+    return run_on_draws(controller, posterior, tip, control, shown, trial, stage.config.closed_loop)
 
 
 def run_on_draws(
@@ -206,7 +205,7 @@ def run_on_draws(
     control_draws: Sequence[Real] | Real,
     tip_draws: Sequence[Real] | Real | None,
     trial: Trial,
-    quantisation: float,
+    steps: ClosedLoopOptions | None,
 ) -> Runs:
     """One closed loop per draw of coefficients; the performance output follows from the command that
     acted."""
@@ -222,7 +221,7 @@ def run_on_draws(
         law = replace(
             controller, computational_delay_samples=controller.computational_delay_samples - int(holds)
         )
-        run = _loop(law, machine, trial, 0, quantisation, early=holds)
+        run = _loop(law, machine, trial, 0, steps, early=holds)
         if holds:
             # The machine acted on each command one sample after it was handed over.
             run = replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
@@ -242,7 +241,7 @@ def _loop(
     machine: SampledMachine,
     trial: Trial,
     measured: int,
-    quantisation: float,
+    steps: ClosedLoopOptions | None,
     *,
     early: bool = False,
 ) -> ClosedLoopTrajectory:
@@ -253,7 +252,8 @@ def _loop(
         trial.reference,
         measured_index=measured,
         input_disturbance=disturbance,
-        command_step=quantisation,
+        measurement_step=0.0 if steps is None else steps.measurement_step,
+        command_step=0.0 if steps is None else steps.quantisation,
     )
 
 

@@ -116,8 +116,8 @@ def describe_model(found: Identification) -> dict[str, Any]:
     """Poles in an engineer's units, structure and the search's own remarks."""
     model = found.model
     poles = model.poles
-    with np.errstate(divide="ignore"):
-        decay = -np.log(np.abs(poles.real)) / model.dt_s
+    # A pole at or left of z = 0 is no decay that a continuous-time rate could describe.
+    decay = -np.log(poles.real[poles.real > 0]) / model.dt_s
     modes = sorted(zip(poles.omega_rad_s(model.dt_s).tolist(), poles.zeta().tolist(), strict=True))
     return {
         "order": model.order,
@@ -129,6 +129,7 @@ def describe_model(found: Identification) -> dict[str, Any]:
             for omega, zeta in modes
         ],
         "real_poles_per_s": sorted(decay.tolist()),
+        "real_poles_z": sorted(poles.real.tolist(), reverse=True),
         "noise_std": found.noise_std,
         "tangent_optimality": found.tangent_optimality,
         "warnings": list(found.warnings),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 from control_design.frequency_grid import frequency_grid
 from control_design.plant_set import Mode
@@ -63,7 +64,7 @@ def find_uncertainty(stage: StageInput) -> StageData:
                 "level": channel.uncertainty.level,
                 "report": posterior.report.to_dict() if posterior.report is not None else None,
                 "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
-                "tests": residual_tests(result),
+                "tests": residual_tests(result, posterior),
                 "repeat_scatter": scatter,
             }
         )
@@ -133,13 +134,19 @@ def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> dict[s
     }
 
 
-def residual_tests(result: ChannelResult) -> list[dict[str, Any]]:
-    """Whiteness and independence on the estimation records, and on each record that was not fitted."""
+def residual_tests(result: ChannelResult, posterior: ResponsePosterior) -> list[dict[str, Any]]:
+    """Whiteness and independence on the estimation records, whiteness on each record that was not fitted.
+
+    Where the bounds have a noise model, whiteness is that of the residuals behind it: they rest on those.
+    """
     found = result.identification
+    colour = () if posterior.report is None else posterior.report.ar_coefficients
+    filter_of_noise = np.array([1.0, *colour])
+    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in found.residuals]
     delay = found.model.input_delay_samples
     inputs = [record.input[delay:, 0] for record in result.used]
     tests = [
-        {"data": "estimation", **whiteness_test(found.residuals).to_dict()},
+        {"data": "estimation", **whiteness_test(whitened).to_dict()},
         {"data": "estimation", **independence_test(inputs, found.residuals).to_dict()},
     ]
     tests += [

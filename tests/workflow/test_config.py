@@ -1,0 +1,163 @@
+"""The configuration: defaults, round trip, what contradicts itself, and the examples as they ship."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.workflow.conftest import FAST_ARM, ROOT
+from workflow.config import FileSource, RunConfig, SimulatedSource, load_config
+from workflow.entry import built_in_config
+from workflow.errors import InputError
+from workflow.excitations import BangBang, Doublet, LogChirp, Multisine, Prbs
+from workflow.settings import check
+
+MINIMAL = """
+[run]
+name = "my_arm"
+[source]
+kind = "files"
+time = "t_s"
+[[source.records]]
+path = "log.csv"
+[[channels]]
+input = "voltage_V"
+output = "angle_rad"
+[specification]
+bandwidth_rad_s = 2.0
+"""
+
+
+def minimal(tmp_path, text=MINIMAL):
+    (tmp_path / "log.csv").write_text("")
+    (tmp_path / "arm.toml").write_text(text)
+    return load_config(tmp_path / "arm.toml")[0]
+
+
+def test_own_data_needs_a_dozen_lines(tmp_path):
+    assert len(MINIMAL.split("\n")) - 2 <= 13
+    config = minimal(tmp_path)
+    assert isinstance(config.source, FileSource)
+    assert config.machine == "identified"
+    assert config.purpose_of(0) == "control"
+    assert config.record_names == ["log"]
+    assert config.input_files == [tmp_path / "log.csv"]
+
+
+def test_document_round_trip_survives_a_moved_log(tmp_path):
+    config = minimal(tmp_path)
+    (tmp_path / "log.csv").unlink()
+    assert RunConfig.from_document(config.to_document(), source="x") == config
+
+
+def test_frozen_and_second_channel_is_performance():
+    config, _ = load_config(FAST_ARM)
+    with pytest.raises(ValueError, match="frozen"):
+        config.run.seed = 1
+    default, _ = built_in_config()
+    assert (default.control_index, default.performance_index) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("extra", "complaint"),
+    [
+        ('[[channels]]\ninput = "voltage_V"\noutput = "angle_rad"', "two channels are called 'angle_rad'"),
+        ('[[channels]]\ninput = "v2"\noutput = "tip"', "same input"),
+        ('[[channels]]\ninput = "voltage_V"\noutput = "tip"\npurpose = "control"', "exactly one channel"),
+        ('[[source.records]]\npath = "log.csv"', "two records are called 'log'"),
+        ('[closed_loop_data]\nmethod = "two_stage"', "needs references"),
+        ('[closed_loop]\neffects = [{ name = "tip_payload", mass_kg = 0.1 }]', "simulated arm only"),
+        ("[run.more]\na = 1", "unknown key run.more"),
+    ],
+)
+def test_contradictions(tmp_path, extra, complaint):
+    with pytest.raises(InputError, match=complaint):
+        minimal(tmp_path, MINIMAL + extra)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ('path = "log.csv"', 'path = "log.csv"\nrole = "validation"', "no record has role 'estimation'"),
+        ('time = "t_s"', 'time = "t_s"\ndt_s = 0.1', "not both"),
+        (
+            'path = "log.csv"',
+            'path = "log.csv"\nstart_sample = 5\nstop_sample = 5',
+            "stop_sample must be above",
+        ),
+        ('name = "my_arm"', 'name = "../my_arm"', "run.name"),
+        ('name = "my_arm"', "seed = -1", "run.seed"),
+    ],
+)
+def test_contradictions_in_the_source(tmp_path, old, new, complaint):
+    assert old in MINIMAL
+    with pytest.raises(InputError, match=complaint):
+        minimal(tmp_path, MINIMAL.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"kind": "prbs", "amplitude_V": 2.0, "samples": 100},
+        {"kind": "multisine", "rms_V": 1.0, "period_samples": 100, "from_Hz": 2.0, "to_Hz": 50.0},
+        {"kind": "log_chirp", "amplitude_V": 2.0, "samples": 100, "from_Hz": 1.0, "to_Hz": 40.0},
+        {"kind": "doublet", "amplitude_V": 2.0, "samples": 100, "pulse_s": 0.1},
+        {"kind": "bang_bang", "amplitude_V": 2.0, "samples": 100, "slew_s": 0.2},
+    ],
+    ids=lambda table: table["kind"],
+)
+def test_every_excitation_gives_its_samples_and_its_size(table):
+    kinds = {
+        "prbs": Prbs,
+        "multisine": Multisine,
+        "log_chirp": LogChirp,
+        "doublet": Doublet,
+        "bang_bang": BangBang,
+    }
+    excitation = check(kinds[table["kind"]], table, source="x")
+    signal = excitation.signal(0.005, np.random.default_rng(1))
+    assert signal.shape == (100,)
+    if "rms_V" in table:
+        np.testing.assert_allclose(np.sqrt(np.mean(signal**2)), table["rms_V"], rtol=1e-12)
+    else:
+        assert 0.95 * table["amplitude_V"] < np.max(np.abs(signal)) <= table["amplitude_V"]
+
+
+def test_packaged_default_is_the_example():
+    assert (ROOT / "workflow" / "data" / "default_arm.toml").read_text() == (
+        ROOT / "examples" / "default_arm.toml"
+    ).read_text()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.toml")), ids=lambda path: path.stem)
+def test_examples_are_valid_and_say_what_is_not_known(path, monkeypatch, request):
+    if "FLEXLINK_DATA" in path.read_text():
+        monkeypatch.setenv("FLEXLINK_DATA", str(request.getfixturevalue("flexlink_data")))
+    config, text = load_config(path)
+    assert config.notes.unknown
+    assert tomllib.loads(text)["run"]["name"] == path.stem
+
+
+def test_examples_name_the_variable_when_it_is_not_set(monkeypatch):
+    monkeypatch.delenv("FLEXLINK_DATA", raising=False)
+    with pytest.raises(InputError, match="environment variable FLEXLINK_DATA is not set"):
+        load_config(ROOT / "examples" / "daisy_robot_arm.toml")
+
+
+def test_rig_file_is_read_relative_to_the_configuration(tmp_path):
+    from plant.presets import paper_link
+
+    (tmp_path / "rig.toml").write_text(paper_link().to_toml())
+    text = FAST_ARM.read_text().replace('rig = "paper_link"', 'rig = "rig.toml"')
+    (tmp_path / "arm.toml").write_text(text)
+    config, _ = load_config(tmp_path / "arm.toml")
+    assert isinstance(config.source, SimulatedSource)
+    assert config.source.rig == tmp_path / "rig.toml"
+    assert config.input_files == [tmp_path / "rig.toml"]
+    assert RunConfig.from_document(config.to_document(), source="x") == config
+    (tmp_path / "rig.toml").write_text("[link]\nlength_m = -1.0\n")
+    with pytest.raises(InputError, match=r"source\.rig: .*rig\.toml"):
+        load_config(Path(tmp_path / "arm.toml"))

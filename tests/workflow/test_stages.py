@@ -1,0 +1,199 @@
+"""What the stages leave, against known truth and against what the libraries say when called alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from control_design.certificate import certify
+from ident.record import Record
+from plant import linear_arm
+from plant.presets import paper_link
+from tests.workflow.conftest import FAST_ARM
+from workflow.config import FileRecord, load_config
+from workflow.errors import InputError
+from workflow.pipeline import config_of
+from workflow.run_directory import RunDirectory
+from workflow.settings import check
+from workflow.simulated_rig import EncodedArm
+from workflow.stages.identify import increments
+from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
+from workflow.stages.results import (
+    load_certificate,
+    load_empirical,
+    load_frequency,
+    load_identification,
+    load_plant,
+    load_posterior,
+    load_records,
+    load_synthesis,
+)
+
+
+@pytest.fixture(scope="module")
+def run(fast_run) -> RunDirectory:
+    return RunDirectory.open(fast_run[0])
+
+
+def true_response(omega):
+    """Held input to hub angle of the fast arm, exactly: viscous friction is linear, so the rig carries it."""
+    rig = paper_link()
+    rig = rig.perturbed({"hub.viscous_friction_Nms": rig.hub.viscous_friction_Nms + 0.02})
+    arm = linear_arm(rig).to_control()
+    sampled = arm.sample(rig.sampling.dt_s, method="zoh")
+    return sampled(np.exp(1j * omega * rig.sampling.dt_s))[0, 0]
+
+
+def test_records_know_their_noise_free_output(run):
+    records = load_records(run)
+    assert [item.role for item in records] == ["estimation", "validation"]
+    clean = run.load_stage("records").arrays["noise_free/0/output"]
+    noise = records[0].record.output - clean
+    sensors = paper_link().sensors
+    # 700 samples: the standard deviation is known to 2.7 %; 5 sigma.
+    np.testing.assert_allclose(
+        noise.std(axis=0), [sensors.hub_angle_noise_rad, sensors.tip_noise_m], rtol=0.14
+    )
+
+
+def test_ellipses_hold_the_true_response(run):
+    frequency = load_frequency(run, 0)
+    inside = (frequency.omega_rad_s > 2) & (frequency.omega_rad_s < 100)
+    truth = true_response(frequency.omega_rad_s)
+    # 95 % each, strongly correlated over frequency: mostly nearly all; far less means a wrong response.
+    assert np.mean(frequency.contains(truth)[inside]) > 0.7
+    np.testing.assert_allclose(frequency.centre[inside], truth[inside], rtol=0.2)
+
+
+def test_posterior_and_display_grid_agree(run):
+    frequency, posterior = load_frequency(run, 0), load_posterior(run, 0)
+    again = posterior.at(frequency.omega_rad_s, frequency.level)
+    np.testing.assert_array_equal(again.centre, frequency.centre)
+    np.testing.assert_array_equal(again.covariance, frequency.covariance)
+
+
+def test_empirical_response_is_there(run):
+    empirical = load_empirical(run, 0)
+    assert empirical is not None
+    assert empirical.omega_rad_s.size > 10
+
+
+def test_identification_comes_back_whole(run):
+    found = load_identification(run, 0)
+    about = run.load_stage("identify").document["channels"][0]
+    assert found.identification.model.order == about["order"]
+    assert about["fit_estimation_percent"] == {"prbs": pytest.approx(found.identification.fit_percent[0])}
+    assert set(about["fit_validation_percent"]) == {"fresh <b>prbs</b>"}
+    assert [fit.name for fit in found.fresh] == ["fresh <b>prbs</b>"]
+
+
+def test_certificate_is_that_of_the_stored_controller(run):
+    result, certificate = load_synthesis(run), load_certificate(run)
+    config = config_of(run)
+    again = certify(result.controller, [load_plant(run, config)], config.specification)
+    assert again == certificate
+
+
+def test_closed_loop_arrays_fit_the_schema(run):
+    data = run.load_stage("closed_loop")
+    samples = data.arrays["time_s"].size
+    assert data.document["draws"] == data.document["settled_draws"] == 2
+    assert data.arrays["predicted/output"].shape == (1, samples)
+    for name in ("output", "command", "limited"):
+        assert data.arrays[f"achieved/{name}"].shape == (2, samples)
+    # Noise differs between the runs, the reference does not.
+    assert not np.array_equal(*data.arrays["achieved/output"])
+    step, half = data.document["reference_step"], samples // 2
+    assert set(np.unique(data.arrays["reference"])) == {0.0, step}
+    assert np.all(data.arrays["disturbance"][:half] == 0)
+    assert np.all(data.arrays["disturbance"][half:] == data.document["disturbance"])
+    # The model predicts the machine: friction here is viscous, so only noise and ellipse are between.
+    error = data.arrays["predicted/output"][0] - data.arrays["achieved/output"][0]
+    assert np.sqrt(np.mean(error**2)) < 0.05 * step
+
+
+def test_encoder_rounds_the_hub_angle_only():
+    config, _ = load_config(FAST_ARM)
+    step = 0.01
+    source = config.source.model_copy(update={"encoder_step_rad": step})
+    arm = EncodedArm(source, [], np.random.default_rng(1))
+    for _ in range(20):
+        arm.advance(6.0)
+    hub, tip = arm.measure()
+    assert hub / step == pytest.approx(round(hub / step), abs=1e-9)
+    assert tip / step != pytest.approx(round(tip / step), abs=1e-9)
+    assert abs(hub - arm.true_output[0]) < step / 2 + 6 * paper_link().sensors.hub_angle_noise_rad
+
+
+def test_extra_effect_replaces_one_of_the_same_kind():
+    config, _ = load_config(FAST_ARM)
+    free = EncodedArm(config.source, [], np.random.default_rng(1))
+    braked = EncodedArm(
+        config.source, [{"name": "viscous_friction", "coefficient_Nms": 5.0}], np.random.default_rng(1)
+    )
+    for arm in (free, braked):
+        for _ in range(100):
+            arm.advance(3.0)
+    assert braked.true_output[0] < 0.5 * free.true_output[0]
+
+
+def make_record(name="a", dt_s=0.01, u=None):
+    y = np.arange(6.0)[:, None] ** 2
+    u = np.array([0, 1, 0, 1, 1, 0.0])[:, None] if u is None else u
+    return Record(name=name, input=u, output=y, dt_s=dt_s, input_names=("u",), output_names=("y",))
+
+
+def test_increments_are_differences():
+    record = increments(make_record())
+    np.testing.assert_array_equal(record.output[:, 0], [1, 3, 5, 7, 9])
+    np.testing.assert_array_equal(record.input[:, 0], [1, -1, 1, 0, -1])
+
+
+def test_sampling_times_that_differ_are_refused_and_jitter_is_not():
+    with pytest.raises(InputError, match=r"'a' and 'b' differ in sampling time \(0\.01 and 0\.02 s\)"):
+        with_common_sampling_time([make_record("a"), make_record("b", 0.02)])
+    alike = with_common_sampling_time([make_record("a"), make_record("b", 0.01 * (1 + 1e-9))])
+    assert alike[0].dt_s == alike[1].dt_s
+
+
+def test_constant_input_is_refused():
+    with pytest.raises(InputError, match="'u' is constant"):
+        refuse_constant_input(make_record(u=np.full((6, 1), 2.0)))
+
+
+def test_files_of_three_kinds_give_the_same_record(tmp_path):
+    from scipy.io import savemat
+
+    t = np.arange(50) * 0.02
+    table = {"t": t, "u": np.sin(t), "y": np.cos(t)}
+    lines = ["t,u,y", *(",".join(repr(float(v)) for v in row) for row in zip(*table.values(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    np.savez(tmp_path / "log.npz", **table)
+    savemat(tmp_path / "log.mat", table)
+    records = [
+        read_log(tmp_path / name, ["u"], ["y"], time="t", dt_s=None)
+        for name in ("log.csv", "log.npz", "log.mat")
+    ]
+    for record in records:
+        np.testing.assert_array_equal(record.output, records[0].output)
+        assert record.dt_s == pytest.approx(0.02)
+
+
+def test_slice_and_mirror(tmp_path, flexlink_data):
+    """The second half of the DaISy arm is the first with its sign turned, as its description says."""
+    from workflow.config import Channel, FileSource
+    from workflow.stages.records import read_record
+
+    path = flexlink_data / "daisy_robot_arm" / "robot_arm.csv"
+    tables = [
+        {"path": str(path), "stop_sample": 512},
+        {"path": str(path), "name": "second", "start_sample": 512, "mirrored": True},
+    ]
+    source = check(FileSource, {"kind": "files", "dt_s": 0.01, "records": tables}, source="x")
+    channels = [check(Channel, {"input": "u_reaction_torque", "output": "y_acceleration"}, source="x")]
+    first, second = (read_record(source, entry, channels) for entry in source.records)
+    assert isinstance(source.records[0], FileRecord)
+    assert first.n_samples == second.n_samples == 512
+    # data/README: correlation -0.996 in u and -0.998 in y before the sign is turned.
+    assert np.corrcoef(first.input[:, 0], second.input[:, 0])[0, 1] == pytest.approx(0.996, abs=1e-3)
+    assert np.corrcoef(first.output[:, 0], second.output[:, 0])[0, 1] == pytest.approx(0.998, abs=1e-3)
