@@ -25,6 +25,12 @@ def _compiled(function: _F) -> _F:
     return cast(_F, njit(cache=True, error_model="numpy")(function))
 
 
+def _inlined(function: _F) -> _F:
+    # Pieces of `run`, kept apart for the reader. As calls they would cost a factor of two: the compiler no
+    # longer sees that the work arrays do not overlap.
+    return cast(_F, njit(inline="always", error_model="numpy")(function))
+
+
 @_compiled
 def _smooth_forces(
     first: int,
@@ -70,6 +76,180 @@ def _smooth_forces(
             j += 1
 
 
+@_inlined
+def _hold(held: Real, mode: Integer, reference: Real, element: Real) -> int:
+    """Fill in the constant force of every element in its mode; return the index of the matrix set."""
+    q = 0
+    for e in range(mode.size):
+        if element[e, 0] == FRICTION:
+            if mode[e] == 0:
+                q += 1 << e
+                held[3 + e] = element[e, 1] * reference[e]
+            else:
+                held[3 + e] = -mode[e] * element[e, 2]
+        elif mode[e] != 0:
+            q += 1 << e
+            held[3 + e] = -mode[e] * element[e, 1] * element[e, 2]
+        else:
+            held[3 + e] = 0.0
+    return q
+
+
+@_inlined
+def _linear_step(w: Real, x: Real, held: Real, new: Real) -> None:
+    """Fill new with the step of the state under held inputs alone."""
+    n = x.size
+    for i in range(n):
+        new[i] = 0.0
+    for m in range(n):
+        value = x[m]
+        for i in range(n):
+            new[i] += w[m, i] * value
+    for m in range(held.size):
+        value = held[m]
+        if value != 0.0:
+            for i in range(n):
+                new[i] += w[n + m, i] * value
+
+
+@_inlined
+def _add_smooth_forces(
+    w: Real,
+    g: Real,
+    x: Real,
+    held: Real,
+    new: Real,
+    free: Real,
+    position: Real,
+    force: Real,
+    mode: Integer,
+    channel_kind: Integer,
+    channel: Real,
+    channel_rows: Real,
+    static_moment: Real,
+    geometric_stiffness: Real,
+) -> None:
+    """Add to new what the smooth forces do in the step, by collocation at its start, middle and end (order
+    4).
+
+    free (2J,), position (3, J) and force (3, J) are work space; the last force is that at the end of the
+    step.
+    """
+    n, n_channels = x.size, channel_kind.size
+    first = n + held.size
+    for j in range(n_channels):
+        total = 0.0
+        for i in range(n):
+            total += channel_rows[i, j] * x[i]
+        position[0, j] = total
+    for column in range(2 * n_channels):
+        total = 0.0
+        for m in range(n):
+            total += g[m, column] * x[m]
+        for m in range(held.size):
+            total += g[n + m, column] * held[m]
+        free[column] = total
+    _smooth_forces(0, 0, position, force, mode, channel_kind, channel, static_moment, geometric_stiffness)
+    for j in range(n_channels):
+        force[1, j], force[2, j] = force[0, j], force[0, j]
+    # The sweeps contract by h |df/dv| / J, which `plant.plan` keeps below 0.3.
+    for sweep in range(12):
+        change, size = 0.0, 1e-3
+        for later in range(2):
+            for j in range(n_channels):
+                column = later * n_channels + j
+                total = free[column]
+                for node in range(3):
+                    for c in range(n_channels):
+                        total += g[first + node * n_channels + c, column] * force[node, c]
+                change = max(change, abs(total - position[1 + later, j]))
+                size = max(size, abs(total))
+                position[1 + later, j] = total
+        if sweep > 0 and change <= 1e-9 * size:
+            break
+        _smooth_forces(1, 2, position, force, mode, channel_kind, channel, static_moment, geometric_stiffness)
+    for node in range(3):
+        for c in range(n_channels):
+            value, row = force[node, c], first + node * n_channels + c
+            for i in range(n):
+                new[i] += w[row, i] * value
+
+
+@_inlined
+def _along(row: Real, x: Real) -> float:
+    total = 0.0
+    for i in range(x.size):
+        total += row[i] * x[i]
+    return total
+
+
+@_compiled
+def _largest_stretch(element: Real, e: int, speed: float) -> float:
+    """Stretch of a friction element at which its force is the friction level of this speed."""
+    level = element[e, 2]
+    if element[e, 3] != 0.0:
+        level += element[e, 3] * np.exp(-abs(speed) / element[e, 4])
+    return float(level / element[e, 1])
+
+
+@_inlined
+def _modes_still_hold(
+    new: Real,
+    held: Real,
+    force: Real,
+    mode: Integer,
+    wanted: Integer,
+    reference: Real,
+    element: Real,
+    element_rows: Real,
+    element_rate: Real,
+) -> bool:
+    """Fill wanted with the mode every element has in the state new; whether all are as assumed."""
+    n, n_held = new.size, held.size
+    same = True
+    for e in range(mode.size):
+        angle, speed = _along(element_rows[e, 0], new), _along(element_rows[e, 1], new)
+        wanted[e] = mode[e]
+        if element[e, 0] == CONTACT:
+            side = 1 if angle > 0 else -1
+            depth = side * angle - element[e, 1]
+            push = element[e, 2] * depth + element[e, 3] * side * speed
+            wanted[e] = side if depth > 0.0 and push > 0.0 else 0
+        elif mode[e] == 0:
+            stretch = angle - reference[e]
+            if abs(stretch) >= _largest_stretch(element, e, speed):
+                wanted[e] = 1 if stretch > 0 else -1
+        else:
+            # The slider follows only while its own speed, shaft minus rate of stretch, keeps the sign.
+            slider = speed
+            if element[e, 3] != 0.0:
+                rate = 0.0
+                for i in range(n):
+                    rate += element_rate[e, i] * new[i]
+                for m in range(n_held):
+                    rate += element_rate[e, n + m] * held[m]
+                for j in range(force.shape[1]):
+                    rate += element_rate[e, n + n_held + j] * force[2, j]
+                softening = element[e, 3] / element[e, 4] * np.exp(-abs(speed) / element[e, 4])
+                slider += mode[e] * np.sign(speed) * softening * rate / element[e, 1]
+            if mode[e] * slider <= 0.0 or mode[e] * speed <= 0.0:
+                wanted[e] = 0
+        same = same and wanted[e] == mode[e]
+    return same
+
+
+@_inlined
+def _switch(
+    x: Real, mode: Integer, wanted: Integer, reference: Real, element: Real, element_rows: Real
+) -> None:
+    """Take over the wanted modes; a friction element that sticks keeps the stretch it has."""
+    for e in range(mode.size):
+        if wanted[e] != mode[e] and element[e, 0] == FRICTION and wanted[e] == 0:
+            angle, speed = _along(element_rows[e, 0], x), _along(element_rows[e, 1], x)
+            reference[e] = angle - mode[e] * _largest_stretch(element, e, speed)
+        mode[e] = wanted[e]
+
+
 @_compiled
 def run(
     inputs: Real,
@@ -93,7 +273,7 @@ def run(
     """Advance the state over T samples, writing the outputs at the start of each.
 
     inputs (T, 4): voltage of the first and second part of the sample, hub torque, tip force.
-    observed (T, O): filled with output_rows (N, O) applied to the state at the start of each sample.
+    observed (T, O): filled with output_rows (O, N) applied to the state at the start of each sample.
     x (N,), reference (E,), mode (E,): state, friction slider positions, slip and contact signs; changed in
         place.
     substeps (G,): steps per part of the sample (G = 1, or 2 with a fractional delay).
@@ -108,162 +288,51 @@ def run(
     static_moment (M,), geometric_stiffness (M, M): of the modes under gravity; empty without it.
     """
     n, n_elements, n_channels = x.size, mode.size, channel_kind.size
-    n_held = 3 + n_elements
-    levels = step.shape[2]
-    held = np.zeros(n_held)
-    new = np.empty(n)
-    free = np.empty(2 * n_channels)
-    position, f = np.zeros((3, n_channels)), np.zeros((3, n_channels))
+    top = step.shape[2] - 1
+    held, new = np.zeros(3 + n_elements), np.empty(n)
+    free, position, force = np.empty(2 * n_channels), np.zeros((3, n_channels)), np.zeros((3, n_channels))
     wanted = np.zeros(n_elements, dtype=np.int64)
     for k in range(inputs.shape[0]):
         for o in range(observed.shape[1]):
-            total = 0.0
-            for i in range(n):
-                total += output_rows[i, o] * x[i]
-            observed[k, o] = total
+            observed[k, o] = _along(output_rows[o], x)
         for part in range(substeps.size):
             held[0], held[1], held[2] = inputs[k, part], inputs[k, 2], inputs[k, 3]
             for _ in range(substeps[part]):
-                remaining, level = 1 << (levels - 1), levels - 1
+                # Time left in this step in units of the smallest one; a step of size 2^level starts on a
+                # multiple of it.
+                remaining, level = 1 << top, top
                 while remaining > 0:
-                    # Which linear system holds, and with which constant forces.
-                    q = 0
-                    for e in range(n_elements):
-                        if element[e, 0] == FRICTION:
-                            if mode[e] == 0:
-                                q += 1 << e
-                                held[3 + e] = element[e, 1] * reference[e]
-                            else:
-                                held[3 + e] = -mode[e] * element[e, 2]
-                        elif mode[e] != 0:
-                            q += 1 << e
-                            held[3 + e] = -mode[e] * element[e, 1] * element[e, 2]
-                        else:
-                            held[3 + e] = 0.0
+                    q = _hold(held, mode, reference, element)
                     w = step[part, q, level]
-                    for i in range(n):
-                        new[i] = 0.0
-                    for m in range(n):
-                        value = x[m]
-                        for i in range(n):
-                            new[i] += w[m, i] * value
-                    for m in range(n_held):
-                        value = held[m]
-                        if value != 0.0:
-                            for i in range(n):
-                                new[i] += w[n + m, i] * value
+                    _linear_step(w, x, held, new)
                     if n_channels > 0:
-                        g = reach[part, q, level]
-                        for j in range(n_channels):
-                            total = 0.0
-                            for i in range(n):
-                                total += channel_rows[i, j] * x[i]
-                            position[0, j] = total
-                        for j in range(2 * n_channels):
-                            total = 0.0
-                            for m in range(n):
-                                total += g[m, j] * x[m]
-                            for m in range(n_held):
-                                total += g[n + m, j] * held[m]
-                            free[j] = total
-                        _smooth_forces(
-                            0, 0, position, f, mode, channel_kind, channel, static_moment, geometric_stiffness
+                        _add_smooth_forces(
+                            w,
+                            reach[part, q, level],
+                            x,
+                            held,
+                            new,
+                            free,
+                            position,
+                            force,
+                            mode,
+                            channel_kind,
+                            channel,
+                            channel_rows,
+                            static_moment,
+                            geometric_stiffness,
                         )
-                        for j in range(n_channels):
-                            f[1, j], f[2, j] = f[0, j], f[0, j]
-                        # Collocation at start, middle and end (order 4). The sweeps contract by h |df/dv| / J,
-                        # which `plant.plan` keeps below 0.3.
-                        for sweep in range(12):
-                            change, size = 0.0, 1e-3
-                            for later in range(2):
-                                for j in range(n_channels):
-                                    column = later * n_channels + j
-                                    total = free[column]
-                                    for node in range(3):
-                                        for c in range(n_channels):
-                                            row = n + n_held + node * n_channels + c
-                                            total += g[row, column] * f[node, c]
-                                    change = max(change, abs(total - position[1 + later, j]))
-                                    size = max(size, abs(total))
-                                    position[1 + later, j] = total
-                            if sweep > 0 and change <= 1e-9 * size:
-                                break
-                            _smooth_forces(
-                                1,
-                                2,
-                                position,
-                                f,
-                                mode,
-                                channel_kind,
-                                channel,
-                                static_moment,
-                                geometric_stiffness,
-                            )
-                        for node in range(3):
-                            for c in range(n_channels):
-                                value = f[node, c]
-                                row = n + n_held + node * n_channels + c
-                                for i in range(n):
-                                    new[i] += w[row, i] * value
-                    # Does every element still hold its mode at the end of the step?
-                    event = False
-                    for e in range(n_elements):
-                        angle, speed = 0.0, 0.0
-                        for i in range(n):
-                            angle += element_rows[e, 0, i] * new[i]
-                            speed += element_rows[e, 1, i] * new[i]
-                        wanted[e] = mode[e]
-                        if element[e, 0] == FRICTION:
-                            limit = element[e, 2]
-                            if element[e, 3] != 0.0:
-                                limit += element[e, 3] * np.exp(-abs(speed) / element[e, 4])
-                            limit /= element[e, 1]
-                            if mode[e] == 0:
-                                stretch = angle - reference[e]
-                                if abs(stretch) >= limit:
-                                    wanted[e] = 1 if stretch > 0 else -1
-                            else:
-                                # The slider follows only while its own speed, shaft minus stretch rate,
-                                # keeps the sign.
-                                slider = speed
-                                if element[e, 3] != 0.0:
-                                    rate = 0.0
-                                    for i in range(n):
-                                        rate += element_rate[q, e, i] * new[i]
-                                    for m in range(n_held):
-                                        rate += element_rate[q, e, n + m] * held[m]
-                                    for j in range(n_channels):
-                                        rate += element_rate[q, e, n + n_held + j] * f[2, j]
-                                    softening = (
-                                        element[e, 3] / element[e, 4] * np.exp(-abs(speed) / element[e, 4])
-                                    )
-                                    slider += mode[e] * np.sign(speed) * softening * rate / element[e, 1]
-                                if mode[e] * slider <= 0.0 or mode[e] * speed <= 0.0:
-                                    wanted[e] = 0
-                        else:
-                            side = 1 if angle > 0 else -1
-                            depth = side * angle - element[e, 1]
-                            push = element[e, 2] * depth + element[e, 3] * side * speed
-                            wanted[e] = side if depth > 0.0 and push > 0.0 else 0
-                        event = event or wanted[e] != mode[e]
-                    if event and level > 0:
-                        level -= 1
-                        continue
+                    if n_elements > 0:
+                        same = _modes_still_hold(
+                            new, held, force, mode, wanted, reference, element, element_rows, element_rate[q]
+                        )
+                        if not same and level > 0:
+                            level -= 1
+                            continue
+                        if not same:
+                            _switch(new, mode, wanted, reference, element, element_rows)
                     for i in range(n):
                         x[i] = new[i]
-                    if event:
-                        for e in range(n_elements):
-                            if wanted[e] != mode[e]:
-                                if element[e, 0] == FRICTION and wanted[e] == 0:
-                                    angle, speed = 0.0, 0.0
-                                    for i in range(n):
-                                        angle += element_rows[e, 0, i] * x[i]
-                                        speed += element_rows[e, 1, i] * x[i]
-                                    limit = element[e, 2]
-                                    if element[e, 3] != 0.0:
-                                        limit += element[e, 3] * np.exp(-abs(speed) / element[e, 4])
-                                    reference[e] = angle - mode[e] * limit / element[e, 1]
-                                mode[e] = wanted[e]
                     remaining -= 1 << level
                     level = 0
                     while remaining > 0 and (remaining >> level) & 1 == 0:

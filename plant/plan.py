@@ -135,7 +135,7 @@ def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: flo
         substeps=np.array(substeps, dtype=np.int64),
         step=step,
         reach=reach,
-        output_rows=np.ascontiguousarray(builder.outputs().T),
+        output_rows=builder.outputs(),
         element=element,
         element_rows=element_rows,
         element_rate=rate,

@@ -157,7 +157,7 @@ class SampledArm:
         self._rng = rng
         self._inputs = np.zeros((1, 4))
         self._unused = np.empty((1, 3))
-        self._rows = self._plan.output_rows.T.copy()
+        self._rows = self._plan.output_rows
         self.reset()
 
     @property
