@@ -16,6 +16,7 @@ from control_design.synthesis import Outcome, SynthesisOptions, synthesise
 from ident.embedding import tangent
 from ident.identify import identify
 from ident.model import GobfModel
+from ident.nominal import nominal_near
 from ident.options import IdentOptions
 from ident.record import Record
 from ident.uncertainty import ResponsePosterior
@@ -32,7 +33,7 @@ from workflow.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 from workflow.stages.identify import describe_model
 from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.stages.results import ChannelResult, load_plant
-from workflow.stages.uncertainty import band_row, bands_of, display_grid, residual_tests
+from workflow.stages.uncertainty import band_row, bands_of, display_grid, nominal_row, residual_tests
 from workflow.storage import AnyArray
 from workflow.summary import (
     RunSummary,
@@ -158,6 +159,7 @@ def identify_logs(
         fresh = tuple(fit_on_fresh_data(found.model, record) for record in fresh_logs)
         posterior = tangent(used, found.model)
         omega = display_grid(found.model, used)
+        nominal = nominal_near(posterior, found.model.poles, omega)
         frequency = posterior.at(omega, level)
     about = {
         "name": output_name,
@@ -172,9 +174,10 @@ def identify_logs(
         "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
         "tests": tests,
         "repeat_scatter": None,
+        "nominal": nominal_row(frequency, nominal),
     }
     if out is not None:
-        storage.write_npz(out, plant_arrays(found.model, posterior, level))
+        storage.write_npz(out, plant_arrays(nominal, posterior, level))
     return RunSummary(
         title=f"{input_name} to {output_name}",
         sections=(Section("model", channel_rows(about)), Section("uncertainty", uncertainty_rows(spread))),

@@ -168,6 +168,15 @@ def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:
         if test["data"] == "estimation":
             passed = "pass" if test["passed"] else "FAIL"
             rows.append(Row(f"residuals, {test['name']}", f"{passed}: {test['verdict']}"))
+    if "nominal" in spread:
+        row = spread["nominal"]
+        rows.append(
+            Row(
+                "nominal model",
+                f"inside {row['share_inside_percent']:.3g} % of the ellipses, at most "
+                f"{row['largest_distance']:.3g} of one from the centre ({row['at_rad_s']:.4g} rad/s)",
+            )
+        )
     if spread["repeat_scatter"]:
         ratios = [row["ratio"] for row in spread["repeat_scatter"]]
         rows.append(Row("repeat scatter", f"{_range(ratios, '')} times the predicted (by band)"))

@@ -31,8 +31,10 @@ uncertainty.npz
     document  channels: list of {name, method, level, report: EmbeddingReport.to_dict()|null, bands: list
               of {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis
               over |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()},
-              repeat_scatter: null or list of ScatterRow.to_dict()}
+              repeat_scatter: null or list of ScatterRow.to_dict(), nominal {share_inside_percent,
+              largest_distance, at_rad_s}}
     arrays    channel/<k>/posterior/...       ident.ResponsePosterior
+              channel/<k>/nominal/...         ident.GobfModel: the identified poles, nearest to the posterior
               channel/<k>/frequency/...       ident.FrequencyUncertainty on the display grid
               channel/<k>/empirical/...       ident.FrequencyUncertainty without a model; may be absent
 
@@ -47,9 +49,9 @@ certify.json
 
 closed_loop.npz, or closed_loop.json when there was nothing to run
     document  skipped: null or the reason; machine "simulated"|"identified"; if not skipped also tracking
-              (asked for), draws, settled_draws, reference_step, disturbance, quantisation, measurement_step,
-              input_limit|null, predicted: {StepMetrics.to_dict(), disturbance_peak, disturbance_left,
-              settled}, achieved: list of the same, one per draw
+              (asked for), draws, settled_draws, reference_step, disturbance, quantisation,
+              measurement_step, input_limit|null, predicted: {StepMetrics.to_dict(), disturbance_peak,
+              disturbance_left, settled}, achieved: list of the same, one per draw
     arrays    time_s, reference, disturbance  (T,); the disturbance adds to the plant's input from T // 2 on
               predicted/output, /command, /limited, /performance  (1, T): on the posterior mean
               achieved/...                    (R, T): R runs on the machine

@@ -9,6 +9,7 @@ from control_design.plant_set import Channel as PlantChannel
 from control_design.plant_set import UncertainPlant
 from control_design.synthesis import SynthesisResult
 from ident.identify import Identification
+from ident.model import GobfModel
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.validation import FreshFit
@@ -75,6 +76,11 @@ def load_posterior(run: RunDirectory, index: int) -> ResponsePosterior:
     return ResponsePosterior.from_arrays(run.load_stage("uncertainty").under(f"channel/{index}/posterior/"))
 
 
+def load_nominal(run: RunDirectory, index: int) -> GobfModel:
+    """What the design calls nominal for channel `index`: the identified poles, nearest to the posterior."""
+    return GobfModel.from_arrays(run.load_stage("uncertainty").under(f"channel/{index}/nominal/"))
+
+
 def load_frequency(run: RunDirectory, index: int) -> FrequencyUncertainty:
     """Ellipses of channel `index` on the display grid."""
     return FrequencyUncertainty.from_arrays(
@@ -90,12 +96,12 @@ def load_empirical(run: RunDirectory, index: int) -> FrequencyUncertainty | None
 
 def load_plant(run: RunDirectory, config: RunConfig) -> UncertainPlant:
     """The uncertain plant the controller is designed for: control channel and first performance channel."""
-    identify, uncertainty = run.load_stage("identify"), run.load_stage("uncertainty")
+    data = run.load_stage("uncertainty")
 
     def channel(index: int) -> PlantChannel:
-        model = Identification.from_arrays(identify.under(f"channel/{index}/identification/")).model
-        posterior = ResponsePosterior.from_arrays(uncertainty.under(f"channel/{index}/posterior/"))
-        return PlantChannel(model.to_control(), posterior, config.channels[index].uncertainty.level)
+        nominal = GobfModel.from_arrays(data.under(f"channel/{index}/nominal/"))
+        posterior = ResponsePosterior.from_arrays(data.under(f"channel/{index}/posterior/"))
+        return PlantChannel(nominal.to_control(), posterior, config.channels[index].uncertainty.level)
 
     control = channel(config.control_index)
     performance = config.performance_index

@@ -15,6 +15,7 @@ from control_design.plant_set import Mode
 from ident.conditions import combine_posteriors, record_posteriors
 from ident.embedding import EmbeddingOptions, classical, common_fir_length, tangent
 from ident.model import GobfModel
+from ident.nominal import nominal_near
 from ident.nonparametric import empirical_frf
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -50,11 +51,13 @@ def find_uncertainty(stage: StageInput) -> StageData:
             posterior = posterior_of(result, channel.uncertainty, records)
             omega = display_grid(model, result.used)
             frequency = posterior.at(omega, channel.uncertainty.level)
+            nominal = nominal_near(posterior, model.poles, omega)
             empirical = empirical_response(result.used, channel.uncertainty.level)
             scatter = scatter_of(channel, model, records, bands_of(omega))
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in posterior.to_arrays().items()}
         arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
+        arrays |= {f"{at}nominal/{key}": value for key, value in nominal.to_arrays().items()}
         if empirical is not None:
             arrays |= {f"{at}empirical/{key}": value for key, value in empirical.to_arrays().items()}
         about.append(
@@ -66,6 +69,7 @@ def find_uncertainty(stage: StageInput) -> StageData:
                 "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
                 "tests": residual_tests(result, posterior),
                 "repeat_scatter": scatter,
+                "nominal": nominal_row(frequency, nominal),
             }
         )
     return StageData(arrays, {"channels": about})
@@ -131,6 +135,17 @@ def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> dict[s
         "to_rad_s": high,
         "median_radius_percent": float(np.median(relative)),
         "largest_radius_percent": float(np.max(relative)),
+    }
+
+
+def nominal_row(frequency: FrequencyUncertainty, nominal: GobfModel) -> dict[str, float]:
+    """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
+    distance = frequency.normalised_distance(nominal.frequency_response(frequency.omega_rad_s))
+    worst = int(np.argmax(distance))
+    return {
+        "share_inside_percent": 100 * float(np.mean(distance <= 1)),
+        "largest_distance": float(distance[worst]),
+        "at_rad_s": float(frequency.omega_rad_s[worst]),
     }
 
 
