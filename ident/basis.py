@@ -238,7 +238,9 @@ def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int)
                     x1_next = gb * x1 - gs * x2 + sg * v
                     x2 = sb * x1 + beta * x2
                     x1 = x1_next
-            out2[stop:length] = 0.0
+            for k in range(stop, length):
+                out2[k] = 0.0
             row += 2
-        out1[stop:length] = 0.0
+        for k in range(stop, length):
+            out1[k] = 0.0
         alive = max(alive, stop)

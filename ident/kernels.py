@@ -37,6 +37,41 @@ def _subtract(target: Any, factor: float, row: Any, lo: int, hi: int) -> None:
 
 
 @numba.njit(cache=True)
+def _copy(target: Any, source: Any) -> None:
+    # Array assignments would do, but each makes numba compile seconds of broadcasting code.
+    for k in range(source.size):
+        target[k] = source[k]
+
+
+@numba.njit(cache=True)
+def _dots(rows: Any, others: Any, lo: int, hi: int) -> Any:
+    """Inner products (A, B) of rows (A, N) and others (B, N) over lo..hi."""
+    products = np.empty((rows.shape[0], others.shape[0]))
+    for i in range(rows.shape[0]):
+        for j in range(others.shape[0]):
+            products[i, j] = _dot(rows[i], others[j], lo, hi)
+    return products
+
+
+@numba.njit(cache=True)
+def _place(target: Any, part: Any, row: int, column: int) -> None:
+    for i in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            target[row + i, column + j] = part[i, j]
+
+
+@numba.njit(cache=True)
+def _subtract_products(target: Any, a: Any, b: Any, row: int, column: int) -> None:
+    """target[row:, column:] -= a b^T."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            total = 0.0
+            for q in range(a.shape[1]):
+                total += a[i, q] * b[j, q]
+            target[row + i, column + j] -= total
+
+
+@numba.njit(cache=True)
 def _schur_drop(gram: Any, b: Any) -> float:
     """b^T gram^-1 b by Cholesky; dependent columns are left out."""
     n = b.size
@@ -83,65 +118,46 @@ def candidate_rss(
     for i in range(blocks.shape[0]):
         m += 1 if i < n_real else 2
     phi = np.empty((m, n_total))
-    signal = w.copy()
+    signal = np.empty((1, n_total))
+    _copy(signal[0], w)
     for r in range(n_records):
-        run_cascade(blocks, n_real, signal, phi, 0, starts[r], starts[r + 1])
-    n_local, n_shared = local_q.shape[0], shared_q.shape[0]
-    size = m + (m * n_records if free else 0)
+        run_cascade(blocks, n_real, signal[0], phi, 0, starts[r], starts[r + 1])
+    _copy(signal[0], residual)
+    # Free responses first: unknown i of record r has the index r m + i, the shared columns follow.
+    first = m * n_records if free else 0
+    size = first + m
     gram = np.zeros((size, size))
     b = np.zeros(size)
-    # Free responses first: unknown i of record r has the index r m + i, the shared columns follow.
-    first = size - m
-    shared = np.zeros((size, n_shared))
+    on_shared = np.zeros((size, shared_q.shape[0]))
+    _place(gram, _dots(phi, phi, 0, n_total), first, first)
+    _place(on_shared, _dots(phi, shared_q, 0, n_total), first, 0)
+    along = _dots(phi, signal, 0, n_total)
     for i in range(m):
-        for q in range(n_shared):
-            shared[first + i, q] = _dot(phi[i], shared_q[q], 0, n_total)
-        b[first + i] = _dot(phi[i], residual, 0, n_total)
-        for j in range(i + 1):
-            gram[first + i, first + j] = _dot(phi[i], phi[j], 0, n_total)
-    on_local = np.empty((2 * m, n_local))
+        b[first + i] = along[i, 0]
+    response = np.empty((m, n_total))
     if free:
         longest = 0
         for r in range(n_records):
             longest = max(longest, starts[r + 1] - starts[r])
-        response = np.empty((m, longest))
         run_cascade_free(blocks, n_real, response, 0, longest)
-        placed = np.empty((m, n_total))
-    else:
-        placed = phi
+    placed = np.empty((m, n_total))
     for r in range(n_records):
         lo, hi = starts[r], starts[r + 1]
+        on_local = _dots(phi, local_q, lo, hi)
+        _subtract_products(gram, on_local, on_local, first, first)
         if free:
             for i in range(m):
-                for k in range(hi - lo):
-                    placed[i, lo + k] = response[i, k]
-                for q in range(n_local):
-                    on_local[m + i, q] = _dot(placed[i], local_q[q], lo, hi)
-                for q in range(n_shared):
-                    shared[r * m + i, q] = _dot(placed[i], shared_q[q], lo, hi)
-                b[r * m + i] = _dot(placed[i], residual, lo, hi)
-        for i in range(m):
-            for q in range(n_local):
-                on_local[i, q] = _dot(phi[i], local_q[q], lo, hi)
-        for i in range(m):
-            for j in range(i + 1):
-                for q in range(n_local):
-                    gram[first + i, first + j] -= on_local[i, q] * on_local[j, q]
-            if free:
-                for j in range(i + 1):
-                    value = _dot(placed[i], placed[j], lo, hi)
-                    for q in range(n_local):
-                        value -= on_local[m + i, q] * on_local[m + j, q]
-                    gram[r * m + i, r * m + j] = value
-                for j in range(m):
-                    value = _dot(phi[i], placed[j], lo, hi)
-                    for q in range(n_local):
-                        value -= on_local[i, q] * on_local[m + j, q]
-                    gram[first + i, r * m + j] = value
-    for i in range(size):
-        for j in range(i + 1):
-            for q in range(n_shared):
-                gram[i, j] -= shared[i, q] * shared[j, q]
+                _copy(placed[i, lo:hi], response[i, : hi - lo])
+            free_on_local = _dots(placed, local_q, lo, hi)
+            _place(gram, _dots(placed, placed, lo, hi), r * m, r * m)
+            _subtract_products(gram, free_on_local, free_on_local, r * m, r * m)
+            _place(gram, _dots(phi, placed, lo, hi), first, r * m)
+            _subtract_products(gram, on_local, free_on_local, first, r * m)
+            _place(on_shared, _dots(placed, shared_q, lo, hi), r * m, 0)
+            along = _dots(placed, signal, lo, hi)
+            for i in range(m):
+                b[r * m + i] = along[i, 0]
+    _subtract_products(gram, on_shared, on_shared, 0, 0)
     return _dot(residual, residual, 0, n_total) - _schur_drop(gram, b)
 
 
@@ -172,12 +188,14 @@ def linearise(
     n_local = n_poly + (n if free else 0)
     n_shared = n + (1 if feedthrough else 0)
     rows = np.empty((n_local + n_shared, n_total))
-    rows[:n_poly] = polynomials
-    signal = u.copy()
+    for i in range(n_poly):
+        _copy(rows[i], polynomials[i])
+    signal = np.empty(n_total)
+    _copy(signal, u)
     for r in range(n_records):
         run_cascade(blocks, n_real, signal, rows, n_local, starts[r], starts[r + 1])
     if feedthrough:
-        rows[n_local + n] = u
+        _copy(rows[n_local + n], u)
     if free:
         longest = 0
         for r in range(n_records):
@@ -188,8 +206,10 @@ def linearise(
             for i in range(n):
                 for k in range(starts[r + 1] - starts[r]):
                     rows[n_poly + i, starts[r] + k] = response[i, k]
-    raw = rows[n_local:].copy()
-    residual[:] = y
+    raw = np.empty((n_shared, n_total))
+    for i in range(n_shared):
+        _copy(raw[i], rows[n_local + i])
+    _copy(residual, y)
     for r in range(n_records):
         lo, hi = starts[r], starts[r + 1]
         for j in range(n_local):
@@ -213,20 +233,23 @@ def linearise(
         _subtract(residual, theta[j], row, 0, n_total)
     # The fitted output that the poles make. With free responses among the columns a polynomial part does no
     # harm (filtered, it stays in the span of the columns); without them it has to be left out.
-    fitted = y - residual
+    fitted = np.empty(n_total)
+    _copy(fitted, y)
+    _subtract(fitted, 1.0, residual, 0, n_total)
     if not free:
         for j in range(n_shared - 1, -1, -1):
             for i in range(j + 1, n_shared):
                 theta[j] -= triangle[j, i] * theta[i]
             theta[j] = theta[j] / triangle[j, j] if triangle[j, j] > 0 else 0.0
-        fitted[:] = 0.0
+        for k in range(n_total):
+            fitted[k] = 0.0
         for j in range(n_shared):
             _subtract(fitted, -theta[j], raw[j], 0, n_total)
     states = np.empty((n, n_total))
     at = 0
     for i in range(blocks.shape[0]):
         single = blocks[i : i + 1]
-        signal[:] = fitted
+        _copy(signal, fitted)
         for r in range(n_records):
             run_cascade(single, 1 if i < n_real else 0, signal, states, at, starts[r], starts[r + 1])
         at += 1 if i < n_real else 2
@@ -250,7 +273,8 @@ def _normalise(row: Any, size_before: float, lo: int, hi: int) -> float:
     left."""
     size = _dot(row, row, lo, hi)
     if not size > _RANK_TOLERANCE**2 * size_before:
-        row[lo:hi] = 0.0
+        for k in range(lo, hi):
+            row[k] = 0.0
         return 0.0
     length = np.sqrt(size)
     part = row[lo:hi]
