@@ -11,7 +11,7 @@ from typing import Self
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TaskID, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from workflow.summary import RunSummary
@@ -22,7 +22,7 @@ class _Remaining(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         left = task.fields.get("remaining_s")
-        return Text("" if left is None else f"about {left:.0f} s left", style="cyan")
+        return Text("" if left is None else f"about {left:.0f} s left", style="cyan", no_wrap=True)
 
 
 class TerminalProgress:
@@ -33,7 +33,7 @@ class TerminalProgress:
         console = Console(stderr=True)
         self._bar = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
             BarColumn(bar_width=30),
             TextColumn("{task.percentage:>3.0f} %"),
             _Remaining(),

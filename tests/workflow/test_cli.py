@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.workflow.conftest import FAST_ARM, start_flexlink
+from tests.workflow.command import FAST_ARM, start_flexlink
 from workflow.cli import main
 
 FILES_CONFIG = """

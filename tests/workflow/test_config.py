@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.workflow.conftest import FAST_ARM, ROOT
+from tests.workflow.command import FAST_ARM, ROOT
 from workflow.config import FileSource, RunConfig, SimulatedSource, load_config
 from workflow.entry import built_in_config
 from workflow.errors import InputError

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.workflow.conftest import FAST_ARM, start_flexlink
+from tests.workflow.command import FAST_ARM, start_flexlink
 from workflow import storage
 from workflow.config import load_config
 from workflow.entry import run_from_files

@@ -9,7 +9,7 @@ from control_design.certificate import certify
 from ident.record import Record
 from plant import linear_arm
 from plant.presets import paper_link
-from tests.workflow.conftest import FAST_ARM
+from tests.workflow.command import FAST_ARM
 from workflow.config import FileRecord, load_config
 from workflow.errors import InputError
 from workflow.pipeline import config_of

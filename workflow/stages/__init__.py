@@ -70,21 +70,21 @@ __all__ = ["STAGES", "Stage", "StageInput"]
 
 STAGES: tuple[Stage, ...] = (
     Stage("records", (), records.settings, records.make_records, expected_s=1.0),
-    Stage("identify", ("records",), identify.settings, identify.identify_channels, expected_s=5.0),
+    Stage("identify", ("records",), identify.settings, identify.identify_channels, expected_s=2.0),
     Stage(
         "uncertainty",
         ("records", "identify"),
         uncertainty.settings,
         uncertainty.find_uncertainty,
-        expected_s=4.0,
+        expected_s=2.0,
     ),
-    Stage("design", ("identify", "uncertainty"), design.settings, design.design_controller, expected_s=20.0),
+    Stage("design", ("identify", "uncertainty"), design.settings, design.design_controller, expected_s=15.0),
     Stage(
         "certify",
         ("identify", "uncertainty", "design"),
         certify.settings,
         certify.certify_controller,
-        expected_s=4.0,
+        expected_s=1.0,
     ),
     Stage(
         "closed_loop",
@@ -98,7 +98,7 @@ STAGES: tuple[Stage, ...] = (
         ("records", "identify", "uncertainty", "design", "certify", "closed_loop"),
         report.settings,
         report.write_page,
-        expected_s=8.0,
+        expected_s=7.0,
         also_writes=report.page,
     ),
 )

@@ -1,0 +1,32 @@
+"""Calling the command line from tests, in this process or in one that can be killed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+FAST_ARM = Path(__file__).parent / "data" / "fast_arm.toml"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+
+def start_flexlink(*arguments: object) -> subprocess.Popen[bytes]:
+    """`flexlink` in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "workflow", *(str(argument) for argument in arguments)],
+        cwd=ROOT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
