@@ -236,11 +236,20 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
     them."""
     data, options = outcome.data, outcome.search.options
     free = prepare(records, replace(data.structure, estimate_initial_state=True))
-    order = outcome.best.poles.order
-    if not free.n_samples > free.n_parameters(order) > data.n_parameters(order):
+    without = outcome.best
+    if not free.n_samples > free.n_parameters(max(without.poles.order, 4)):
         return outcome
-    end = PoleSearch(free, options).descend(outcome.best.poles, "with initial state")
-    if not _nuisance_test("initial state", (data, outcome.best), (free, end)).needed:
+    search = PoleSearch(free, options)
+    if without.poles.order - search.fixed.order < 3 and None in (options.n_real, options.n_pairs):
+        # Nothing found from rest: a free decay looks just so. Judge by what a search with free responses
+        # finds.
+        most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
+        n_real = min(2, options.max_real) if options.n_real is None else options.n_real
+        end = search.joint(n_real, min(1, most_pairs))
+        without = PoleSearch(data, options).descend(end.poles, "from rest")
+    else:
+        end = search.descend(without.poles, "with initial state")
+    if end.poles.order == 0 or not _nuisance_test("initial state", (data, without), (free, end)).needed:
         return outcome
     return _searched(free, options, lambda fraction, message: report(0.5 + 0.45 * fraction, message))
 
@@ -248,6 +257,8 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
 def _fitted_on_all(records: Sequence[Record], options: IdentOptions, outcome: _Outcome) -> Identification:
     """Polish on all samples and decide what was left to the data: initial state first, then the offset."""
     structure, search, best = outcome.data.structure, outcome.search, outcome.best
+    if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
+        structure = replace(structure, estimate_initial_state=False)
     data = prepare(records, structure)
     if data.n_samples != outcome.data.n_samples:
         best = _moved(data, best, search)
@@ -270,7 +281,18 @@ def _fitted_on_all(records: Sequence[Record], options: IdentOptions, outcome: _O
         test = _nuisance_test(name, without, with_it)
         verdicts.append(test.verdict())
         data, best = with_it if test.needed else without
+    best = replace(best, poles=_in_order(best.poles, search.fixed))
     return _result(records, data, best, outcome, tuple(verdicts))
+
+
+def _in_order(poles: Poles, fixed: Poles) -> Poles:
+    """Fixed poles first as they are, then real ones from slow to fast and pairs from low to high
+    frequency."""
+    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
+    return Poles(
+        np.concatenate([poles.real[: fixed.real.size], np.sort(real)[::-1]]),
+        np.concatenate([poles.pairs[: fixed.pairs.size], pairs[np.argsort(np.abs(np.log(pairs)))]]),
+    )
 
 
 def _moved(data: Regression, best: Polished, search: PoleSearch) -> Polished:
@@ -341,6 +363,12 @@ def _result(
 def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> list[str]:
     """One sentence of advice for each searched pole that ended at a bound."""
     sentences = []
+    if poles.order == 0:
+        sentences.append(
+            "no pole was worth keeping: the output shows no dynamics driven by this input; check the "
+            "columns, the "
+            "delay and the amplitude of the input"
+        )
     close = 1 + 1e-6
     for a in poles.real[fixed.real.size :]:
         if 1 - a <= bounds.distance_min * close:

@@ -296,3 +296,33 @@ def test_effective_samples_of_white_and_coloured_noise():
     coloured = scipy.signal.lfilter([1], [1, -0.9], white)
     # AR(1): 1 + 2 sum 0.81^k = (1 + 0.81)/(1 - 0.81) = 9.5.
     assert effective_samples(coloured, starts) == pytest.approx(20_000 / 9.53, rel=0.15)
+
+
+def test_a_free_decay_is_recognised():
+    """Next to no input, a state nobody knows: found by the free responses, although nothing is driven."""
+    rng = np.random.default_rng(0)
+    k = np.arange(600)
+    u = 1e-3 * rng.normal(size=600)
+    y = 0.99**k * np.cos(0.2 * k) + 1e-3 * rng.normal(size=600)
+    result = identify([as_record(u, y)])
+    assert result.structure.estimate_initial_state
+    # Standard deviation of the decay rate about 1e-3 times the rate's square root over the amplitude: 1e-5.
+    assert np.min(np.abs(result.model.poles.pairs - 0.99 * np.exp(0.2j))) < 1e-4
+
+
+def test_unrelated_signals_give_no_poles_and_say_so():
+    rng = np.random.default_rng(0)
+    result = identify([as_record(rng.normal(size=500), rng.normal(size=500))])
+    assert result.model.order == 0
+    assert any("no pole was worth keeping" in warning for warning in result.warnings)
+
+
+def test_a_search_in_mid_record_does_not_change_what_was_asked_for():
+    truth = p2(0, 3000)
+    u = np.concatenate([np.zeros(3000), truth.record.input[:, 0]])
+    y = run(truth.system, u) + truth.noise_std * np.random.default_rng(1).normal(size=6000)
+    options = IdentOptions(n_real=2, n_pairs=3, search_samples=2000, estimate_initial_state=False)
+    result = identify([as_record(u, y)], options)
+    assert not result.structure.estimate_initial_state
+    assert np.all(np.diff(result.model.poles.omega_rad_s(0.005)) > 0)
+    np.testing.assert_allclose(result.model.poles.omega_rad_s(0.005)[:2] / 2 / np.pi, P2_HZ[:2], rtol=0.01)
