@@ -283,6 +283,8 @@ def _save_uncertainty(
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in found.to_arrays().items()}
         arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
+        nominal = result.identification.model
+        arrays |= {f"{at}nominal/{key}": value for key, value in nominal.to_arrays().items()}
         if empirical is not None:
             arrays |= {f"{at}empirical/{key}": value for key, value in empirical.to_arrays().items()}
         bands = uncertainty_stage.bands_of(omega)
@@ -293,7 +295,8 @@ def _save_uncertainty(
                 "level": 0.95,
                 "report": None,
                 "bands": [uncertainty_stage.band_row(frequency, low, high) for low, high in bands],
-                "tests": uncertainty_stage.residual_tests(result),
+                "tests": uncertainty_stage.residual_tests(result, found),
+                "nominal": uncertainty_stage.nominal_row(frequency, nominal),
                 "repeat_scatter": [row.to_dict() for row in scatter_rows()] if scatter else None,
             }
         )

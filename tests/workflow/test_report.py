@@ -1,4 +1,4 @@
-"""The page: numbers are the stages' numbers, nothing is fetched, everything is escaped, every outcome has words."""
+"""The page: its numbers are the stages', it fetches nothing, escapes everything, suits every outcome."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def draw_closed_loop(
         rows.append(("performance", scene.performance))
     rows.append(("command", scene.command))
     onset = _onset(scene)
-    windows = _windows(scene, onset)
+    windows = _windows(scene, onset, predicted, achieved if achieved is not None else spread)
     with style.house_style():
         figure = style.new_figure(2.1 * len(rows) + 0.9)
         grid = figure.subplots(len(rows), len(windows), squeeze=False, sharex="col", sharey="row")
@@ -76,12 +76,6 @@ def draw_closed_loop(
                 axes.set_xlim(start, stop)
                 if onset is not None and start <= onset <= stop:
                     axes.axvline(onset, color="#888888", lw=0.8, ls=":")
-                    if kind == "output":
-                        style.tag(
-                            axes,
-                            onset,
-                            f"disturbance {_disturbance_size(scene):.3g} {scene.command[1]}".rstrip(),
-                        )
             axes_row[0].set_ylabel(style.two_lines(*label))
             _limits(axes_row[0], scene, kind, predicted, (achieved, spread))
         for axes, (_, _, title) in zip(grid[0], windows, strict=True):
@@ -107,15 +101,45 @@ def _disturbance_size(scene: LoopScene) -> float:
     return float(values[np.argmax(np.abs(values))])
 
 
-def _windows(scene: LoopScene, onset: float | None) -> list[tuple[float, float, str]]:
+def _windows(
+    scene: LoopScene, onset: float | None, predicted: LoopTraces, other: LoopTraces | None
+) -> list[tuple[float, float, str]]:
+    """Start, end and title of each panel: step and disturbance apart, each as long as something moves."""
     start, stop = float(scene.time_s[0]), float(scene.time_s[-1])
     margin = 0.03 * (stop - start)
     if onset is None or not start + 4 * margin < onset < stop - 4 * margin:
         return [(start, stop, "Reference step" if onset is None else "Reference step and disturbance")]
-    return [
-        (start, onset - 1e-9, "Reference step"),
-        (onset - margin, stop, "Disturbance at the plant's input"),
-    ]
+    unit = scene.command[1] or "as logged"
+    size = f"{_disturbance_size(scene):.3g} {style.plain(unit, 12)}"
+    windows = []
+    for first, last, title in (
+        (start, onset, "Reference step"),
+        (onset - margin, stop, f"Disturbance of {size} at the plant's input"),
+    ):
+        quiet = _quiet_from(scene.time_s, first, last, predicted, other)
+        # Cut only where much is saved; some rest after the motion shows that it is over.
+        end = min(last, first + max(1.5 * (quiet - first), 0.2 * (last - first)))
+        windows.append((first, end if end < first + 0.75 * (last - first) else last - 1e-9, title))
+    return windows
+
+
+def _quiet_from(
+    time_s: Real, first: float, last: float, predicted: LoopTraces, other: LoopTraces | None
+) -> float:
+    """Time after which predicted runs stay within 2 % and the others (noisy) within 15 % of their range."""
+    part = slice(int(np.searchsorted(time_s, first)), int(np.searchsorted(time_s, last)))
+    quiet = first
+    for traces, share in ((predicted, 0.02), (other, 0.15)):
+        for kind in ("output", "command", "performance"):
+            values = None if traces is None else getattr(traces, kind)
+            if values is None:
+                continue
+            run = values[:, part]
+            end = run[:, -max(1, run.shape[1] // 20) :].mean(axis=1, keepdims=True)
+            moving = np.any(np.abs(run - end) > share * np.ptp(run, axis=1, keepdims=True), axis=0)
+            if moving.any():
+                quiet = max(quiet, float(time_s[part][np.flatnonzero(moving)[-1]]))
+    return quiet
 
 
 def _draw_row(

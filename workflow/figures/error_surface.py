@@ -98,5 +98,7 @@ def _round_ticks(bar: Colorbar, levels: Real) -> None:
     for value in (1, 1.02, 1.05, 1.1, 1.2, 1.5, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000):
         if value <= levels[-1] and (not ticks or np.log(value / ticks[-1]) > step):
             ticks.append(value)
+    if len(ticks) < 3:
+        ticks = [float(f"{value:.4g}") for value in np.linspace(levels[0], levels[-1], 5)]
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.ax.minorticks_off()

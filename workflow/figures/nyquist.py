@@ -60,7 +60,7 @@ def draw_nyquist(
     with style.house_style():
         figure = style.new_figure(6.0)
         whole, near = figure.subplots(1, 2)
-        reach = float(np.clip(1.15 * np.abs(loop.centre).max(), 1.6, 6.0))
+        reach = _reach(np.abs(loop.centre))
         nearest = loop.nearest
         closest = loop.distance[nearest]
         side = float(np.clip(1.35 * max(closest, modulus_margin or 0.0, 0.35), 0.5, 1.3))
@@ -101,6 +101,13 @@ def draw_nyquist(
     return figure
 
 
+def _reach(size: Real) -> float:
+    """Half-width of the whole view: all that the loop does after it first falls below 1, no integrator."""
+    below = np.flatnonzero(size < 1)
+    after = size[below[0] :] if below.size else size
+    return float(np.clip(1.25 * after.max(), 1.8, 6.0))
+
+
 def _draw_loop(
     axes: Axes, loop: UncertainLoop, real: tuple[float, float], imag: tuple[float, float], level: float
 ) -> None:
@@ -131,7 +138,7 @@ def _draw_loop(
         loop.centre.real,
         loop.centre.imag,
         **style.PREDICTED_LINE,
-        label="loop at the centres, rising frequency",
+        label="loop at the centres",
     )
     _arrow(axes, loop.centre, real, imag)
     axes.axhline(0, color="#999999", lw=0.7)

@@ -20,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 MEASURED = "#6b6b6b"  # what sensors said
 MODEL = "#0072B2"  # identified model, open loop
@@ -102,6 +103,7 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
 def render(figure: Figure) -> Picture:
     """SVG, or PNG where the SVG would be larger than 400 kB. Equal figures give equal bytes."""
     with house_style():
+        _settle(figure)
         buffer = io.BytesIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         figure.savefig(buffer, format="svg", metadata=nothing, dpi=_PNG_DPI)
@@ -111,6 +113,17 @@ def render(figure: Figure) -> Picture:
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", metadata={"Software": None}, dpi=_PNG_DPI)
         return Picture("png", buffer.getvalue())
+
+
+def _settle(figure: Figure) -> None:
+    """Lay the figure out once and for all, panels on a grid of 1e-5 of its size.
+
+    The layout solver's last bits depend on where its objects lie in memory; clip paths are named after them.
+    """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        axes.set_position(Bbox(np.round(axes.get_position(original=True).get_points(), 5)))
 
 
 def _shorter(svg: bytes) -> bytes:
@@ -202,22 +215,6 @@ def plain_log_labels(figure: Figure) -> None:
 
 def _plain_number(value: float, _: int) -> str:
     return f"{value:g}"
-
-
-def tag(axes: Axes, x: float, text: str) -> None:
-    """A small word at the top of a vertical line at data position x, inside the axes."""
-    axes.annotate(
-        text,
-        xy=(x, 1.0),
-        xycoords=("data", "axes fraction"),
-        xytext=(3, -3),
-        textcoords="offset points",
-        va="top",
-        ha="left",
-        fontsize=8.5,
-        color="#444444",
-        bbox={"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.8},
-    )
 
 
 def tag_below(axes: Axes, x: float, text: str) -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from control_design.certificate import Certificate
 from control_design.plant_set import UncertainPlant
 from control_design.synthesis import Outcome, SynthesisResult
+from ident.model import GobfModel
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config import RunConfig
@@ -30,9 +31,13 @@ from workflow.stages.results import (
 
 @dataclass(frozen=True, eq=False)
 class ChannelData:
-    """One channel: its typed results and the documents of the two stages that made them."""
+    """One channel: its typed results and the documents of the two stages that made them.
+
+    `nominal` is the model the design calls nominal, `fresh_records` are those behind `result.fresh`.
+    """
 
     result: ChannelResult
+    nominal: GobfModel
     frequency: FrequencyUncertainty
     empirical: FrequencyUncertainty | None
     identified: Mapping[str, Any]
@@ -95,7 +100,7 @@ def _as_fitted(record: Record, of_increments: bool) -> Record:
     """The record as the fit sees it, increments named so."""
     if not of_increments:
         return record
-    name = f"increment of {record.output_names[0]}"
+    name = f"Δ {record.output_names[0]}"
     return replace(increments(record), output_names=(name,), output_units=record.output_units)
 
 
@@ -112,6 +117,7 @@ def load(run: RunDirectory, config: RunConfig) -> RunData:
         channels.append(
             ChannelData(
                 result=result,
+                nominal=GobfModel.from_arrays(uncertain.under(f"channel/{k}/nominal/")),
                 frequency=FrequencyUncertainty.from_arrays(uncertain.under(f"channel/{k}/frequency/")),
                 empirical=FrequencyUncertainty.from_arrays(empirical) if empirical else None,
                 identified=identified.document["channels"][k],

@@ -121,12 +121,16 @@ def _error_surface(channel: ChannelData, pair: int) -> Figure:
     omega, zeta = float(poles.omega_rad_s(dt_s)[pair]), float(poles.zeta()[pair])
     longest_s = max(record.n_samples for record in channel.result.used) * dt_s
     low = min(max(omega / 8, 2 * np.pi / longest_s), 0.8 * omega)
+    high = max(min(8 * omega, 0.95 * np.pi / dt_s), 1.02 * omega)
+    wide = np.geomspace(low, high, 30)
+    # The valley of a lightly damped pair is as narrow as its damping: even steps would jump over it.
+    near = omega * np.exp(zeta * np.sinh(np.linspace(-3.0, 3.0, 21)))
     surface = error_surface(
         channel.result.used,
         found.model,
         found.structure,
         pair=pair,
-        first=np.geomspace(low, max(min(8 * omega, 0.95 * np.pi / dt_s), 1.02 * omega), 48),
+        first=np.unique(np.concatenate([wide, near[(near > low) & (near < high)]])),
         second=np.geomspace(min(1e-3, zeta / 3), max(0.7, min(0.97, 1.1 * zeta)), 24),
     )
     return draw_error_surface(surface, searched_pairs(found.search.stages, omega), name=channel.label)
@@ -156,7 +160,7 @@ def _bode(data: RunData, channel: ChannelData) -> Figure:
         name=channel.label,
         input_label=(model.input_name, data.unit(model.input_name)),
         output_label=(model.output_name, data.unit(model.output_name)),
-        model=model,
+        model=channel.nominal,
         empirical=empirical,
     )
 

@@ -117,11 +117,11 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         (number(m["frequency_Hz"], 4), number(m["omega_rad_s"], 4), number(m["damping"]))
         for m in about["modes"]
     )
-    reals = tuple((number(decay, 4),) for decay in about["real_poles_per_s"])
+    reals = tuple((number(z, 6), _rate(z, model.dt_s)) for z in about["real_poles_z"])
     if modes:
         blocks.append(Table(("pole pair: frequency [Hz]", "[rad/s]", "damping ratio [1]"), modes))
     if reals:
-        blocks.append(Table(("real pole: decay rate [1/s]",), reals))
+        blocks.append(Table(("real pole z [1]", "decay rate [1/s]"), reals))
     pair = shown_pair(channel)
     if pair is not None:
         omega = float(model.poles.omega_rad_s(model.dt_s)[pair])
@@ -146,6 +146,8 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     blocks += [
         *maybe(tuple(map(sentence, about["warnings"])), "warning", "To look at before trusting this model")
     ]
+    staged = about.get("two_stage")
+    blocks += maybe((sentence(staged),) if staged else (), "note", "Records made in closed loop")
     blocks += [*maybe(tuple(map(sentence, about["verdicts"])), "note", "What the data decided")]
     if len(about["order_table"]) > 1:
         best = min(step["criterion"] for step in about["order_table"])
@@ -161,6 +163,11 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         head = ("real poles", "pairs", "residual sum of squares", "criterion above the best")
         blocks.append(Table(head, steps, "Structures tried; the smallest criterion wins."))
     return blocks
+
+
+def _rate(z: float, dt_s: float) -> str:
+    """Decay rate of a real pole; one at or left of the origin has no counterpart in continuous time."""
+    return number(-math.log(z) / dt_s, 4) if z > 0 else "none (z is not positive)"
 
 
 def uncertainty_section(data: RunData) -> Section:
@@ -206,6 +213,15 @@ def _uncertain(data: RunData, index: int, channel: ChannelData) -> list[Block]:
             ),
         ),
     ]
+    nominal = about["nominal"]
+    blocks.append(
+        Text(
+            "The nominal model of the design lies inside its ellipse at "
+            f"{percent(nominal['share_inside_percent'])} "
+            f"of these frequencies; farthest out at {frequency(nominal['at_rad_s'])}, "
+            f"{number(nominal['largest_distance'])} times the ellipse's own radius from its centre."
+        )
+    )
     beyond = [band for band in bands if band["median_radius_percent"] > 100]
     if beyond:
         blocks.append(
@@ -232,21 +248,15 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         *((name, fit, "validation") for name, fit in about["fit_validation_percent"].items()),
         *((name, fit, "repeat") for name, fit in about["fit_repeat_percent"].items()),
     ]
+    what = "of the output's differences from sample to sample" if about["increments"] else "of the output"
     if fits:
         worst_name, worst, _ = min(fits, key=lambda entry: entry[1])
-        blocks.append(
-            Text(
-                f"On {count(len(fits), 'record')} that the fit has not seen, the model run freely "
-                "reproduces between "
-                f"{percent(worst)} ({worst_name}) and {percent(max(fit for _, fit, _ in fits))} of the "
-                "output."
-                if len(fits) > 1
-                else f"On the record {worst_name}, which the fit has not seen, the model run freely "
-                "reproduces "
-                f"{percent(worst)} of the output."
-            )
-        )
-        if worst < 50:
+        unseen = f"On {count(len(fits), 'record')} that the fit has not seen"
+        range_of = f"between {percent(worst)} ({worst_name}) and {percent(max(fit for _, fit, _ in fits))}"
+        if len(fits) == 1:
+            unseen, range_of = f"On the record {worst_name}, which the fit has not seen", percent(worst)
+        blocks.append(Text(f"{unseen}, the model run freely reproduces {range_of} {what}."))
+        if worst < 50 and not about["increments"]:
             blocks.append(
                 Remarks(
                     (
@@ -293,6 +303,13 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
             _scatter_table(scatter),
         ]
     return blocks
+
+
+def _behind(about: Mapping[str, Any]) -> str:
+    """Which residuals the whiteness test looks at."""
+    report = about["report"]
+    order = len(report["ar_coefficients"]) if report else 0
+    return f" (behind the noise model of order {order})" if order else ""
 
 
 def _on(test: Mapping[str, Any]) -> str:

@@ -165,7 +165,7 @@ def _sure(data: RunData) -> list[str]:
         fits = channel.identified["fit_validation_percent"]
         if fits:
             each = listing([f"{percent(fit)} ({name})" for name, fit in fits.items()])
-            text += f"; fit on fresh data {each}"
+            text += f"; fit on fresh data{' (increments)' if channel.identified['increments'] else ''} {each}"
         else:
             text += "; no fresh data to test it on"
         sentences.append(text + ".")
