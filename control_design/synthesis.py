@@ -526,53 +526,91 @@ class _Search:
         return NlpPoint(np.asarray(parameters), 1.0 / min(max(gamma, 1e-3), 1e3), tuple(angles))
 
     def _start(self, rows: Sequence[Rows]) -> NlpPoint:
-        """A random low-gain cascade, its gain halved until every nominal loop is stable."""
-        double = max(plant.n_integrators for plant in self.plants) + int(self.spec.integrator) >= 2
+        """A random low-gain cascade with stable nominal loops: smaller gains, or slower leads, until it is
+        stable."""
+        integrators = max(plant.n_integrators for plant in self.plants) + int(self.spec.integrator)
+        first = {"integrator": 2, "first_order": 2, "second_order": 3}[self.cascade.sections[0]]
+        crossover = 10 ** self.rng.uniform(-0.7, 0.0)
+        parameters = self._random_sections()
+        parameters[:first] *= self._low_gain(parameters)
+        gamma = float("inf")
+        for _ in range(12):
+            if integrators >= 2:
+                # Less gain does not stabilise two integrators: a lead around a slower and slower crossover
+                # does.
+                parameters = self._lead_sections(crossover)
+                parameters[:first] *= self._crossover_gain(parameters, crossover * self.scale)
+                crossover *= 0.6
+            gamma = self.gamma(parameters, kinds=KINDS[:3])
+            if np.isfinite(gamma):
+                break
+            parameters[:first] *= 0.5
+        return self._at(parameters, rows, gamma)
+
+    def _random_sections(self) -> Real:
+        """Sections with corners within a factor 5 of the scale, numerators near their denominators."""
         x: list[float] = []
-        for position, kind in enumerate(self.cascade.sections):
+        for kind in self.cascade.sections:
             corner = 10 ** self.rng.uniform(-0.7, 0.7)
             damping = self.rng.uniform(0.3, 1.0)
             jitter = 1.0 + 0.3 * self.rng.standard_normal(3)
             if kind == "integrator":
-                # PI with its corner low: slow integral action, proportional part first.
-                x += [jitter[0], 0.1 * corner * abs(jitter[1])]
-            elif kind == "first_order":
-                lead = 0.15 if double else 1.0  # two integrators need lead for any stable start
                 x += [
-                    1.0 * jitter[0],
-                    lead * corner * abs(jitter[1]),
-                    np.log(corner * (3.0 if double else 1.0)),
-                ]
+                    jitter[0],
+                    0.1 * corner * abs(jitter[1]),
+                ]  # proportional part first, slow integral action
+            elif kind == "first_order":
+                x += [jitter[0], corner * abs(jitter[1]), np.log(corner)]
             elif kind == "notch":
                 x += [np.log(2 * damping * corner), np.log(2 * corner), 2 * np.log(corner)]
             else:
-                lead = 0.15 if double and position == self.cascade.sections.index("second_order") else 1.0
-                numerator = np.array([1.0, 2 * damping * corner, lead * corner**2]) * jitter
+                numerator = np.array([1.0, 2 * damping * corner, corner**2]) * jitter
                 x += [*numerator, np.log(2 * damping * corner), 2 * np.log(corner)]
-        parameters = np.array(x)
-        lead_size = {"integrator": 2, "first_order": 2, "second_order": 3}[self.cascade.sections[0]]
-        parameters[:lead_size] *= self._low_gain(parameters)
-        for _ in range(12):
-            gamma = self.gamma(parameters, kinds=KINDS[:3])
-            if np.isfinite(gamma):
-                break
-            parameters[:lead_size] *= 0.5
-        return self._at(parameters, rows, gamma)
+        return np.array(x)
+
+    def _lead_sections(self, crossover: float) -> Real:
+        """PI far below, one lead (zero at a quarter, poles at four times) around the crossover, the rest near
+        one."""
+        x: list[float] = []
+        lead_left = True
+        for kind in self.cascade.sections:
+            low, high = 0.25 * crossover, 4.0 * crossover
+            jitter = 1.0 + 0.1 * self.rng.standard_normal(3)
+            corner = 10 ** self.rng.uniform(-0.3, 0.7)
+            if kind == "integrator":
+                x += [1.0, 0.05 * crossover * jitter[0]]
+            elif kind == "first_order":
+                zero = low * jitter[0] if lead_left else corner * jitter[0]
+                x += [1.0, zero, np.log(high if lead_left else corner)]
+                lead_left = False
+            elif kind == "notch":
+                x += [np.log(1.8 * corner), np.log(2 * corner), 2 * np.log(corner)]
+            elif lead_left:
+                x += [0.0, high * jitter[0], high * low * jitter[1], np.log(2 * high), 2 * np.log(high)]
+                lead_left = False
+            else:
+                numerator = np.array([1.0, 2 * corner, corner**2]) * jitter
+                x += [*numerator, np.log(2 * corner), 2 * np.log(corner)]
+        return np.array(x)
 
     def _low_gain(self, parameters: Real) -> float:
-        """Signed factor that puts the centre's loop gain at a random crossover below the scale."""
+        """Signed factor that puts the centre's crossover at a random frequency below the scale."""
+        crossover = self.scale * 10 ** self.rng.uniform(-1.5, -0.3)
+        gain = self._crossover_gain(parameters, crossover)
+        asked = self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
+        if not asked and self.dense[0].plant.n_integrators + int(self.spec.integrator) == 0:
+            gain *= 1.0 if self.rng.uniform() < 0.5 else -1.0  # pure damping knows no sign
+        return gain
+
+    def _crossover_gain(self, parameters: Real, crossover_rad_s: float) -> float:
+        """Factor that makes |L| = 1 at the crossover, signed so that arg L(0+) = -i pi/2 (see
+        `_start_window`)."""
         data = self.dense[0]
         omega = data.ellipses.omega_rad_s
-        crossover = self.scale * 10 ** self.rng.uniform(-1.5, -0.3)
-        k = self.cascade.response(parameters, omega)
-        index = int(np.argmin(np.abs(omega - crossover)))
-        size = float(np.abs(k[index] * data.ellipses.centre[index]))
-        # Sign: the residue at zero frequency must be positive, arg L(0+) = -i pi/2 (see `_start_window`).
+        loop = self.cascade.response(parameters, omega) * data.ellipses.centre
+        size = float(np.abs(loop[int(np.argmin(np.abs(omega - crossover_rad_s)))]))
         order = data.plant.n_integrators + int(self.spec.integrator)
-        low = k[0] * data.ellipses.centre[0] * 1j**order
-        sign = 1.0 if low.real >= 0 else -1.0
-        if self.spec.bandwidth_rad_s is None and self.spec.sensitivity_weight is None and order == 0:
-            sign = 1.0 if self.rng.uniform() < 0.5 else -1.0  # pure damping knows no sign
+        sign = 1.0 if (loop[0] * 1j**order).real >= 0 else -1.0
         return sign / max(size, 1e-12)
 
 

@@ -21,7 +21,7 @@ class RelativeDisc:
 
 
 def hub_arm(dt_s: float = 0.005, *, integrators: int = 1) -> control.StateSpace:
-    """Motor voltage to hub angle: integrator(s), motor lag, zeros at 12 rad/s below a mode at 16 rad/s (1.5 %)."""
+    """Voltage to hub angle: integrator(s), motor lag, zeros at 12 rad/s below a mode at 16 rad/s."""
     numerator = 50 * 256 / 144 * np.array([1, 2 * 0.01 * 12, 144])
     rigid = [1, 8, 0] if integrators == 1 else [1, 0, 0]
     denominator = np.polymul([1, 2 * 0.015 * 16, 256], rigid)

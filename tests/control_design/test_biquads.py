@@ -38,7 +38,8 @@ def test_cascade_is_the_bilinear_transform_of_its_sections(sections):
     assert system.nstates == cascade.order
     np.testing.assert_allclose(control.evalfr(system, z[1]), expected[1], rtol=1e-8)
     radius = np.abs(system.poles())
-    assert np.all(radius <= 1) and np.sum(radius == 1) == sections.count("integrator")
+    assert np.all(radius <= 1)
+    assert np.sum(radius == 1) == sections.count("integrator")
 
 
 def test_response_at_nyquist_is_the_limit():

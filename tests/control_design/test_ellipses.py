@@ -1,4 +1,4 @@
-"""Exact geometry of the ellipses against sampling of their boundary and interior, and against numpy's eigenvalues."""
+"""Exact geometry of the ellipses against sampling of their boundary and against numpy's eigenvalues."""
 
 from __future__ import annotations
 

@@ -1,0 +1,155 @@
+"""The certificate: honest about instability, exact against sampled plants, clear about its limits."""
+
+from __future__ import annotations
+
+import json
+
+import control
+import numpy as np
+import pytest
+
+from control_design import Certificate, Channel, Controller, Specification, UncertainPlant, certify
+from control_design.example_plants import ResponseRecord
+
+from .plants import RelativeDisc, hub_arm, tip_acceleration
+
+_DT = 0.005
+
+
+def _gain(value: float, delay: int = 1) -> Controller:
+    return Controller(
+        np.zeros((0, 0)),
+        np.zeros((0, 1)),
+        np.zeros((1, 0)),
+        [[value]],
+        _DT,
+        computational_delay_samples=delay,
+    )
+
+
+def _arm(relative_std: float = 0.02) -> UncertainPlant:
+    return UncertainPlant("arm", hub_arm(), RelativeDisc(hub_arm(), relative_std, 60.0))
+
+
+def test_a_gentle_gain_on_the_hub_is_certified_and_says_what_it_checked():
+    spec = Specification(modulus_margin=0.5, bandwidth_rad_s=0.5, low_frequency_rejection=0.01)
+    certificate = certify(_gain(0.3), [_arm()], spec)
+    assert certificate.certified, [item.sentence() for item in certificate.items]
+    (verdict,) = certificate.plants
+    assert verdict.stable
+    assert verdict.nyquist.matches
+    assert verdict.nyquist.half_turns == pytest.approx(0.5, abs=1e-6)
+    closed = control.feedback(control.series(hub_arm(), control.ss(0, 1, 0.3, 0, _DT)), 1)
+    assert verdict.pole_radius == pytest.approx(np.max(np.abs(closed.poles())), rel=1e-9)
+    light = min(verdict.closed_loop_modes, key=lambda m: m.zeta)
+    assert light.omega_rad_s == pytest.approx(16, rel=0.05)
+    assert any("dense grid" in words for words in certificate.checked)
+    assert any("between grid points: not proved" in words for words in certificate.not_checked)
+    # The worst case is worse than the nominal one in every margin.
+    nominal, worst = verdict.nominal_margins, verdict.worst_margins
+    assert worst.modulus < nominal.modulus
+    assert worst.gain_up < nominal.gain_up
+    assert worst.phase_rad < nominal.phase_rad
+    assert worst.delay_s < nominal.delay_s
+
+
+def test_an_unstable_loop_is_never_certified():
+    rng = np.random.default_rng(3)
+    unstable = 0
+    for _ in range(25):
+        value = float(10 ** rng.uniform(-1, 3) * rng.choice([-1, 1]))
+        closed = control.feedback(control.series(hub_arm(), control.ss(0, 1, value, 0, _DT)), 1)
+        certificate = certify(_gain(value), [_arm(0.001)], Specification(modulus_margin=0.01), n_dense=1500)
+        if np.max(np.abs(closed.poles())) >= 1:
+            unstable += 1
+            assert not certificate.certified
+            assert not certificate.plants[0].stable
+            assert not certificate.plants[0].nyquist.matches
+    assert unstable > 10
+
+
+def test_worst_sensitivity_bounds_every_sampled_plant_and_is_reached():
+    """Members drawn on the ellipses' boundary: max|S| never above, and within 0.1 % of, the certificate."""
+    plant, k = _arm(0.05), 0.3
+    certificate = certify(_gain(k), [plant], Specification())
+    verdict = certificate.plants[0]
+    omega = np.unique(
+        np.append(np.geomspace(1e-2, plant.nyquist_rad_s, 4000), verdict.worst_margin_omega_rad_s)
+    )
+    e = plant.at(omega)
+    loop = k * np.exp(-1j * omega * _DT)
+    worst = max(
+        np.max(1 / np.abs(1 + loop * e.points(np.cos(f), np.sin(f)))) for f in np.linspace(0, 2 * np.pi, 721)
+    )
+    assert worst <= verdict.worst_peak_sensitivity * (1 + 1e-9)
+    assert worst >= verdict.worst_peak_sensitivity * 0.999
+
+
+def test_every_requirement_is_listed_with_its_number():
+    plant = UncertainPlant(
+        "arm",
+        hub_arm(),
+        RelativeDisc(hub_arm(), 0.02, 60.0),
+        performance=Channel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.02, 60.0)),
+    )
+    spec = Specification(
+        bandwidth_rad_s=2.0,
+        integrator=True,
+        modulus_margin=0.6,
+        effort_limit=10.0,
+        mode_peak_ratio=0.2,
+        delay_margin_s=0.01,
+    )
+    certificate = certify(_gain(0.3), [plant], spec)
+    met = {item.requirement.split(",")[0]: item.met for item in certificate.items}
+    assert met == {
+        "modulus margin": True,
+        "tracking": False,
+        "effort": True,
+        "damping of the mode": False,
+        "delay margin": True,
+        "integrators in the controller": False,
+    }
+    assert not certificate.certified
+    assert any("correlation" in words for words in certificate.not_checked)
+
+
+def test_damping_number_is_the_sampled_worst_case_of_the_measured_output():
+    plant, spec = _arm(0.05), Specification(mode_peak_ratio=0.5)
+    certificate = certify(_gain(0.3), [plant], spec)
+    (item,) = [i for i in certificate.items if i.requirement.startswith("damping")]
+    low, high = spec.mode_band(plant)
+    omega = np.unique(np.append(np.linspace(low, high, 4001), item.omega_rad_s))
+    e = plant.at(omega)
+    loop = 0.3 * np.exp(-1j * omega * _DT)
+    w4 = 1 / (0.5 * spec.mode_reference_peak(plant))
+    worst = 0.0
+    for f in np.linspace(0, 2 * np.pi, 721):
+        g = e.points(np.cos(f), np.sin(f))
+        worst = max(worst, float(np.max(w4 * np.abs(g / (1 + loop * g)))))
+    assert worst <= item.achieved * (1 + 1e-9)
+    assert worst >= item.achieved * 0.999
+
+
+def test_uncertainty_on_its_own_grid_is_named_and_round_trips():
+    own = np.geomspace(0.5, 200.0, 800)
+    record: ResponseRecord = RelativeDisc(hub_arm(), 0.02, 60.0).at(own, 0.95)
+    certificate = certify(_gain(0.3), [UncertainPlant("frf", hub_arm(), record)], Specification())
+    assert certificate.plants[0].own_grid_rad_s == (0.5, 200.0)
+    assert any("own grid only" in words and "above 200" in words for words in certificate.not_checked)
+    assert certificate.certified
+    text = json.dumps(certificate.to_dict(), allow_nan=False)
+    assert Certificate.from_dict(json.loads(text)) == certificate
+
+
+def test_no_uncertainty_is_said_and_mismatches_are_refused():
+    bare = UncertainPlant("bare", hub_arm())
+    certificate = certify(_gain(0.3), [bare], Specification())
+    assert any("no uncertainty was given" in words for words in certificate.not_checked)
+    with pytest.raises(ValueError, match="0 samples of computational delay"):
+        certify(_gain(0.3, delay=0), [bare], Specification())
+    with pytest.raises(ValueError, match="at least one plant"):
+        certify(_gain(0.3), [], Specification())
+    slow = UncertainPlant("slow", hub_arm(0.01))
+    with pytest.raises(ValueError, match="differ in dt_s"):
+        certify(_gain(0.3), [slow], Specification())

@@ -1,0 +1,131 @@
+"""Time domain against python-control's feedback of the same functions; limits, quantisation, metrics."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from control_design import ClosedLoopTrajectory, Controller, LinearMachine, simulate, step_metrics
+
+from .plants import hub_arm
+
+_DT = 0.005
+
+
+def _controller(delay: int = 1, **fields) -> Controller:
+    return Controller(
+        [[0.8, 0.05], [0, 0.95]],
+        [[1.0], [0.2]],
+        [[0.3, 0.5]],
+        [[1.5]],
+        _DT,
+        computational_delay_samples=delay,
+        **fields,
+    )
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_linear_loop_in_time_is_the_feedback_of_its_transfer_functions(delay):
+    """Same delay convention in time and in the loop analysis: 1e-10 of signals of size one over 4 s."""
+    rng = np.random.default_rng(1)
+    g, controller = hub_arm(), _controller(delay)
+    reference, load = rng.standard_normal(800), rng.standard_normal(800)
+    shift = rng.standard_normal(800)
+    trajectory = simulate(
+        controller, LinearMachine(g), reference, input_disturbance=load, output_disturbance=shift
+    )
+    z = control.ss(0, 1, 1, 0, _DT)
+    k = controller.to_control()
+    for _ in range(delay):
+        k = control.series(k, z)
+    closed = control.feedback(control.series(k, g), 1)
+    from_load = control.feedback(g, k)
+    sensitivity = control.feedback(control.ss([], [], [], 1, _DT), control.series(k, g))
+    expected = (
+        control.forced_response(closed, inputs=reference).outputs
+        + control.forced_response(from_load, inputs=load).outputs
+        + control.forced_response(sensitivity, inputs=shift).outputs
+    )
+    scale = np.max(np.abs(expected))
+    np.testing.assert_allclose(trajectory.measured, expected, rtol=0, atol=1e-10 * scale)
+
+
+def test_hub_torque_reaches_the_second_input():
+    g = hub_arm()
+    two = control.ss(g.A, np.hstack([np.asarray(g.B), 2 * np.asarray(g.B)]), g.C, np.zeros((1, 2)), _DT)
+    torque = np.sin(np.arange(200) * 0.1)
+    still = Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[0.0]], _DT)
+    got = simulate(still, LinearMachine(two), np.zeros(200), hub_torque_Nm=torque).measured
+    np.testing.assert_allclose(got, control.forced_response(g, inputs=2 * torque).outputs, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match="needs a second one"):
+        simulate(still, LinearMachine(g), np.zeros(200), hub_torque_Nm=torque)
+
+
+def test_limits_and_quantisation_are_where_they_belong():
+    trajectory = simulate(
+        _controller(input_limit=0.05, rate_limit=1.0),
+        LinearMachine(hub_arm()),
+        np.ones(400),
+        measurement_step=1e-3,
+        command_step=0.01,
+    )
+    assert np.all(np.abs(trajectory.command) <= 0.05 + 1e-12)
+    steps = trajectory.command / 0.01
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    steps = trajectory.measured / 1e-3
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert trajectory.limited.mean() > 0.5
+    assert trajectory.command[0] == 0  # one sample of delay
+
+
+def test_bad_signals_are_refused():
+    controller, machine = _controller(), LinearMachine(hub_arm())
+    with pytest.raises(ValueError, match="not finite at sample 1"):
+        simulate(controller, machine, [0.0, np.nan])
+    with pytest.raises(ValueError, match="input_disturbance must be"):
+        simulate(controller, machine, np.ones(3), input_disturbance=np.ones(2))
+    with pytest.raises(ValueError, match="differ in dt_s"):
+        simulate(controller, LinearMachine(hub_arm(0.01)), np.ones(3))
+    with pytest.raises(ValueError, match="needs D = 0"):
+        LinearMachine(control.ss(0.5, 1, 1, 1, 0.1))
+
+
+def test_trajectory_round_trip():
+    trajectory = simulate(_controller(), LinearMachine(hub_arm()), np.ones(20))
+    copy = ClosedLoopTrajectory.from_arrays(trajectory.to_arrays())
+    for name, value in trajectory.to_arrays().items():
+        np.testing.assert_array_equal(getattr(copy, name), value)
+        assert value.dtype != object
+
+
+def test_step_metrics_of_a_known_second_order_response():
+    """zeta 0.5, omega 10: overshoot exp(-pi zeta/sqrt(1 - zeta^2)) = 16.30 %; the rest by python-control."""
+    system = control.tf([100], [1, 10, 100])
+    time = np.arange(0, 3, 0.0005)
+    y = control.step_response(system, time).outputs
+    at = 100
+    trajectory = ClosedLoopTrajectory(
+        np.arange(time.size + at) * 0.0005,
+        np.concatenate([np.zeros(at), 2 * np.ones(time.size)]),
+        np.concatenate([np.zeros(at), 2 * y])[:, None],
+        np.full(time.size + at, 3.0),
+        np.arange(time.size + at) < at + time.size // 4,
+        0.0005,
+    )
+    metrics = step_metrics(trajectory)
+    info = control.step_info(system, T=time)
+    assert metrics.overshoot_percent == pytest.approx(100 * np.exp(-np.pi * 0.5 / np.sqrt(0.75)), rel=1e-4)
+    # python-control counts samples, we interpolate: one sample of 0.5 ms each.
+    assert metrics.rise_time_s == pytest.approx(info["RiseTime"], abs=1e-3)
+    assert metrics.settling_time_s == pytest.approx(info["SettlingTime"], abs=1e-3)
+    assert metrics.steady_error == pytest.approx(0, abs=1e-5)
+    assert metrics.peak_command == 3
+    assert metrics.limited_fraction == pytest.approx(0.25, abs=1e-3)
+    assert metrics.undershoot_percent == 0
+
+
+def test_step_metrics_refuse_what_is_no_step():
+    trajectory = simulate(_controller(), LinearMachine(hub_arm()), np.sin(np.arange(50)))
+    with pytest.raises(ValueError, match="steps once"):
+        step_metrics(trajectory)

@@ -1,0 +1,127 @@
+"""The running controller against python-control, anti-windup against its limits, exact round trips."""
+
+from __future__ import annotations
+
+import json
+
+import control
+import numpy as np
+import pytest
+
+from control_design import Controller
+
+_DT = 0.01
+
+
+def _pi(**fields) -> Controller:
+    """PI controller u = (1 + 2/s) e by the trapezoidal rule."""
+    one = np.ones((1, 1))
+    return Controller(one, 2 * _DT * one, one, (1 + _DT) * one, _DT, **fields)
+
+
+def _random(rng: np.random.Generator, n: int = 4, **fields) -> Controller:
+    a = rng.standard_normal((n, n))
+    a *= 0.9 / np.max(np.abs(np.linalg.eigvals(a)))
+    return Controller(
+        a, rng.standard_normal((n, 1)), rng.standard_normal((1, n)), np.full((1, 1), 0.3), _DT, **fields
+    )
+
+
+def test_stepper_is_the_linear_system_without_limits():
+    rng = np.random.default_rng(1)
+    controller = _random(rng)
+    error = rng.standard_normal(300)
+    expected = control.forced_response(controller.to_control(), inputs=error).outputs
+    stepper = controller.stepper()
+    np.testing.assert_allclose([stepper.step(e) for e in error], expected, rtol=0, atol=1e-11)
+    stepper.reset()
+    np.testing.assert_allclose([stepper.step(e) for e in error], expected, rtol=0, atol=1e-11)
+
+
+def test_delay_in_response_and_state_space_agree():
+    controller = _random(np.random.default_rng(2), computational_delay_samples=2)
+    omega = np.geomspace(0.01, np.pi / _DT, 40)
+    system = controller.to_control(include_delay=True)
+    assert system.nstates == 6
+    expected = np.asarray(control.frequency_response(system, omega).complex).ravel()
+    np.testing.assert_allclose(controller.response(omega), expected, rtol=1e-9)
+
+
+def test_limits_hold_and_the_integrator_does_not_wind_up():
+    limit, rate = 1.0, 20.0
+    controller = _pi(input_limit=limit, rate_limit=rate)
+    stepper = controller.stepper()
+    command = np.array([stepper.step(1.0) for _ in range(2000)])
+    assert np.all(np.abs(command) <= limit)
+    assert np.all(np.abs(np.diff(command, prepend=0.0)) <= rate * _DT * (1 + 1e-12))
+    # Without anti-windup the state would stand at 2 * 20 s = 40 and take 20 s to unwind at error -1.
+    after = np.array([stepper.step(-1.0) for _ in range(100)])
+    assert np.argmax(after < 0) < 20
+    assert after[-1] == -limit
+
+
+def test_anti_windup_keeps_a_non_minimum_phase_controller_bounded():
+    """Controller zero at z = 1.5: conditioning with M = B/D would have a pole there; ours must not."""
+    controller = Controller([[0.9]], [[1.0]], [[-0.6]], [[1.0]], _DT, input_limit=0.1)
+    zero = controller.to_control().zeros()
+    assert abs(zero[0]) == pytest.approx(1.5)
+    assert np.abs(controller.A - controller.anti_windup_gain @ controller.C).item() < 1
+    stepper = controller.stepper()
+    for _ in range(5000):
+        stepper.step(1.0)
+    assert np.all(np.abs(stepper._x) < 100)
+
+
+def test_json_and_mat_round_trip_exactly(tmp_path):
+    for controller in (
+        _random(np.random.default_rng(3), input_limit=5.0, rate_limit=100.0, name="hub"),
+        _pi(),
+        Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[2.0]], _DT),
+    ):
+        text = controller.to_json()
+        copies = [Controller.from_json(text)]
+        controller.save_mat(tmp_path / "k.mat")
+        copies.append(Controller.load_mat(tmp_path / "k.mat"))
+        assert json.loads(text)["law"].startswith("u = C x + D e")
+        for copy in copies:
+            for name in ("A", "B", "C", "D", "anti_windup_gain"):
+                np.testing.assert_array_equal(getattr(copy, name), getattr(controller, name))
+            for name in ("dt_s", "input_limit", "rate_limit", "computational_delay_samples", "name"):
+                assert getattr(copy, name) == getattr(controller, name)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "line 1, column 2"),
+        ("[]", "must be an object"),
+        ("{}", "expected 'flexlink-controller-1'"),
+        ('{"format": "flexlink-controller-1", "A": []}', "lacks the key 'D'"),
+    ],
+)
+def test_files_that_are_no_controller_are_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        Controller.from_json(text)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"dt_s": 0.0}, "dt_s must be positive"),
+        ({"A": np.array([[np.nan]])}, "not finite"),
+        ({"B": np.ones((2, 1))}, "needs A"),
+        ({"input_limit": -1.0}, "input_limit must be positive"),
+        ({"computational_delay_samples": -1}, "must not be negative"),
+        ({"input_limit": 1.0, "anti_windup_gain": np.zeros((1, 1))}, "would wind up"),
+    ],
+)
+def test_controllers_that_cannot_run_are_refused(fields, message):
+    one = np.ones((1, 1))
+    with pytest.raises(ValueError, match=message):
+        Controller(**({"A": one, "B": one, "C": one, "D": one, "dt_s": 0.01} | fields))
+
+
+def test_a_controller_is_frozen():
+    controller = _pi()
+    with pytest.raises(ValueError, match="read-only"):
+        controller.A[0, 0] = 2

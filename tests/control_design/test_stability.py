@@ -1,0 +1,163 @@
+"""Nyquist count against closed-loop poles on random loops; margins by hand and by python-control."""
+
+from __future__ import annotations
+
+import warnings
+
+import control
+import numpy as np
+import pytest
+
+from control_design import Controller, Ellipses, UncertainPlant
+from control_design.ellipses import distance_to_minus_one
+from control_design.frequency_grid import frequency_grid
+from control_design.margins import ellipse_margins, nominal_margins
+from control_design.plant_set import frequency_response
+from control_design.stability import closed_loop_poles, loop_integrators, nyquist_count
+
+from .plants import hub_arm, random_stable
+
+
+def _controller(system: control.StateSpace, delay: int) -> Controller:
+    return Controller(
+        system.A, system.B, system.C, system.D, float(system.dt), computational_delay_samples=delay
+    )
+
+
+def _count(controller: Controller, plant: UncertainPlant) -> bool:
+    integrators, unstable = loop_integrators(controller, plant)
+    omega = frequency_grid(plant.nyquist_rad_s, plant.modes, omega_min_rad_s=1e-4, n_log=400, n_mode=60)
+
+    def loop(w: np.ndarray) -> np.ndarray:
+        return controller.response(w) * plant.channel.nominal_response(w)
+
+    return nyquist_count(loop, omega, integrators=integrators, unstable_poles=unstable).matches
+
+
+def test_nyquist_count_and_poles_agree_over_random_loops():
+    rng = np.random.default_rng(11)
+    verdicts = []
+    for trial in range(150):
+        dt = 0.01
+        g = random_stable(rng, int(rng.integers(1, 5)), dt)
+        if trial % 3:  # integrators in the plant
+            for _ in range(trial % 3):
+                g = control.series(g, control.ss(1, dt, 1, 0, dt))
+        if trial % 5 == 0:  # one unstable pole
+            g = control.series(g, control.ss(1.1, 1, 0.1, 0.05, dt))
+        k = random_stable(rng, int(rng.integers(1, 4)), dt)
+        k = control.ss(k.A, k.B, k.C, rng.standard_normal() * np.ones((1, 1)), dt)
+        if trial % 7 == 0:  # integrator in the controller
+            k = control.series(k, control.ss(1, dt, 1, 1, dt))
+        k = k * float(10 ** rng.uniform(-3, 0.5) * rng.choice([-1, 1]))
+        plant, controller = UncertainPlant("random", g), _controller(k, trial % 2)
+        radius = np.max(np.abs(closed_loop_poles(controller, plant)))
+        if abs(radius - 1) < 1e-6:
+            continue
+        verdicts.append(radius < 1)
+        assert _count(controller, plant) == (radius < 1), (trial, radius)
+    assert 20 < sum(verdicts) < len(verdicts) - 20  # both verdicts occur often
+
+
+def test_closed_loop_poles_are_those_of_python_control():
+    plant = UncertainPlant("arm", hub_arm())
+    k = control.ss([[0.5, 0.1], [0, 0.9]], [[1], [0.3]], [[0.2, 0.4]], 0.7, 0.005)
+    controller = _controller(k, 1)
+    delay = control.ss(0, 1, 1, 0, 0.005)
+    loop = control.series(k, delay, plant.nominal)
+    expected = np.sort_complex(control.feedback(loop, 1).poles())
+    np.testing.assert_allclose(np.sort_complex(closed_loop_poles(controller, plant)), expected, atol=1e-8)
+
+
+def test_margins_of_an_integrator_with_delay_by_hand():
+    """L = k dt z^-1/(z - 1): arg L = -pi/2 - 3 theta/2 and |L| = k dt/(2 sin(theta/2)), theta = omega dt.
+
+    The phase crossover is at theta = pi/3, where |L| = k dt: the gain may rise by 1/(k dt).
+    """
+    dt, k = 0.01, 20.0
+    g = control.ss(1, dt, 1, 0, dt)
+
+    def loop(omega: np.ndarray) -> np.ndarray:
+        return k * frequency_response(g, omega) * np.exp(-1j * omega * dt)
+
+    omega = np.geomspace(1e-3, np.pi / dt, 3000)
+    margins = nominal_margins(loop, omega)
+    crossover = 2 / dt * np.arcsin(k * dt / 2)
+    phase = np.pi / 2 - 1.5 * crossover * dt
+    assert margins.gain_up == pytest.approx(1 / (k * dt), rel=1e-9)
+    assert margins.gain_down == 0
+    assert margins.phase_rad == pytest.approx(phase, rel=1e-9)
+    assert margins.delay_s == pytest.approx(phase / crossover, rel=1e-9)
+
+
+def test_margins_agree_with_python_control():
+    """Its margins come from polynomials or interpolation: three digits are asked for."""
+    rng = np.random.default_rng(12)
+    compared = 0
+    for _ in range(120):
+        g = control.series(random_stable(rng, 3, 0.02), control.ss(1, 0.02, 1, 0, 0.02))
+        k = float(10 ** rng.uniform(-2, 0))
+        if np.max(np.abs(control.feedback(g * k, 1).poles())) >= 0.999:
+            continue
+        omega = np.geomspace(1e-3, np.pi / 0.02, 3000)
+        ours = nominal_margins(lambda w, g=g, k=k: k * frequency_response(g, w), omega)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # python-control warns where its two methods differ
+            _, pm, sm, *_ = control.stability_margins(g * k)
+        if np.isfinite(ours.gain_up):
+            # Poles decide about the gain margin: python-control leaves out a crossing at Nyquist itself.
+            for factor, stable in ((0.999, True), (1.001, False)):
+                radius = np.max(np.abs(control.feedback(g * (k * ours.gain_up * factor), 1).poles()))
+                assert (radius < 1) == stable
+        if np.isfinite(pm):
+            assert ours.phase_rad == pytest.approx(np.deg2rad(abs(pm)), rel=1e-3)
+            compared += 1
+        if sm is not None and np.isfinite(sm):
+            # It reports stationary points of |1 + L| inside the band; the smallest value may be at Nyquist
+            # itself.
+            assert ours.modulus <= sm * (1 + 1e-3)
+    assert compared >= 5
+
+
+def test_worst_margins_over_ellipses_agree_with_sampled_members():
+    """Dense sampling of one ellipse's members: every sampled crossing lies within the exact worst case."""
+    rng = np.random.default_rng(13)
+    for _ in range(60):
+        centre = np.array([rng.uniform(-1.5, 0.5) + 1j * rng.uniform(-1.2, 1.2)])
+        major = np.array([rng.uniform(0.05, 0.8)])
+        e = Ellipses(
+            np.array([2.0]),
+            centre,
+            major,
+            major * rng.uniform(0.05, 1),
+            np.exp(1j * rng.uniform(0, 2 * np.pi, 1)),
+        )
+        k = np.array([1.0 + 0j])
+        distance = distance_to_minus_one(k, e)
+        margins = ellipse_margins(k, e, distance)
+        if distance[0] == 0:
+            assert margins.modulus == 0
+            assert margins.phase_rad == 0
+            continue
+
+        def member(x: np.ndarray, e: Ellipses = e) -> np.ndarray:
+            turned = (x - e.centre[0]) * np.conj(e.direction[0])
+            inside = (turned.real / e.semi_major[0]) ** 2 + (turned.imag / e.semi_minor[0]) ** 2
+            return np.asarray(inside <= 1)
+
+        # Members on the unit circle and on the negative real axis, sampled; 1e-3 is a few sampling steps.
+        angle = np.linspace(0, 2 * np.pi, 40_001)
+        turn = angle[member(-np.exp(1j * angle))]
+        either = np.minimum(turn, 2 * np.pi - turn)
+        _same(margins.phase_rad, either.min(initial=np.inf))
+        _same(margins.delay_s * 2.0, turn.min(initial=np.inf))
+        real = np.linspace(-4, 0, 80_001)[:-1]
+        hit = real[member(real + 0j)]
+        _same(margins.gain_up, np.min(-1 / hit[hit > -1], initial=np.inf))
+        _same(margins.gain_down, np.max(-1 / hit[hit < -1], initial=0.0))
+
+
+def _same(exact: float, sampled: float) -> None:
+    """Sampling may only miss what is thinner than its steps: close where it finds anything."""
+    if np.isfinite(sampled) and sampled != 0:
+        assert exact == pytest.approx(sampled, rel=2e-3, abs=2e-3)
