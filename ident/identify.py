@@ -2,134 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from ident.arrays import RealArray, readonly_real
-from ident.coordinates import ZETA_LIMIT
+from ident.identification import Identification
 from ident.input_checks import advice, refuse_unusable
 from ident.least_squares import fit, linearisation
 from ident.model import GobfModel
 from ident.options import IdentOptions
-from ident.order_selection import OrderSelection, OrderStep, Progress, effective_samples
+from ident.order_selection import OrderSelection, Progress, effective_samples
 from ident.pole_search import PoleSearch
+from ident.pole_warnings import pole_warnings
 from ident.poles import Poles
 from ident.polish import Bounds, Polished, free_optimality
 from ident.record import Record
 from ident.regression import Regression, prepare, thinned
 from ident.search_trace import SearchTrace
-from ident.structure import Structure
 
 # A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
 _NUISANCE_LEVEL = 0.99
 
-
-@dataclass(frozen=True, eq=False)
-class Identification:
-    """A fitted model and how well it fits.
-
-    Attributes
-    ----------
-    model : GobfModel
-    structure : Structure
-        What the fit assumed around the basis, after the data decided what was left to them.
-    record_names : tuple of str
-    residuals : tuple of (T - delay,) arrays
-        Output minus fitted output (nuisances included) of each record, from sample `input_delay_samples` on.
-    fit_percent : (K,) array
-        100 (1 - |residual| / |y - mean y|) of each record.
-    rss : float
-        Residual sum of squares over all records.
-    noise_std : float
-        sqrt(rss / (N - number of unknowns)), in units of the output.
-    tangent_optimality : float
-        Share of the residual (0..1) in the tangent space of the poles that are free to move: 0 at an optimum.
-    order_table : tuple of OrderStep
-        Every structure that was tried, by order.
-    verdicts : tuple of str
-        One sentence for each question that was left to the data.
-    search : SearchTrace
-    """
-
-    model: GobfModel
-    structure: Structure
-    record_names: tuple[str, ...]
-    residuals: tuple[RealArray, ...]
-    fit_percent: RealArray
-    rss: float
-    noise_std: float
-    tangent_optimality: float
-    order_table: tuple[OrderStep, ...]
-    verdicts: tuple[str, ...]
-    search: SearchTrace
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
-        object.__setattr__(self, "fit_percent", readonly_real(self.fit_percent))
-        if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
-            raise ValueError("residuals, record_names and fit_percent must have one entry per record")
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What to look at before trusting the model, one sentence each."""
-        return self.search.warnings
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        structure = self.structure
-        arrays: dict[str, np.ndarray[Any, Any]] = {
-            "structure": np.array(
-                [
-                    structure.integrators,
-                    structure.input_delay_samples,
-                    structure.feedthrough,
-                    structure.estimate_offset,
-                    structure.estimate_initial_state,
-                ],
-                dtype=np.int64,
-            ),
-            "record_names": np.array(self.record_names, dtype=np.str_),
-            "fit_percent": self.fit_percent,
-            "rss": np.array(self.rss),
-            "noise_std": np.array(self.noise_std),
-            "tangent_optimality": np.array(self.tangent_optimality),
-            "order_counts": np.array(
-                [(s.n_real, s.n_pairs) for s in self.order_table], dtype=np.int64
-            ).reshape(-1, 2),
-            "order_values": np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2),
-            "verdicts": np.array(self.verdicts, dtype=np.str_),
-        }
-        arrays |= {f"residual{i}": residual for i, residual in enumerate(self.residuals)}
-        arrays |= {f"model_{key}": value for key, value in self.model.to_arrays().items()}
-        arrays |= {f"search_{key}": value for key, value in self.search.to_arrays().items()}
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Identification:
-        integrators, delay, feedthrough, offset, initial_state = (int(item) for item in arrays["structure"])
-        names = tuple(str(item) for item in arrays["record_names"])
-        return cls(
-            model=GobfModel.from_arrays(_under("model_", arrays)),
-            structure=Structure(integrators, delay, bool(feedthrough), bool(offset), bool(initial_state)),
-            record_names=names,
-            residuals=tuple(arrays[f"residual{i}"] for i in range(len(names))),
-            fit_percent=arrays["fit_percent"],
-            rss=float(arrays["rss"]),
-            noise_std=float(arrays["noise_std"]),
-            tangent_optimality=float(arrays["tangent_optimality"]),
-            order_table=tuple(
-                OrderStep(int(n_real), int(n_pairs), float(rss), float(criterion))
-                for (n_real, n_pairs), (rss, criterion) in zip(
-                    arrays["order_counts"], arrays["order_values"], strict=True
-                )
-            ),
-            verdicts=tuple(str(item) for item in arrays["verdicts"]),
-            search=SearchTrace.from_arrays(_under("search_", arrays)),
-        )
+__all__ = ["Identification", "identify"]
 
 
 def identify(
@@ -308,10 +204,6 @@ def _silent(fraction: float, message: str) -> None:
     """Default progress: nobody listens."""
 
 
-def _under(prefix: str, arrays: Mapping[str, np.ndarray[Any, Any]]) -> dict[str, np.ndarray[Any, Any]]:
-    return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
-
-
 def _result(
     records: Sequence[Record], data: Regression, best: Polished, outcome: _Outcome, verdicts: tuple[str, ...]
 ) -> Identification:
@@ -358,54 +250,3 @@ def _result(
             tuple(search.stages), tuple(search.minima), tuple(dict.fromkeys(warnings)), search.evaluations
         ),
     )
-
-
-def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> list[str]:
-    """One sentence of advice for each searched pole that ended at a bound."""
-    sentences = []
-    if poles.order == 0:
-        sentences.append(
-            "no pole was worth keeping: the output shows no dynamics driven by this input; check the "
-            "columns, the "
-            "delay and the amplitude of the input"
-        )
-    close = 1 + 1e-6
-    for a in poles.real[fixed.real.size :]:
-        if 1 - a <= bounds.distance_min * close:
-            sentences.append(
-                f"a real pole went to the slow bound (a = {a:.9g}): it is an integrator as far as the "
-                "record can "
-                "tell; try integrators = 1 more and compare"
-            )
-        elif 1 - a >= bounds.distance_max / close:
-            sentences.append(
-                f"a real pole went to the fast bound (a = {a:.3g}): it stands for a direct term or a "
-                "delay; try "
-                "feedthrough = true, another input_delay_samples, or one real pole less"
-            )
-    omegas, zetas = poles.omega_rad_s(dt_s), poles.zeta()
-    for pole, omega, zeta in list(zip(poles.pairs, omegas, zetas, strict=True))[fixed.pairs.size :]:
-        if zeta >= ZETA_LIMIT - 1e-6:
-            sentences.append(
-                f"a pole pair at {omega:.4g} rad/s is overdamped (zeta = {zeta:.2f}): replace the pair "
-                "by two real poles"
-            )
-        elif zeta >= bounds.zeta_max / close or zeta <= bounds.zeta_min * close:
-            sentences.append(
-                f"the pole pair at {omega:.4g} rad/s sits on its bound of zeta ({zeta:.4g}): it may "
-                "describe a "
-                "disturbance; fit one pair less, or widen zeta_min or zeta_max if you trust it"
-            )
-        elif -np.log(abs(pole)) <= bounds.s_min * close:
-            sentences.append(
-                f"the pole pair at {omega:.4g} rad/s does not decay within the record: its damping "
-                "cannot be told; "
-                "record longer"
-            )
-        if not bounds.omega_min * close < omega * dt_s < bounds.omega_max / close:
-            sentences.append(
-                f"a pole pair went to the bound of its frequency ({omega:.4g} rad/s): widen the bound, "
-                "or fit one "
-                "pair less"
-            )
-    return sentences
