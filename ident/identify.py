@@ -110,9 +110,8 @@ class _NuisanceTest:
 
     def verdict(self) -> str:
         return (
-            f"{self.name} {'estimated' if self.needed else 'left out'}: {self.columns} unknowns, test "
-            "statistic "
-            f"{self.statistic:.1f} against {self.limit:.1f} at {_NUISANCE_LEVEL:.0%}"
+            f"{self.name} {'estimated' if self.needed else 'left out'}: {self.columns} unknowns, "
+            f"test statistic {self.statistic:.1f} against {self.limit:.1f} at {_NUISANCE_LEVEL:.0%}"
         )
 
 

@@ -115,8 +115,7 @@ class Table:
             row = int(backwards[0]) + 1
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
-                f"{stamps[row]:.9g} s; "
-                "expected increasing time"
+                f"{stamps[row]:.9g} s; expected increasing time"
             )
         # The median says what the step is even where samples are lost; the mean over all is the better
         # estimate after.
@@ -126,8 +125,7 @@ class Table:
             row = int(uneven[0]) + 1
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s "
-                "where most steps are "
-                f"{median:.6g} s; expected uniform sampling (each step within {TIME_TOLERANCE:.0%})"
+                f"where most steps are {median:.6g} s; expected uniform sampling (each step within {TIME_TOLERANCE:.0%})"
             )
         mean = float((stamps[-1] - stamps[0]) / interval.size)
         if dt_s is None:
