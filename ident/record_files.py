@@ -125,7 +125,8 @@ class Table:
             row = int(uneven[0]) + 1
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s "
-                f"where most steps are {median:.6g} s; expected uniform sampling (each step within {TIME_TOLERANCE:.0%})"
+                f"where most steps are {median:.6g} s; expected uniform sampling (each step within "
+                f"{TIME_TOLERANCE:.0%})"
             )
         mean = float((stamps[-1] - stamps[0]) / interval.size)
         if dt_s is None:
