@@ -14,13 +14,13 @@ from control_design.ellipses import Ellipses
 from control_design.margins import Margins
 from control_design.plant_set import Channel, Mode, UncertainPlant
 from control_design.specification import RationalWeight, Specification, SpecificationError
-from control_design.synthesis import (
+from control_design.synthesis import SynthesisOptions, synthesise
+from control_design.synthesis_result import (
     BlockingPoint,
     Outcome,
+    StartReport,
     SynthesisError,
-    SynthesisOptions,
     SynthesisResult,
-    synthesise,
 )
 
 __all__ = [
@@ -41,6 +41,7 @@ __all__ = [
     "Specification",
     "SpecificationError",
     "SpecificationItem",
+    "StartReport",
     "StepMetrics",
     "SynthesisError",
     "SynthesisOptions",

@@ -195,10 +195,10 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
 def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
     """Distance from `point` to the farthest point of the axis-parallel ellipse at the origin. All (F,).
 
-    Maximise |(a cos f + x, b sin f + y)| with x, y >= 0: the maximiser is in the first quadrant, and with
-    c = a^2 - b^2 >= 0 the secular equation (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1 has one root m > a^2,
-    bracketed by a^2 + a x ... a^2 + |(a x, b y)|-type bounds; solved by safeguarded Newton on the (convex)
-    inverse square root.
+    Maximise |(a cos f + x, b sin f + y)| with x, y >= 0: the maximiser lies in the first quadrant, and its
+    multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1. With n = m - a^2 the root
+    lies between max(a x, b y - a^2 + b^2) (one term alone) and a x + b y (the sum of the terms), where
+    bisection finds it.
     """
     x, y = np.abs(np.real(point)), np.abs(np.imag(point))
     a = np.asarray(semi_major, dtype=np.float64)

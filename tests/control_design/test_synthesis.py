@@ -37,6 +37,7 @@ def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
     result = synthesise(
         [plant],
         specification,
+        SynthesisOptions(sufficient_gamma=0.94),
         rng=np.random.default_rng(1),
         progress=lambda fraction, message: messages.append((fraction, message)),
     )
@@ -52,12 +53,13 @@ def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scenario", "limit"), [("B", 1.09), ("C", 1.34)])
-def test_link_scenarios_b_and_c_at_order_5(scenario, limit):
+@pytest.mark.parametrize(("scenario", "limit"), [("A", 0.94), ("B", 1.09), ("C", 1.34)])
+def test_link_scenarios_at_order_5_with_the_default_search(scenario, limit):
     plant, specification = flexible_link(scenario), flexible_link_specification(5)
     result = synthesise([plant], specification, rng=np.random.default_rng(1))
     certificate = certify(result.controller, [plant], specification)
-    assert result.outcome is Outcome.NOT_MET
+    assert result.outcome is (Outcome.MET_ON_GRID if scenario == "A" else Outcome.NOT_MET)
+    assert certificate.certified == (scenario == "A")
     assert certificate.plants[0].stable
     assert certificate.plants[0].nyquist.matches
     assert certificate.gamma <= limit
