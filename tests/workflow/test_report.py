@@ -196,7 +196,7 @@ def test_without_a_controller_the_page_still_tells_the_rest(undrawn, tmp_path):
 def test_without_validation_data_the_page_warns(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(validation=False), scatter=False)
     assert "No record was kept back for validation" in page.text
-    assert "no fresh data to test it on" in page.text
+    assert "no validation record to test it on" in page.text
     assert "this one was used in the fit" in page.text
     assert not list((tmp_path / "run" / "figures").glob("repeats*"))
 

@@ -109,8 +109,7 @@ def _windows(
     margin = 0.03 * (stop - start)
     if onset is None or not start + 4 * margin < onset < stop - 4 * margin:
         return [(start, stop, "Reference step" if onset is None else "Reference step and disturbance")]
-    unit = scene.command[1] or "as logged"
-    size = f"{_disturbance_size(scene):.3g} {style.plain(unit, 12)}"
+    size = f"{_disturbance_size(scene):.3g} {style.plain(scene.command[1], 12)}".rstrip()
     windows = []
     for first, last, title in (
         (start, onset, "Reference step"),

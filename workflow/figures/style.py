@@ -156,7 +156,9 @@ def two_lines(name: object, unit: str) -> str:
 
 def ratio_unit(output_unit: str, input_unit: str) -> str:
     """Unit of a gain."""
-    return f"{output_unit or '(out as logged)'} / {input_unit or '(in as logged)'}"
+    if not output_unit and not input_unit:
+        return "as logged"
+    return f"{output_unit or '?'} / {input_unit or '?'}"
 
 
 def finish(figure: Figure, axes: Axes | Iterable[Axes], columns: int = 4) -> None:

@@ -14,17 +14,15 @@ from workflow import storage
 from workflow.config import RunConfig
 from workflow.figures.style import Picture, inline_svg, render
 from workflow.report.data import RunData, load
-from workflow.report.page import Plot, Section, Table
-from workflow.report.pictures import pictures_of
-from workflow.report.sections import (
+from workflow.report.loop_sections import (
     closed_loop_section,
     design_section,
-    identification_section,
     margins_section,
     notes_section,
-    records_section,
-    uncertainty_section,
 )
+from workflow.report.model_sections import identification_section, records_section, uncertainty_section
+from workflow.report.page import Plot, Section, Table
+from workflow.report.pictures import pictures_of
 from workflow.report.verdict import reproducibility_section, verdict_of
 from workflow.run_directory import RunDirectory
 from workflow.summary import summarise

@@ -167,8 +167,15 @@ def _sure(data: RunData) -> list[str]:
             each = listing([f"{percent(fit)} ({name})" for name, fit in fits.items()])
             text += f"; fit on fresh data{' (increments)' if channel.identified['increments'] else ''} {each}"
         else:
-            text += "; no fresh data to test it on"
+            text += "; no validation record to test it on"
         sentences.append(text + ".")
+        inside = channel.uncertain["nominal"]["share_inside_percent"]
+        if inside < 90 and data.plant is not None:
+            sentences.append(
+                f"{channel.label}: the nominal model of the design lies outside its ellipse at "
+                f"{percent(100 - inside)} of the frequencies; margins and worst cases are those of the "
+                "ellipses, the closed-loop poles those of the nominal."
+            )
         warnings = channel.identified["warnings"]
         if warnings:
             sentences.append(

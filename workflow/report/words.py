@@ -20,6 +20,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return text
 
 
+def quantity(value: float, unit: str) -> str:
+    """A number with its unit, if anybody stated one."""
+    return f"{number(value)} {unit}".rstrip()
+
+
 def percent(value: float, digits: int = 3) -> str:
     return f"{number(value, digits)} %"
 
