@@ -10,7 +10,7 @@ import numpy as np
 from control_design.certificate import certify
 from control_design.controller import Controller
 from control_design.plant_set import Channel, UncertainPlant
-from control_design.synthesis import BlockingPoint, Outcome, StartReport, SynthesisResult
+from control_design.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from ident.basis import basis_response
 from ident.identify import Identification
 from ident.model import GobfModel

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from control_design.certificate import Certificate
 from control_design.plant_set import UncertainPlant
-from control_design.synthesis import Outcome, SynthesisResult
+from control_design.synthesis_result import Outcome, SynthesisResult
 from ident.model import GobfModel
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from control_design.synthesis import Outcome
+from control_design.synthesis_result import Outcome
 from workflow.report.data import RunData
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text, maybe
 from workflow.report.words import count, decibels, frequency, listing, number, percent, quantity, sentence
