@@ -12,7 +12,8 @@ import numpy as np
 from control_design.certificate import certify
 from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification
-from control_design.synthesis import Outcome, SynthesisOptions, synthesise
+from control_design.synthesis import SynthesisOptions, synthesise
+from control_design.synthesis_result import Outcome
 from ident.embedding import tangent
 from ident.identify import identify
 from ident.model import GobfModel

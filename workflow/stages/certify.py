@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from control_design.certificate import certify
-from control_design.synthesis import Outcome
+from control_design.synthesis_result import Outcome
 from workflow.config import RunConfig
 from workflow.errors import naming
 from workflow.run_directory import StageData

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from control_design.certificate import Certificate
 from control_design.plant_set import Channel as PlantChannel
 from control_design.plant_set import UncertainPlant
-from control_design.synthesis import SynthesisResult
+from control_design.synthesis_result import SynthesisResult
 from ident.identify import Identification
 from ident.model import GobfModel
 from ident.record import Record
