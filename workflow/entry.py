@@ -14,14 +14,14 @@ from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis_result import Outcome
-from ident.embedding import tangent
+from ident.embedding import EmbeddingOptions, tangent
 from ident.identify import identify
 from ident.model import GobfModel
 from ident.nominal import nominal_near
 from ident.options import IdentOptions
 from ident.record import Record
 from ident.uncertainty import ResponsePosterior
-from ident.validation import fit_on_fresh_data
+from ident.validation import fit_on_fresh_data, whiteness_test
 from workflow import storage
 from workflow.config import RunConfig, SimulatedSource, load_config
 from workflow.errors import InputError, naming
@@ -141,6 +141,7 @@ def identify_logs(
 ) -> RunSummary:
     """Identify one channel from log files (tangent uncertainty); with `out` write model and posterior as npz.
 
+    The noise is modelled where the residuals are not white.
     Raises InputError: one line naming file, column or line.
     """
     if not 0.5 < level < 1:
@@ -158,7 +159,9 @@ def identify_logs(
     with naming("identify"):
         found = identify(used, options)
         fresh = tuple(fit_on_fresh_data(found.model, record) for record in fresh_logs)
-        posterior = tangent(used, found.model)
+        # White-noise bounds around coloured residuals are far too narrow, so the data decide.
+        coloured = not whiteness_test(found.residuals).passed
+        posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=coloured))
         omega = display_grid(found.model, used)
         nominal = nominal_near(posterior, found.model.poles, omega)
         frequency = posterior.at(omega, level)
