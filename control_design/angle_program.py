@@ -69,6 +69,7 @@ class AngleProgram:
         cascade: Cascade,
         plants: Sequence[Rows],
         *,
+        controller_damping: float | None = None,
         max_iterations: int = 250,
         tolerance: float = 1e-6,
     ) -> None:
@@ -93,6 +94,11 @@ class AngleProgram:
             rows.append(expression)
             row_lower.append(np.full(expression.numel(), low))
             row_upper.append(np.full(expression.numel(), high))
+
+        if controller_damping is not None:
+            # p^2 + e^a p + e^b has damping e^(a - b/2)/2: a straight line in the parameters.
+            for at in cascade.pair_positions:
+                add(x[at] - 0.5 * x[at + 1], float(np.log(2 * controller_damping)), np.inf)
 
         for plant in self.plants:
             e = plant.ellipses

@@ -21,6 +21,9 @@ SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
 _NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}
 _DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2, "notch": 2}
 
+SOLVER_SLACK = 1e-3
+"""Relative; a bound on the denominators that the solver holds may be off by its acceptable tolerance (1e-4)."""
+
 
 @dataclass(frozen=True)
 class Cascade:
@@ -38,6 +41,22 @@ class Cascade:
     def parameters(self) -> int:
         """Length of the parameter vector: numerators then log denominators, section by section."""
         return sum(_NUMERATORS[kind] + _DENOMINATORS[kind] for kind in self.sections)
+
+    @property
+    def pair_positions(self) -> tuple[int, ...]:
+        """Where the log denominator (a, b) of each second-order section starts in the parameter vector."""
+        positions, at = [], 0
+        for kind in self.sections:
+            if kind in ("second_order", "notch"):
+                positions.append(at + _NUMERATORS[kind])
+            at += _NUMERATORS[kind] + _DENOMINATORS[kind]
+        return tuple(positions)
+
+    def least_damping(self, x: Sequence[float] | Real) -> float:
+        """Smallest damping ratio of the second-order denominators in p; infinite without any."""
+        values = np.asarray(x, dtype=np.float64)
+        ratios = [0.5 * np.exp(values[at] - 0.5 * values[at + 1]) for at in self.pair_positions]
+        return float(min(ratios, default=np.inf))
 
     def split(self, x: Sequence[float] | Real) -> list[tuple[Real, Real]]:
         """(numerator, denominator) coefficients in p of every section, highest power first."""

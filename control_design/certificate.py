@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from control_design.biquads import SOLVER_SLACK
 from control_design.controller import Controller
 from control_design.ellipses import Complex, Real
 from control_design.frequency_grid import frequency_grid, plant_grid
@@ -163,6 +164,8 @@ def certify(
         verdict, found = _check_plant(controller, plant, specification, omega_min_rad_s, n_dense)
         verdicts.append(verdict)
         items += found
+    if specification.controller_damping is not None:
+        items.append(_controller_damping_item(controller, specification.controller_damping))
     if specification.integrator:
         items.append(_integrator_item(controller, plants[0]))
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
@@ -239,7 +242,10 @@ def _check_plant(
         if plant.own_grid is None
         else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
     )
-    return verdict, _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]))
+    items = _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]))
+    if specification.mode_damping is not None:
+        items.append(_mode_damping_item(plant.name, loop_modes, specification))
+    return verdict, items
 
 
 def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
@@ -295,6 +301,42 @@ def _items(
     return items
 
 
+def _mode_damping_item(plant: str, modes: Sequence[Mode], specification: Specification) -> SpecificationItem:
+    """Least damped mode of the nominal closed loop inside the band; without one in it, damping is no issue."""
+    assert specification.mode_damping is not None
+    assert specification.mode_band_rad_s is not None
+    low, high = specification.mode_band_rad_s
+    inside = [mode for mode in modes if low <= mode.omega_rad_s <= high]
+    least = min(inside, key=lambda mode: mode.zeta, default=None)
+    return SpecificationItem(
+        "damping ratio of the nominal closed loop's modes",
+        plant,
+        specification.mode_damping,
+        1.0 if least is None else least.zeta,
+        "",
+        least is None or least.zeta >= specification.mode_damping,
+        None if least is None else least.omega_rad_s,
+    )
+
+
+def _controller_damping_item(controller: Controller, required: float) -> SpecificationItem:
+    # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.
+    w = 2 / controller.dt_s * (controller.poles - 1) / (controller.poles + 1)
+    pairs = w[np.imag(w) > 0]
+    zeta = -np.real(pairs) / np.abs(pairs)
+    least = int(np.argmin(zeta)) if pairs.size else None
+    achieved = 1.0 if least is None else float(zeta[least])
+    return SpecificationItem(
+        "damping ratio of the controller's own poles",
+        "controller",
+        required,
+        achieved,
+        "",
+        achieved >= required * (1 - SOLVER_SLACK),
+        None if least is None else float(np.abs(pairs[least])),
+    )
+
+
 def _integrator_item(controller: Controller, plant: UncertainPlant) -> SpecificationItem:
     own = loop_integrators(controller, plant)[0] - plant.n_integrators
     return SpecificationItem(
@@ -314,6 +356,8 @@ def _checked_words(verdicts: Sequence[PlantVerdict], specification: Specificatio
     ]
     if specification.mode_peak_ratio is not None:
         words.append("damping of the flexible mode as the peak of |Gp S| in its band")
+    if specification.mode_damping is not None:
+        words.append("damping ratios of the nominal closed loop's modes in their band")
     return tuple(words)
 
 

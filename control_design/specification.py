@@ -105,6 +105,13 @@ class Specification(BaseModel):
         le=1,
         description="peak of |Gp S| in the mode's band over the open-loop peak of |Gp| there (damping)",
     )
+    mode_damping: float | None = Field(
+        default=None,
+        gt=0,
+        lt=1,
+        description="least damping ratio of the nominal closed loop's modes inside mode_band_rad_s; the certificate "
+        "checks it, the optimiser only sees what the other requirements make of it",
+    )
     mode_band_rad_s: tuple[float, float] | None = Field(
         default=None,
         description="band of the damping requirement; none = a factor 1.5 either side of the lowest mode",
@@ -125,6 +132,13 @@ class Specification(BaseModel):
     structure: Literal["biquads", "pi_d_notch"] = Field(
         default="biquads",
         description="biquads: free cascade; pi_d_notch: [integrator], lead/lag, notches at free frequencies",
+    )
+    controller_damping: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="least damping ratio of the controller's own pole pairs; without it a controller may answer a "
+        "notch of the plant with a resonance of its own, which then rings in closed loop",
     )
     computational_delay_samples: int = Field(
         default=1, ge=0, le=10, description="samples between measuring and applying the command"
@@ -148,8 +162,10 @@ class Specification(BaseModel):
             low, high = self.mode_band_rad_s
             if not (0 < low < high and np.isfinite(high)):
                 raise ValueError(f"mode_band_rad_s needs 0 < low < high; got {low}, {high}")
-            if self.mode_peak_ratio is None:
-                raise ValueError("mode_band_rad_s needs mode_peak_ratio")
+            if self.mode_peak_ratio is None and self.mode_damping is None:
+                raise ValueError("mode_band_rad_s needs mode_peak_ratio or mode_damping")
+        if self.mode_damping is not None and self.mode_band_rad_s is None:
+            raise ValueError("mode_damping needs mode_band_rad_s: the band whose modes are meant")
         smallest = 1 if self.structure == "biquads" else 1 + int(self.integrator)
         if self.controller_order < smallest:
             raise ValueError(

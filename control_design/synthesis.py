@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from control_design.angle_program import AngleProgram, NlpPoint, Rows
-from control_design.biquads import Cascade
+from control_design.biquads import SOLVER_SLACK, Cascade
 from control_design.controller import Controller
 from control_design.ellipses import Complex, Real
 from control_design.frequency_grid import frequency_grid, local_maxima, plant_grid
@@ -289,8 +289,11 @@ class _Search:
         )
 
     def gamma(self, parameters: Real, *, kinds: Sequence[str] = KINDS) -> float:
-        """Weighted worst case on the dense grids; inf if some nominal loop is unstable or an ellipse reaches
-        -1."""
+        """Weighted worst case on the dense grids; inf if some nominal loop is unstable, an ellipse reaches -1 or
+        the controller rings by itself more than it may."""
+        asked = self.spec.controller_damping
+        if asked is not None and not self.cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
+            return float("inf")  # a start that IPOPT left infeasible
         try:
             controller = self._controller(parameters)
         except ValueError:
@@ -347,7 +350,12 @@ class _Search:
             if self.spec.delay_margin_s is not None:
                 late = data.delay * np.exp(-1j * grid * self.spec.delay_margin_s)
                 rows.append(self._delay_copy(data, late))
-        return AngleProgram(self.cascade, rows, max_iterations=self.options.iterations)
+        return AngleProgram(
+            self.cascade,
+            rows,
+            controller_damping=self.spec.controller_damping,
+            max_iterations=self.options.iterations,
+        )
 
     def _rows(self, data: PlantData, delay: Complex, *, with_damping: bool) -> Rows:
         omega = data.ellipses.omega_rad_s

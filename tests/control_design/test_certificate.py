@@ -153,3 +153,18 @@ def test_no_uncertainty_is_said_and_mismatches_are_refused():
     slow = UncertainPlant("slow", hub_arm(0.01))
     with pytest.raises(ValueError, match="differ in dt_s"):
         certify(_gain(0.3), [slow], Specification())
+
+
+def test_mode_damping_is_that_of_python_controls_closed_loop():
+    plant, controller = _arm(), _gain(1.0)
+    loop = control.feedback(plant.nominal * controller.to_control(include_delay=True), 1)
+    omega, zeta, _ = control.damp(loop, doprint=False)
+    band = (5.0, 60.0)
+    inside = zeta[(omega >= band[0]) & (omega <= band[1])]
+    for asked, met in ((0.9 * inside.min(), True), (1.1 * inside.min(), False)):
+        specification = Specification(modulus_margin=0.1, mode_damping=asked, mode_band_rad_s=band)
+        certificate = certify(controller, [plant], specification)
+        (item,) = [item for item in certificate.items if item.requirement.startswith("damping ratio")]
+        assert item.achieved == pytest.approx(inside.min(), rel=1e-6)
+        assert item.met is met
+        assert certificate.certified is met
