@@ -3,6 +3,7 @@ rest."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -58,16 +59,25 @@ def band_limited(
         columns = [scipy.signal.sosfilt(sections, x, zi=settled * x[0])[0] for x in signal.T]
         return np.column_stack(columns)[skip:]
 
-    return Record(
-        name=record.name,
+    return replace(
+        record,
         input=filtered(record.input),
         output=filtered(record.output),
-        dt_s=record.dt_s,
-        input_names=record.input_names,
-        output_names=record.output_names,
         reference=None if record.reference is None else filtered(record.reference),
-        reference_names=record.reference_names,
-        input_units=record.input_units,
-        output_units=record.output_units,
-        source=record.source,
+    )
+
+
+def increments(record: Record) -> Record:
+    """Input, output and reference filtered by 1 - q^-1, one sample shorter: the same response, slow noise
+    whitened.
+
+    Raises ValueError if a single sample is all there is.
+    """
+    if record.n_samples < 2:
+        raise ValueError(f"{record.label}: differences need at least two samples")
+    return replace(
+        record,
+        input=np.diff(record.input, axis=0),
+        output=np.diff(record.output, axis=0),
+        reference=None if record.reference is None else np.diff(record.reference, axis=0),
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from control_design.specification import Specification
 from control_design.synthesis import SynthesisOptions
@@ -122,12 +122,22 @@ Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
 class UncertaintyOptions(EmbeddingOptions):
     """How the ellipses around an identified response are made (design 4.5)."""
 
-    method: Literal["tangent", "conditions", "classical"] = Field(
+    method: Literal["tangent", "records", "conditions", "classical"] = Field(
         "tangent",
-        description="tangent: covers; conditions: tangent per condition plus the scatter between conditions; "
-        "classical: the published recipe, for comparison",
+        description="tangent: covers noise; records: tangent per record plus the scatter between records, "
+        "for arms that differ from run to run or with amplitude (four records or more); conditions: the same "
+        "between records of different condition; classical: the published recipe, for comparison",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
+
+
+def _ordered(band: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < band[0] < band[1]:
+        raise ValueError(f"a band needs 0 < low < high in rad/s; got {band[0]}, {band[1]}")
+    return band
+
+
+Band = Annotated[tuple[float, float], AfterValidator(_ordered)]
 
 
 class Channel(Section):
@@ -146,8 +156,24 @@ class Channel(Section):
         description="fit sample-to-sample differences of input and output: the response is the same, "
         "drift and friction weigh less",
     )
+    band_rad_s: Band | None = Field(
+        None,
+        description="fit inside this band: input and output go through the same filter, which leaves the "
+        "response as it is and takes drift, friction and noise outside the band away",
+    )
+    bounds_band_rad_s: Band | None = Field(
+        None, description="band of the data behind the ellipses, where it is wider than that of the poles"
+    )
     identification: IdentOptions = Field(default_factory=IdentOptions)
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
+
+    @model_validator(mode="after")
+    def _one_filter(self) -> Self:
+        if self.increments and (self.band_rad_s or self.bounds_band_rad_s):
+            raise ValueError("give increments or a band, not both: each is a filter of its own")
+        if self.bounds_band_rad_s is not None and self.band_rad_s is None:
+            raise ValueError("bounds_band_rad_s goes with band_rad_s, the band of the fit")
+        return self
 
     @property
     def label(self) -> str:

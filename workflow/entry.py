@@ -17,7 +17,6 @@ from control_design.synthesis_result import Outcome
 from ident.embedding import EmbeddingOptions, tangent
 from ident.identify import identify
 from ident.model import GobfModel
-from ident.nominal import nominal_near
 from ident.options import IdentOptions
 from ident.record import Record
 from ident.uncertainty import ResponsePosterior
@@ -33,8 +32,15 @@ from workflow.settings import check, read_toml
 from workflow.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 from workflow.stages.identify import describe_model
 from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
-from workflow.stages.results import ChannelResult, load_plant
-from workflow.stages.uncertainty import band_row, bands_of, display_grid, nominal_row, residual_tests
+from workflow.stages.results import load_plant
+from workflow.stages.uncertainty import (
+    band_row,
+    bands_of,
+    display_grid,
+    nominal_of,
+    nominal_row,
+    residual_tests,
+)
 from workflow.storage import AnyArray
 from workflow.summary import (
     RunSummary,
@@ -163,7 +169,7 @@ def identify_logs(
         coloured = not whiteness_test(found.residuals).passed
         posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=coloured))
         omega = display_grid(found.model, used)
-        nominal = nominal_near(posterior, found.model.poles, omega)
+        nominal = nominal_of(posterior, found.model.poles, omega)
         frequency = posterior.at(omega, level)
     about = {
         "name": output_name,
@@ -172,7 +178,7 @@ def identify_logs(
         "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
         "fit_repeat_percent": {},
     }
-    tests = residual_tests(ChannelResult(output_name, found, tuple(used), fresh), posterior)
+    tests = residual_tests(posterior, used)
     spread = {
         "level": level,
         "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],

@@ -6,7 +6,8 @@ import scipy.signal
 
 from ident.identify import identify
 from ident.options import IdentOptions
-from ident.prefilter import band_limited
+from ident.prefilter import band_limited, increments
+from ident.record import Record
 from tests.ident.benchmark_plants import as_record
 
 
@@ -49,3 +50,24 @@ def test_gain_is_one_inside_and_small_outside(low, high):
 def test_bad_bands_are_refused(band, message):
     with pytest.raises(ValueError, match=message):
         band_limited(as_record(np.arange(100.0), np.arange(100.0)), **band)
+
+
+def test_increments_are_differences_of_every_signal():
+    y = np.arange(6.0)[:, None] ** 2
+    u = np.array([0, 1, 0, 1, 1, 0.0])[:, None]
+    record = Record(
+        name="a",
+        input=u,
+        output=y,
+        dt_s=0.1,
+        input_names=("u",),
+        output_names=("y",),
+        reference=2 * u,
+        reference_names=("r",),
+    )
+    found = increments(record)
+    np.testing.assert_array_equal(found.output[:, 0], [1, 3, 5, 7, 9])
+    np.testing.assert_array_equal(found.input[:, 0], [1, -1, 1, 0, -1])
+    np.testing.assert_array_equal(found.reference, 2 * found.input)
+    with pytest.raises(ValueError, match="at least two samples"):
+        increments(record.slice(0, 1))

@@ -21,6 +21,7 @@ from ident.search_trace import PolishedMinimum, SearchStage, SearchTrace
 from ident.structure import Structure
 from ident.uncertainty import ResponsePosterior
 from ident.validation import ScatterRow, fit_on_fresh_data
+from workflow.conditioning import as_fitted
 from workflow.config import RunConfig
 from workflow.run_directory import RunDirectory, StageData
 from workflow.stages import closed_loop as closed_loop_stage
@@ -251,7 +252,7 @@ def _save_identification(
     arrays: dict[str, Any] = {}
     about, results = [], []
     for k, (channel, of) in enumerate(zip(settings.channels, models, strict=True)):
-        used = identify_stage.estimation_records(records, channel.input, channel.output)
+        used = [as_fitted(item.record, channel) for item in records if item.role == "estimation"]
         found = identification(of, used)
         fresh = [
             fit_on_fresh_data(of, item.record.siso(channel.input, channel.output))
@@ -265,7 +266,7 @@ def _save_identification(
         for i, fit in enumerate(fresh):
             arrays |= {f"{at}fresh/{i}/{key}": value for key, value in fit.to_arrays().items()}
         about.append(identify_stage.describe(settings, k, found, fresh, records))
-        results.append(ChannelResult(channel.label, found, tuple(used), tuple(fresh)))
+        results.append(ChannelResult(channel.label, found, tuple(used), tuple(used), tuple(fresh)))
     run.save_stage("identify", StageData(arrays, {"channels": about}), "00")
     return results
 
@@ -279,7 +280,9 @@ def _save_uncertainty(
         found = posterior(result.identification.model)
         omega = uncertainty_stage.display_grid(result.identification.model, result.used)
         frequency = found.at(omega, 0.95)
-        empirical = uncertainty_stage.empirical_response(result.used, 0.95)
+        empirical = uncertainty_stage.empirical_response(
+            result.used, settings.channels[k], result.identification.model.integrators
+        )
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in found.to_arrays().items()}
         arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
@@ -295,9 +298,10 @@ def _save_uncertainty(
                 "level": 0.95,
                 "report": None,
                 "bands": [uncertainty_stage.band_row(frequency, low, high) for low, high in bands],
-                "tests": uncertainty_stage.residual_tests(result, found),
+                "tests": uncertainty_stage.residual_tests(found, result.bounded),
                 "nominal": uncertainty_stage.nominal_row(frequency, nominal),
                 "repeat_scatter": [row.to_dict() for row in scatter_rows()] if scatter else None,
+                "fresh_fit_percent": {fit.name: fit.fit_percent for fit in result.fresh},
             }
         )
     run.save_stage("uncertainty", StageData(arrays, {"channels": about}), "00")

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from control_design.certificate import certify
+from ident.identify import identify
+from ident.options import IdentOptions
 from ident.record import Record
 from plant import linear_arm
 from plant.presets import paper_link
 from tests.workflow.command import FAST_ARM
-from workflow.config import FileRecord, load_config
+from workflow.conditioning import as_bounded, as_fitted
+from workflow.config import Channel, FileRecord, load_config
 from workflow.errors import InputError
 from workflow.pipeline import config_of
 from workflow.run_directory import RunDirectory
 from workflow.settings import check
 from workflow.simulated_rig import EncodedArm
-from workflow.stages.identify import increments
 from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.stages.results import (
+    ChannelResult,
     load_certificate,
     load_empirical,
     load_frequency,
@@ -28,6 +34,7 @@ from workflow.stages.results import (
     load_records,
     load_synthesis,
 )
+from workflow.stages.uncertainty import posterior_of
 
 
 @pytest.fixture(scope="module")
@@ -143,10 +150,56 @@ def make_record(name="a", dt_s=0.01, u=None):
     return Record(name=name, input=u, output=y, dt_s=dt_s, input_names=("u",), output_names=("y",))
 
 
-def test_increments_are_differences():
-    record = increments(make_record())
-    np.testing.assert_array_equal(record.output[:, 0], [1, 3, 5, 7, 9])
-    np.testing.assert_array_equal(record.input[:, 0], [1, -1, 1, 0, -1])
+def test_channel_filters_are_what_the_settings_say():
+    rng = np.random.default_rng(5)
+    u = rng.standard_normal((4000, 1))
+    record = replace(make_record(), input=u, output=lfilter([0.0, 0.3], [1.0, -0.7], u, axis=0))
+    plain = Channel(input="u", output="y")
+    for seen in (as_fitted(record, plain), as_bounded(record, plain)):
+        np.testing.assert_array_equal(seen.output, record.output)
+    np.testing.assert_array_equal(
+        as_fitted(record, Channel(input="u", output="y", increments=True)).output,
+        np.diff(record.output, axis=0),
+    )
+    banded = Channel(input="u", output="y", band_rad_s=(20.0, 100.0), bounds_band_rad_s=(5.0, 100.0))
+    omega = 2 * np.pi * np.fft.rfftfreq(4000, 0.01)
+    low = (omega > 6) & (omega < 12)
+
+    def power(signal):
+        return np.sum(np.abs(np.fft.rfft(signal[:, 0]))[low] ** 2)
+
+    # 6-12 rad/s lies inside the wider band (passed) and an octave or more below the narrower one.
+    assert power(as_bounded(record, banded).output) > 0.5 * power(record.output)
+    assert power(as_fitted(record, banded).output) < 0.1 * power(record.output)
+    with pytest.raises(ValueError, match="not both"):
+        Channel(input="u", output="y", increments=True, band_rad_s=(1.0, 2.0))
+    with pytest.raises(ValueError, match="goes with band_rad_s"):
+        Channel(input="u", output="y", bounds_band_rad_s=(1.0, 2.0))
+    with pytest.raises(ValueError, match="low < high"):
+        Channel(input="u", output="y", band_rad_s=(3.0, 2.0))
+
+
+def test_scatter_between_records_needs_four_and_widens_the_ellipses():
+    """Records of arms that differ by 20 % in gain: noise alone would never tell."""
+    rng = np.random.default_rng(6)
+    channel = Channel(input="u", output="y", uncertainty={"method": "records"})
+    records = []
+    for i, gain in enumerate((0.8, 0.95, 1.05, 1.2)):
+        u = rng.standard_normal((800, 1))
+        y = gain * lfilter([0.0, 0.3], [1.0, -0.7], u, axis=0) + 1e-3 * rng.standard_normal((800, 1))
+        records.append(replace(make_record(f"r{i}"), input=u, output=y))
+    found = identify(records, IdentOptions(n_real=1, n_pairs=0))
+    result = ChannelResult("y", found, tuple(records), tuple(records), ())
+    omega = np.array([1.0, 10.0, 100.0])
+    apart = posterior_of(result, channel.uncertainty, []).at(omega)
+    noise = posterior_of(result, channel.uncertainty.model_copy(update={"method": "tangent"}), []).at(omega)
+    truth = 0.3 * np.exp(-1j * omega * 0.01) / (1 - 0.7 * np.exp(-1j * omega * 0.01))
+    for gain in (0.8, 1.2):
+        assert np.all(apart.contains(gain * truth))
+        assert not np.any(noise.contains(gain * truth))
+    few = replace(result, bounded=tuple(records[:3]))
+    with pytest.raises(ValueError, match="at least four estimation records; found 3"):
+        posterior_of(few, channel.uncertainty, [])
 
 
 def test_sampling_times_that_differ_are_refused_and_jitter_is_not():

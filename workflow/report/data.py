@@ -15,9 +15,9 @@ from control_design.synthesis_result import Outcome, SynthesisResult
 from ident.model import GobfModel
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config import RunConfig
+from workflow.conditioning import as_fitted
+from workflow.config import Channel, RunConfig
 from workflow.run_directory import RunDirectory, StageData
-from workflow.stages.identify import increments
 from workflow.stages.results import (
     ChannelResult,
     RunRecord,
@@ -96,12 +96,15 @@ class RunData:
         return np.asarray(self.closed_loop.arrays[name], dtype=np.float64)
 
 
-def _as_fitted(record: Record, of_increments: bool) -> Record:
-    """The record as the fit sees it, increments named so."""
-    if not of_increments:
-        return record
-    name = f"Δ {record.output_names[0]}"
-    return replace(increments(record), output_names=(name,), output_units=record.output_units)
+def _as_fitted(record: Record, channel: Channel) -> Record:
+    """The record as the fit sees it, increments and filtered signals named so."""
+    fitted = as_fitted(record, channel)
+    name = fitted.output_names[0]
+    if channel.increments:
+        name = f"Δ {name}"
+    elif channel.band_rad_s is not None:
+        name = f"{name}, in band"
+    return replace(fitted, output_names=(name,))
 
 
 def load(run: RunDirectory, config: RunConfig) -> RunData:
@@ -122,10 +125,7 @@ def load(run: RunDirectory, config: RunConfig) -> RunData:
                 empirical=FrequencyUncertainty.from_arrays(empirical) if empirical else None,
                 identified=identified.document["channels"][k],
                 uncertain=uncertain.document["channels"][k],
-                fresh_records=tuple(
-                    _as_fitted(by_name[fit.name].siso(channel.input, channel.output), channel.increments)
-                    for fit in result.fresh
-                ),
+                fresh_records=tuple(_as_fitted(by_name[fit.name], channel) for fit in result.fresh),
             )
         )
     designed = run.stage_file("design") is not None

@@ -16,15 +16,16 @@ records.npz
               noise_free/<i>/output           (T, Y) before sensor effects and noise, simulated source only
 
 identify.npz
-    document  channels: list of {name, input, output, purpose "control"|"performance", increments, n_used,
-              n_fresh, fit_estimation_percent {record: %}, fit_validation_percent {record: %},
-              fit_repeat_percent {record: %}, order, integrators, input_delay_samples, feedthrough, modes:
-              list of {frequency_Hz, omega_rad_s, damping} ascending, real_poles_per_s: decay rates,
-              real_poles_z, noise_std (output units), tangent_optimality, warnings: list of str, verdicts:
-              list of str, order_table: list of {n_real, n_pairs, rss, criterion}, search_evaluations,
-              two_stage: null or a sentence}
+    document  channels: list of {name, input, output, purpose "control"|"performance", increments,
+              band_rad_s, bounds_band_rad_s, n_used, n_fresh, fit_estimation_percent {record: %},
+              fit_validation_percent {record: %}, fit_repeat_percent {record: %}, order, integrators,
+              input_delay_samples, feedthrough, modes: list of {frequency_Hz, omega_rad_s, damping}
+              ascending, real_poles_per_s: decay rates, real_poles_z, noise_std (output units),
+              tangent_optimality, warnings: list of str, verdicts: list of str, order_table: list of
+              {n_real, n_pairs, rss, criterion}, search_evaluations, two_stage: null or a sentence}
     arrays    channel/<k>/identification/...  ident.identify.Identification (model, residuals, search trace)
               channel/<k>/used/<i>/...        ident.Record, SISO: what the fit saw; i counts estimation ones
+              channel/<k>/bounded/<i>/...     ident.Record, SISO: what the ellipses see, if other
               channel/<k>/fresh/<i>/...       ident.validation.FreshFit; i counts the other records in order
 
 uncertainty.npz
@@ -32,7 +33,7 @@ uncertainty.npz
               of {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis
               over |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()},
               repeat_scatter: null or list of ScatterRow.to_dict(), nominal {share_inside_percent,
-              largest_distance, at_rad_s}}
+              largest_distance, at_rad_s}, fresh_fit_percent {record: %} of the posterior mean}
     arrays    channel/<k>/posterior/...       ident.ResponsePosterior
               channel/<k>/nominal/...         ident.GobfModel: the identified poles, nearest to the posterior
               channel/<k>/frequency/...       ident.FrequencyUncertainty on the display grid

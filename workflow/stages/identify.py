@@ -9,8 +9,8 @@ import numpy as np
 
 from ident.closed_loop import two_stage
 from ident.identify import Identification, identify
-from ident.record import Record
 from ident.validation import FreshFit, fit_on_fresh_data
+from workflow.conditioning import as_bounded, as_fitted
 from workflow.config import RunConfig
 from workflow.errors import naming
 from workflow.run_directory import StageData
@@ -38,51 +38,35 @@ def identify_channels(stage: StageInput) -> StageData:
     for k, channel in enumerate(config.channels):
         report = stage.part_of_progress("identify", k, len(config.channels), channel.label)
         with naming(f"channel {channel.label!r}"):
-            used = estimation_records(records, channel.input, channel.output)
+            measured = [item.record for item in records if item.role == "estimation"]
+            bounded = [as_bounded(record, channel) for record in measured]
             first_stage = None
             if config.closed_loop_data.method == "two_stage":
-                opened = two_stage(used, channel.identification)
-                used, first_stage = list(opened.records), opened.verdict
-            if channel.increments:
-                used = [increments(record) for record in used]
+                opened = two_stage(bounded, channel.identification, channel.uncertainty)
+                bounded, first_stage = list(opened.records), opened.verdict
+                used = bounded
+                if channel.bounds_band_rad_s is not None:
+                    used = [as_fitted(record, channel) for record in bounded]
+            else:
+                used = [as_fitted(record, channel) for record in measured]
             found = identify(used, channel.identification, progress=report)
-            rest = [
-                item.record.siso(channel.input, channel.output)
+            # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
+            fresh = [
+                fit_on_fresh_data(found.model, as_fitted(item.record, channel))
                 for item in records
                 if item.role != "estimation"
-            ]
-            # A free run of an integrating plant drifts away with friction; increments are judged as they
-            # were fitted.
-            fresh = [
-                fit_on_fresh_data(found.model, increments(record) if channel.increments else record)
-                for record in rest
             ]
         at = f"channel/{k}/"
         arrays |= {f"{at}identification/{key}": value for key, value in found.to_arrays().items()}
         for i, record in enumerate(used):
             arrays |= {f"{at}used/{i}/{key}": value for key, value in record.to_arrays().items()}
+        if channel.bounds_band_rad_s is not None:
+            for i, record in enumerate(bounded):
+                arrays |= {f"{at}bounded/{i}/{key}": value for key, value in record.to_arrays().items()}
         for i, fit in enumerate(fresh):
             arrays |= {f"{at}fresh/{i}/{key}": value for key, value in fit.to_arrays().items()}
         about.append({**describe(config, k, found, fresh, records), "two_stage": first_stage})
     return StageData(arrays, {"channels": about})
-
-
-def estimation_records(records: Sequence[RunRecord], input_name: str, output_name: str) -> list[Record]:
-    """The SISO records a channel is fitted to."""
-    return [item.record.siso(input_name, output_name) for item in records if item.role == "estimation"]
-
-
-def increments(record: Record) -> Record:
-    """Input and output filtered by 1 - q^-1, one sample shorter: the same response, slow noise whitened."""
-    return Record(
-        name=record.name,
-        input=np.diff(record.input, axis=0),
-        output=np.diff(record.output, axis=0),
-        dt_s=record.dt_s,
-        input_names=record.input_names,
-        output_names=record.output_names,
-        source=record.source,
-    )
 
 
 def describe(
@@ -101,6 +85,8 @@ def describe(
         "output": channel.output,
         "purpose": config.purpose_of(index),
         "increments": channel.increments,
+        "band_rad_s": channel.band_rad_s,
+        "bounds_band_rad_s": channel.bounds_band_rad_s,
         "n_used": len(found.record_names),
         "n_fresh": len(fresh),
         "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),

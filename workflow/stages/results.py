@@ -45,12 +45,14 @@ def load_records(run: RunDirectory) -> list[RunRecord]:
 class ChannelResult:
     """One channel after identification: what was fitted to what, and free runs on the other records.
 
-    `used` are the SISO estimation records as the fit saw them, `fresh` the free runs on records not fitted.
+    `used` are the SISO estimation records as the fit saw them, `bounded` the same as the ellipses see them,
+    `fresh` the free runs on records not fitted.
     """
 
     label: str
     identification: Identification
     used: tuple[Record, ...]
+    bounded: tuple[Record, ...]
     fresh: tuple[FreshFit, ...]
 
 
@@ -63,10 +65,15 @@ def channel_result(data: StageData, index: int) -> ChannelResult:
     """The same from a stage already read."""
     about = data.document["channels"][index]
     at = f"channel/{index}/"
+    used = tuple(Record.from_arrays(data.under(f"{at}used/{i}/")) for i in range(about["n_used"]))
+    bounded = used
+    if about["bounds_band_rad_s"] is not None:
+        bounded = tuple(Record.from_arrays(data.under(f"{at}bounded/{i}/")) for i in range(about["n_used"]))
     return ChannelResult(
         label=about["name"],
         identification=Identification.from_arrays(data.under(f"{at}identification/")),
-        used=tuple(Record.from_arrays(data.under(f"{at}used/{i}/")) for i in range(about["n_used"])),
+        used=used,
+        bounded=bounded,
         fresh=tuple(FreshFit.from_arrays(data.under(f"{at}fresh/{i}/")) for i in range(about["n_fresh"])),
     )
 

@@ -13,20 +13,25 @@ from scipy.signal import lfilter
 from control_design.frequency_grid import frequency_grid
 from control_design.plant_set import Mode
 from ident.conditions import combine_posteriors, record_posteriors
-from ident.embedding import EmbeddingOptions, classical, common_fir_length, tangent
+from ident.embedding import classical, common_fir_length, tangent
 from ident.model import GobfModel
 from ident.nominal import nominal_near
 from ident.nonparametric import empirical_frf
+from ident.poles import Poles
+from ident.prefilter import increments
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
-from ident.validation import independence_test, repeat_scatter, whiteness_test
+from ident.validation import fit_on_fresh_data, independence_test, repeat_scatter, whiteness_test
+from workflow.conditioning import as_bounded
 from workflow.config import Channel, RunConfig, UncertaintyOptions
 from workflow.errors import naming
 from workflow.run_directory import StageData
 from workflow.stages.base import StageInput
-from workflow.stages.identify import increments
 from workflow.stages.results import ChannelResult, RunRecord, channel_result, load_records
 from workflow.storage import AnyArray
+
+_FEWEST_FREQUENCIES = 100
+_SHARE_INSIDE = 0.9
 
 N_BANDS = 6
 """Bands of equal width on the log axis in which radii and scatter are summarised."""
@@ -49,11 +54,16 @@ def find_uncertainty(stage: StageInput) -> StageData:
         model = result.identification.model
         with naming(f"channel {channel.label!r}"):
             posterior = posterior_of(result, channel.uncertainty, records)
-            omega = display_grid(model, result.used)
+            omega = display_grid(model, result.bounded)
             frequency = posterior.at(omega, channel.uncertainty.level)
-            nominal = nominal_near(posterior, model.poles, omega)
-            empirical = empirical_response(result.used, channel.uncertainty.level)
-            scatter = scatter_of(channel, model, records, bands_of(omega))
+            nominal = nominal_of(posterior, model.poles, nominal_grid(omega, channel))
+            empirical = empirical_response(result.bounded, channel, model.integrators)
+            scatter = scatter_of(channel, result, records, bands_of(omega))
+            fresh = {
+                item.record.name: fit_on_fresh_data(posterior, as_bounded(item.record, channel)).fit_percent
+                for item in records
+                if item.role != "estimation"
+            }
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in posterior.to_arrays().items()}
         arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
@@ -67,9 +77,10 @@ def find_uncertainty(stage: StageInput) -> StageData:
                 "level": channel.uncertainty.level,
                 "report": posterior.report.to_dict() if posterior.report is not None else None,
                 "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
-                "tests": residual_tests(result, posterior),
+                "tests": residual_tests(posterior, result.bounded),
                 "repeat_scatter": scatter,
-                "nominal": nominal_row(frequency, nominal),
+                "nominal": nominal_row(posterior.at(nominal_grid(omega, channel)), nominal),
+                "fresh_fit_percent": fresh,
             }
         )
     return StageData(arrays, {"channels": about})
@@ -81,29 +92,52 @@ def posterior_of(
     """One library call, by method."""
     model = result.identification.model
     if options.method == "classical":
-        return classical(result.used, model, options)
+        return classical(result.bounded, model, options)
     if options.method == "tangent":
-        return tangent(result.used, model, options)
+        return tangent(result.bounded, model, options)
+    if options.method == "records":
+        if len(result.bounded) < 4:
+            raise ValueError(
+                "uncertainty.method = 'records' needs at least four estimation records; "
+                f"found {len(result.bounded)}"
+            )
+        each = record_posteriors(result.bounded, model, options)
+        return combine_posteriors(each, small_sample_level=options.level)
     condition = {item.record.name: item.condition for item in records}
     groups: dict[str, list[Record]] = {}
-    for record in result.used:
+    for record in result.bounded:
         groups.setdefault(condition[record.name] or record.name, []).append(record)
-    if len(groups) < 2:
+    if len(groups) < 4:
         raise ValueError(
-            "uncertainty.method = 'conditions' needs estimation records of at least two conditions; "
-            f"found {len(groups)}"
+            "uncertainty.method = 'conditions' needs estimation records of at least four conditions "
+            f"(found {len(groups)}); with fewer use 'records'"
         )
-    return conditions_posterior(list(groups.values()), model, options)
-
-
-def conditions_posterior(
-    groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions
-) -> ResponsePosterior:
-    """Tangent posterior per condition with one kernel length, combined with the scatter between
-    conditions."""
-    length = min(common_fir_length(group, model.poles.doubled(), options) for group in groups)
+    length = min(common_fir_length(group, model.poles.doubled(), options) for group in groups.values())
     shared = options.model_copy(update={"fir_length": length})
-    return combine_posteriors([tangent(group, model, shared) for group in groups])
+    return combine_posteriors(
+        [tangent(group, model, shared) for group in groups.values()], small_sample_level=options.level
+    )
+
+
+def nominal_grid(omega: npt.NDArray[np.float64], channel: Channel) -> npt.NDArray[np.float64]:
+    """Where the nominal model has to be right: the band of the data, everywhere without one."""
+    band = channel.bounds_band_rad_s or channel.band_rad_s
+    if band is None:
+        return omega
+    inside = omega[(omega >= band[0]) & (omega <= band[1])]
+    return inside if inside.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
+
+
+def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: npt.NDArray[np.float64]) -> GobfModel:
+    """Nearest model on the identified poles, or on every pole taken twice if that one leaves its ellipses.
+
+    The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for.
+    """
+    low = nominal_near(posterior, poles, omega)
+    distance = posterior.at(omega).normalised_distance(low.frequency_response(omega))
+    if np.mean(distance <= 1) >= _SHARE_INSIDE:
+        return low
+    return nominal_near(posterior, poles.doubled(), omega)
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> npt.NDArray[np.float64]:
@@ -149,58 +183,67 @@ def nominal_row(frequency: FrequencyUncertainty, nominal: GobfModel) -> dict[str
     }
 
 
-def residual_tests(result: ChannelResult, posterior: ResponsePosterior) -> list[dict[str, Any]]:
-    """Whiteness and independence on the estimation records, whiteness on each record that was not fitted.
+def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
 
     Where the bounds have a noise model, whiteness is that of the residuals behind it: they rest on those.
     """
-    found = result.identification
     colour = () if posterior.report is None else posterior.report.ar_coefficients
     filter_of_noise = np.array([1.0, *colour])
-    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in found.residuals]
-    delay = found.model.input_delay_samples
-    inputs = [record.input[delay:, 0] for record in result.used]
-    tests = [
+    fits = [fit_on_fresh_data(posterior, record) for record in records]
+    whitened = [lfilter(filter_of_noise, np.ones(1), fit.residual)[len(colour) :] for fit in fits]
+    delay = posterior.input_delay_samples
+    inputs = [record.input[: record.n_samples - delay, 0] for record in records]
+    driven = [fit.residual[delay:] for fit in fits]
+    return [
         {"data": "estimation", **whiteness_test(whitened).to_dict()},
-        {"data": "estimation", **independence_test(inputs, found.residuals).to_dict()},
+        {"data": "estimation", **independence_test(inputs, driven).to_dict()},
     ]
-    tests += [
-        {"data": fit.name, **whiteness_test([fit.residual]).to_dict()}
-        for fit in result.fresh
-        if np.any(fit.residual)
-    ]
-    return tests
 
 
-def empirical_response(records: Sequence[Record], level: float) -> FrequencyUncertainty | None:
+def empirical_response(
+    records: Sequence[Record], channel: Channel, integrators: int
+) -> FrequencyUncertainty | None:
     """Response without a model from the largest set of equally long records, or None if they are too
     short."""
     by_length: dict[int, list[Record]] = {}
     for record in records:
         by_length.setdefault(record.n_samples, []).append(record)
     alike = max(by_length.values(), key=len)
+    band = channel.bounds_band_rad_s or channel.band_rad_s
+    if band is None and not channel.increments:
+        for _ in range(integrators):  # an integrated output ends elsewhere than it began and leaks everywhere
+            alike = [increments(record) for record in alike]
+    low, high = band or (None, None)
     try:
-        return empirical_frf(alike, level=level)
+        return empirical_frf(
+            alike, level=channel.uncertainty.level, omega_min_rad_s=low, omega_max_rad_s=high
+        )
     except ValueError:
         return None  # a picture the records are too short for; the identification stands without it
 
 
 def scatter_of(
     channel: Channel,
-    model: GobfModel,
+    result: ChannelResult,
     records: Sequence[RunRecord],
     bands: Sequence[tuple[float, float]],
 ) -> list[dict[str, Any]] | None:
-    """Predicted ellipses against the scatter of repeats, or None without repeats."""
+    """Predicted ellipses of single records against the scatter of repeats, or None without repeats."""
+    bounded = {record.name: record for record in result.bounded}
     groups: dict[str, list[Record]] = {}
     for item in records:
         if item.condition is not None and item.role != "validation":
-            record = item.record.siso(channel.input, channel.output)
-            groups.setdefault(item.condition, []).append(increments(record) if channel.increments else record)
+            record = bounded.get(item.record.name) or as_bounded(item.record, channel)
+            groups.setdefault(item.condition, []).append(record)
     repeated = [group for group in groups.values() if len(group) >= 2]
     if not repeated:
         return None
-    flat = record_posteriors([record for group in repeated for record in group], model, channel.uncertainty)
+    flat = record_posteriors(
+        [record for group in repeated for record in group],
+        result.identification.model,
+        channel.uncertainty,
+    )
     omega = np.geomspace(bands[0][0], bands[-1][1] * (1 - 1e-6), 20 * len(bands))
     estimates = iter([posterior.at(omega, channel.uncertainty.level) for posterior in flat])
     return [
