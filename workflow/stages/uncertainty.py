@@ -129,15 +129,19 @@ def nominal_grid(omega: npt.NDArray[np.float64], channel: Channel) -> npt.NDArra
 
 
 def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: npt.NDArray[np.float64]) -> GobfModel:
-    """Nearest model on the identified poles, or on every pole taken twice if that one leaves its ellipses.
+    """Nearest model on the identified poles; on every pole taken twice where only that one stays in its
+    ellipses.
 
-    The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for.
+    The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
+    but a pole taken twice is a mode listed twice, so it has to earn that.
     """
-    low = nominal_near(posterior, poles, omega)
-    distance = posterior.at(omega).normalised_distance(low.frequency_response(omega))
-    if np.mean(distance <= 1) >= _SHARE_INSIDE:
-        return low
-    return nominal_near(posterior, poles.doubled(), omega)
+    single = nominal_near(posterior, poles, omega)
+    double = nominal_near(posterior, poles.doubled(), omega)
+    ellipses = posterior.at(omega)
+    inside = [
+        float(np.mean(ellipses.contains(model.frequency_response(omega)))) for model in (single, double)
+    ]
+    return double if inside[0] < _SHARE_INSIDE <= inside[1] else single
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> npt.NDArray[np.float64]:
