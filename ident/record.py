@@ -11,6 +11,9 @@ import numpy as np
 
 from ident.arrays import RealArray, readonly_real
 
+# Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
+_LARGEST = 1e100
+
 
 @dataclass(frozen=True, eq=False)
 class Record:
@@ -36,8 +39,8 @@ class Record:
     Raises
     ------
     ValueError
-        If a shape or a name does not fit, dt_s is not positive, or a sample is not finite (names the first
-        one).
+        If a shape or a name does not fit, dt_s is not positive, or a sample is not finite or above 1e100
+        (names the first one).
     """
 
     name: str
@@ -91,6 +94,13 @@ class Record:
                 f"{self.label}: {key} column '{names[column]}' is {signal[k, column]} at index {k}; "
                 "expected finite numbers"
             )
+        large = np.argwhere(np.abs(signal) > _LARGEST)
+        if large.size:
+            k, column = large[0]
+            raise ValueError(
+                f"{self.label}: {key} column '{names[column]}' is {signal[k, column]:.6g} at index {k}; "
+                f"expected magnitudes up to {_LARGEST:g} (choose another unit)"
+            )
 
     @property
     def label(self) -> str:
@@ -135,7 +145,8 @@ class Record:
         """Samples start <= k < stop, 0 <= start < stop <= T; the new record's time starts at 0 again."""
         if not 0 <= start < stop <= self.n_samples:
             raise ValueError(
-                f"{self.label}: a slice needs 0 <= start < stop <= {self.n_samples}; got {start} and {stop}"
+                f"{self.label}: samples {start} to {stop} asked for; expected 0 <= start < stop <= "
+                f"{self.n_samples}, the number there are"
             )
         part = slice(start, stop)
         return Record(
@@ -252,6 +263,11 @@ def _assemble(
                 f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
             )
     wanted = [*inputs, *outputs, *references]
+    if time in wanted:
+        raise ValueError(f"{table.path}: column {time!r} is asked for as time and as a signal; expected two")
+    both = [item for item in inputs if item in outputs]
+    if both:
+        raise ValueError(f"{table.path}: column {both[0]!r} is asked for as input and output; expected two")
     columns = table.columns(wanted if time is None else [time, *wanted])
     step = table.sampling_time(None if time is None else columns[time], time, dt_s)
 

@@ -3,6 +3,7 @@ expectation."""
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -44,13 +45,27 @@ class Table:
         found: dict[str, RealArray] = {}
         for name in wanted:
             if name not in self.names:
-                raise ValueError(f"{self.path}: no column '{name}'; the file has {_listed(self.names)}")
+                raise ValueError(
+                    f"{self.path}: no column '{name}'; the file has {_listed(self.names)}{self._hint()}"
+                )
             if name not in found:
                 found[name] = self._numbers(name)
         sizes = {name: column.size for name, column in found.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(f"{self.path}: columns must be equally long; got {sizes}")
         return found
+
+    def _hint(self) -> str:
+        """What the header looks like when it is no header of ours: another separator, or numbers."""
+        if self.first_line is None:
+            return ""
+        if len(self.names) == 1:
+            for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+                if separator in self.names[0]:
+                    return f" (one column separated by {word}?); expected commas and decimal points"
+        if all(_is_number(name) for name in self.names):
+            return " (numbers?); expected column names in line 1"
+        return ""
 
     def _numbers(self, name: str) -> RealArray:
         column = self.raw[name]
@@ -107,7 +122,7 @@ class Table:
             return float(dt_s)
         if stamps.size < 2:
             raise ValueError(
-                f"{self.path}: {stamps.size} samples; expected at least 2 to find the sampling time"
+                f"{self.path}: a single row of numbers; expected at least 2 to find the sampling time"
             )
         interval = np.diff(stamps)
         backwards = np.flatnonzero(~(interval > 0))
@@ -159,10 +174,11 @@ def read_csv(path: str | PathLike[str], separator: str = ",") -> Table:
     except pd.errors.EmptyDataError:
         raise ValueError(f"{file}: the file is empty; expected a header line and rows of numbers") from None
     except pd.errors.ParserError as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{file}: not a table separated by {separator!r} ({reason})") from None
+        raise ValueError(f"{file}{_ragged(str(error), separator)}") from None
     except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: not a UTF-8 text file (byte {error.start}); expected CSV") from None
+        raise ValueError(
+            f"{file}: not a UTF-8 text file (byte {error.start}); expected CSV in UTF-8"
+        ) from None
     names = tuple(str(item).strip() for item in frame.iloc[0])
     frame = frame.iloc[1:].set_axis(list(names), axis="columns")
     if len(set(names)) != len(names):
@@ -215,6 +231,26 @@ def read_mat(path: str | PathLike[str]) -> Table:
         raise ValueError(f"{file}: not a MATLAB .mat file ({type(error).__name__})") from None
     raw = {name: value for name, value in content.items() if not name.startswith("__")}
     return Table(file, tuple(raw), raw, first_line=None)
+
+
+def _ragged(reason: str, separator: str) -> str:
+    """pandas' complaint about a row that is too long, in our words."""
+    found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", reason)
+    if found is None:
+        return f": not a table separated by {separator!r} ({' '.join(reason.split())})"
+    header, line, cells = found.groups()
+    return (
+        f", line {line}: {cells} cells where line 1 has {header}; expected one per column, separated by "
+        f"{separator!r}, and a decimal point"
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _existing(path: str | PathLike[str]) -> Path:

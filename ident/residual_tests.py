@@ -55,10 +55,10 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     """Autocorrelation of the residuals at lags 1..max_lag, records pooled; Ljung-Box over all lags together.
 
     residuals: one (T,) array per record. The few parameters fitted on many samples are not taken off the
-    degrees of freedom. Raises ValueError when a record is not longer than 2 max_lag, or the residuals are
-    zero.
+    degrees of freedom. Records of at most 2 max_lag samples say next to nothing about such lags and are left
+    out. Raises ValueError when none is longer, or the residuals are zero.
     """
-    centred = _centred(residuals, max_lag)
+    centred = _centred(_long_enough(residuals, max_lag), max_lag)
     n = sum(e.size for e in centred)
     correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
     lags = np.arange(1, max_lag + 1)
@@ -69,13 +69,13 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     largest = int(np.argmax(np.abs(correlation)))
     if passed:
         verdict = (
-            f"The residuals look white over {max_lag} lags (p = {probability:.2g}): no noise model is missed."
+            f"The residuals look white over {max_lag} lags ({_p(probability)}): no noise model is missed."
         )
     else:
         verdict = (
-            f"The residuals are not white (p = {probability:.2g}, largest correlation "
-            f"{correlation[largest]:+.2f} at lag {lags[largest]}): bounds that assume white "
-            "noise are too narrow; use coloured_noise."
+            f"The residuals are not white ({_p(probability)}, largest correlation "
+            f"{correlation[largest]:+.2f} at lag {lags[largest]}): the bounds may be too narrow; model the noise "
+            "(coloured_noise) or, where that is done already, more of it (max_ar_order)."
         )
     return ResidualTest(
         "whiteness", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
@@ -88,14 +88,15 @@ def independence_test(
     """Cross-correlation of past input and residual at lags -max_lag..max_lag (residual after input: lag > 0).
 
     Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, so a coloured input or residual does not
-    fail the test by itself. The verdict rests on lags >= 0 (dynamics the model lacks) with the level shared
+    fail the test by itself. Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0 (dynamics the model lacks) with the level shared
     over them (Sidak); what stands out at negative lags only says that the output feeds back into the input.
     """
     if len(inputs) != len(residuals) or any(
         u.size != e.size for u, e in zip(inputs, residuals, strict=False)
     ):
         raise ValueError("need one input of equal length for every residual")
-    e, u = _centred(residuals, max_lag), _centred(inputs, max_lag)
+    e = _centred(_long_enough(residuals, max_lag), max_lag)
+    u = _centred(_long_enough(inputs, max_lag), max_lag)
     n = sum(part.size for part in e)
     correlation = _pooled_correlation(e, u, max_lag)
     longest = min(part.size for part in e) // 2
@@ -113,12 +114,12 @@ def independence_test(
     worst = int(np.argmax(causal))
     if passed:
         verdict = (
-            f"The residuals do not depend on the input (p = {probability:.2g}): no linear dynamics is missed."
+            f"The residuals do not depend on the input ({_p(probability)}): no linear dynamics is missed."
         )
     else:
         verdict = (
             f"The residuals depend on the input {worst} samples before (correlation "
-            f"{correlation[max_lag + worst]:+.2f}, p = {probability:.2g}): the model lacks dynamics or delay "
+            f"{correlation[max_lag + worst]:+.2f}, {_p(probability)}): the model lacks dynamics or delay "
             "there."
         )
     before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
@@ -129,6 +130,16 @@ def independence_test(
     )
 
 
+def _p(probability: float) -> str:
+    """'p = 0.02'; far out in the tail doubles end, and 'p = 0' would claim a certainty nobody has."""
+    return "p < 1e-300" if probability < 1e-300 else f"p = {probability:.2g}"
+
+
+def _long_enough(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
+    """The signals longer than 2 max_lag, or all of them where none is (`_centred` then refuses them)."""
+    return [signal for signal in signals if signal.size > 2 * max_lag] or list(signals)
+
+
 def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
     if not signals:
         raise ValueError("need at least one record")
@@ -136,7 +147,10 @@ def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
         raise ValueError(f"max_lag must be at least 1; got {max_lag}")
     for signal in signals:
         if signal.ndim != 1 or signal.size <= 2 * max_lag or not np.all(np.isfinite(signal)):
-            raise ValueError(f"need finite (T,) signals with T > {2 * max_lag}; got shape {signal.shape}")
+            raise ValueError(
+                f"residual tests over {max_lag} lags need finite (T,) signals with T > {2 * max_lag} samples; "
+                f"got shape {signal.shape}"
+            )
     centred = [np.asarray(signal - signal.mean(), dtype=np.float64) for signal in signals]
     if not any(np.any(signal) for signal in centred):
         raise ValueError("the signals are constant: there is nothing to correlate")

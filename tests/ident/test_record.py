@@ -113,8 +113,34 @@ def test_rows_of_uneven_length_are_named(tmp_path):
     assert f"{path}, line 5: column 'y_rad' is empty" in complaint(path)
     path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "0.03,1,2,3", *rows(2, start=4)])
     message = complaint(path)
-    assert str(path) in message
-    assert "line 5" in message
+    assert f"{path}, line 5: 4 cells where line 1 has 3" in message
+
+
+@pytest.mark.parametrize(
+    ("lines", "hint"),
+    [
+        (["t_s;u_V;y_rad", "0;1;2"], "semicolons"),
+        (["t_s\tu_V\ty_rad", "0\t1\t2"], "tabs"),
+        (["0,1,2", "1,2,3"], "column names in line 1"),
+    ],
+)
+def test_a_header_of_another_kind_is_recognised(tmp_path, lines, hint):
+    message = complaint(write(tmp_path / "log.csv", lines))
+    assert "no column" in message
+    assert hint in message
+
+
+def test_decimal_commas_are_named_by_line(tmp_path):
+    message = complaint(write(tmp_path / "log.csv", [f"{T},{U},{Y}", "0,00,1,00,2,00"]))
+    assert "line 2: 6 cells where line 1 has 3" in message
+    assert "decimal point" in message
+
+
+def test_one_column_is_not_two_things(good):
+    with pytest.raises(ValueError, match="as input and output"):
+        Record.from_csv(good, [U], [U], time=T)
+    with pytest.raises(ValueError, match="as time and as a signal"):
+        Record.from_csv(good, [T], [Y], time=T)
 
 
 def test_time_running_backwards_or_standing_still(tmp_path):
@@ -267,6 +293,7 @@ def test_record_round_trip_through_arrays(tmp_path):
         ({"input": np.arange(8.0)}, r"input must be \(T, 2\)"),
         ({"output": np.zeros((3, 3))}, "equally long"),
         ({"output": np.full((4, 3), np.inf)}, "output column 'c' is inf at index 0"),
+        ({"output": np.full((4, 3), -1e200)}, r"output column 'c' is -1e\+200 at index 0; .*unit"),
         ({"input_names": ("a", "a")}, "distinct"),
         ({"reference": None}, "without a reference"),
         ({"output_units": ("rad",)}, "one per column"),

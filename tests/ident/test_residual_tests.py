@@ -76,6 +76,22 @@ def test_records_are_pooled_without_correlating_across_their_joint():
     assert pooled.band[0] == pytest.approx(2.5758 / np.sqrt(2000), rel=1e-4)
 
 
+def test_short_records_are_left_out_beside_long_ones():
+    rng = np.random.default_rng(7)
+    e, u = rng.standard_normal(400), rng.standard_normal(400)
+    with_short = whiteness_test([e[:20], e])
+    np.testing.assert_array_equal(with_short.correlation, whiteness_test([e]).correlation)
+    both = independence_test([u[:20], u], [e[:20], e])
+    np.testing.assert_array_equal(both.correlation, independence_test([u], [e]).correlation)
+
+
+def test_no_probability_is_called_zero():
+    ramp = np.linspace(-1.0, 1.0, 3000)
+    result = whiteness_test([ramp])
+    assert result.probability == 0.0  # underflow of the chi-squared tail
+    assert "p < 1e-300" in result.verdict
+
+
 def test_round_trip_and_bad_input():
     result = whiteness_test([np.random.default_rng(6).standard_normal(100)])
     again = ResidualTest.from_dict(result.to_dict())
