@@ -22,11 +22,13 @@ from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
 from workflow.figures.error_surface import draw_error_surface, searched_pairs
 from workflow.figures.nyquist import draw_nyquist, uncertain_loop
+from workflow.figures.overview import StepView, draw_overview
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import ShownRecord, draw_records
 from workflow.figures.repeats import draw_repeat_scatter
 from workflow.figures.residuals import draw_residual_tests
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
+from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
 
 OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))
@@ -74,6 +76,16 @@ def error_surface_figure(name: str = "hub") -> Figure:
 def nyquist_figure(name: str = "hub") -> Figure:
     loop = uncertain_loop(frequency(), example.controller().response(OMEGA))
     return draw_nyquist(loop, level=0.95, modulus_margin=0.5, name=name)
+
+
+def overview_figure(name: str = "hub") -> Figure:
+    loop = uncertain_loop(frequency(), example.controller().response(OMEGA))
+    time = np.linspace(0.0, 2.0, 400)
+    rise = 1 - np.exp(-5 * time)
+    step = StepView(time, np.ones(400), rise, np.stack([rise, 1.05 * rise]), "simulated arm", (name, "rad"))
+    return draw_overview(
+        frequency(), example.model(), loop, step, gain_unit=ratio_unit("rad", name), modulus_margin=0.5
+    )
 
 
 def sensitivity_figure(name: str = "V") -> Figure:
@@ -139,6 +151,7 @@ FAMILIES: list[Callable[..., Figure]] = [
     poles_figure,
     error_surface_figure,
     nyquist_figure,
+    overview_figure,
     sensitivity_figure,
     closed_loop_figure,
     validation_figure,

@@ -61,29 +61,10 @@ def draw_nyquist(
         figure = style.new_figure(6.0)
         whole, near = figure.subplots(1, 2)
         reach = _reach(np.abs(loop.centre))
-        nearest = loop.nearest
-        closest = loop.distance[nearest]
-        side = float(np.clip(1.35 * max(closest, modulus_margin or 0.0, 0.35), 0.5, 1.3))
         _draw_loop(whole, loop, (-reach, reach), (-reach, reach), level)
-        _draw_loop(near, loop, (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side), level)
-        for axes in (whole, near):
-            if modulus_margin is not None:
-                axes.add_patch(
-                    Circle(
-                        (-1, 0),
-                        modulus_margin,
-                        fill=False,
-                        **style.LIMIT_LINE,
-                        label="specification: keep out of here",
-                    )
-                )
-            axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
-        touch = _nearest_point(loop.outline[nearest])
-        label = f"nearest: {closest:.3f} at {loop.omega_rad_s[nearest]:.4g} rad/s"
-        near.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
-        near.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
+        _mark_forbidden(whole, modulus_margin)
+        draw_around_minus_one(near, loop, level=level, modulus_margin=modulus_margin)
         whole.set_title(f"Loop K G{': ' + style.plain(name, 34) if name else ''}")
-        near.set_title("Around -1")
         if np.abs(loop.centre).max() > reach:
             slow = np.abs(loop.centre) > reach
             whole.text(
@@ -99,6 +80,30 @@ def draw_nyquist(
             )
         style.finish(figure, (near, whole), columns=5)
     return figure
+
+
+def draw_around_minus_one(
+    axes: Axes, loop: UncertainLoop, *, level: float, modulus_margin: float | None
+) -> None:
+    """The surroundings of -1 on given axes: ellipses, the disc to keep out of, the nearest point."""
+    nearest = loop.nearest
+    closest = loop.distance[nearest]
+    side = float(np.clip(1.35 * max(closest, modulus_margin or 0.0, 0.35), 0.5, 1.3))
+    _draw_loop(axes, loop, (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side), level)
+    _mark_forbidden(axes, modulus_margin)
+    touch = _nearest_point(loop.outline[nearest])
+    label = f"nearest: {closest:.3f} at {loop.omega_rad_s[nearest]:.4g} rad/s"
+    axes.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
+    axes.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
+    axes.set_title("Around -1")
+
+
+def _mark_forbidden(axes: Axes, modulus_margin: float | None) -> None:
+    if modulus_margin is not None:
+        disc = Circle((-1, 0), modulus_margin, fill=False, label="specification: keep out of here")
+        disc.set(edgecolor=style.LIMIT, linewidth=1.3, linestyle=style.LIMIT_LINE["ls"])
+        axes.add_patch(disc)
+    axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
 
 
 def _reach(size: Real) -> float:

@@ -29,6 +29,12 @@ from workflow.summary import summarise
 
 __all__ = ["write_report"]
 
+OVERVIEW_CAPTION = (
+    "Left: the identified response that is fed back and the range over its ellipses. Middle: the loop with "
+    "the controller, and the point of its ellipses nearest to -1. Right: the reference step, computed and "
+    "run."
+)
+
 
 def write_report(run: RunDirectory, config: RunConfig) -> Path:
     """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
@@ -69,7 +75,9 @@ def page_of(run: RunDirectory, data: RunData, pictures: Mapping[str, Picture]) -
         for section in summary.sections
         for number, row in enumerate(section.rows)
     ]
-    overview = Section("summary", "Summary", "Summary", (Table(("", "quantity", "value"), tuple(rows)),))
+    table = Table(("", "quantity", "value"), tuple(rows))
+    picture = (Plot("overview", OVERVIEW_CAPTION),) if "overview" in pictures else ()
+    overview = Section("summary", "Summary", "Summary", (*picture, table))
     environment = Environment(
         loader=PackageLoader("workflow", "templates"),
         autoescape=True,
@@ -81,7 +89,7 @@ def page_of(run: RunDirectory, data: RunData, pictures: Mapping[str, Picture]) -
         title=data.config.run.title or data.config.run.name,
         verdict=verdict_of(data, certified=summary.certified),
         sections=[overview, *sections],
-        drawn={plot.name: _embedded(plot, pictures[plot.name]) for plot in _plots(sections)},
+        drawn={plot.name: _embedded(plot, pictures[plot.name]) for plot in _plots([overview, *sections])},
     )
 
 

@@ -19,12 +19,14 @@ from workflow.figures.bands import Real
 from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
 from workflow.figures.error_surface import draw_error_surface, searched_pairs
-from workflow.figures.nyquist import draw_nyquist, uncertain_loop
+from workflow.figures.nyquist import UncertainLoop, draw_nyquist, uncertain_loop
+from workflow.figures.overview import StepView, draw_overview
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import ShownRecord, draw_records
 from workflow.figures.repeats import draw_repeat_scatter
 from workflow.figures.residuals import draw_residual_tests
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
+from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
 from workflow.report.data import ChannelData, RunData
 
@@ -43,6 +45,8 @@ def pictures_of(data: RunData) -> dict[str, Drawer]:
         drawers["sensitivities"] = lambda: _sensitivities(data)
     if data.closed_loop is not None:
         drawers["closed-loop"] = lambda: _closed_loop(data)
+    if data.closed_loop is not None and data.plant is not None:
+        drawers["overview"] = lambda: _overview(data)
     return drawers
 
 
@@ -205,15 +209,49 @@ def _loop_grid(data: RunData) -> Real:
     return np.asarray(every[(every > 0) & (every <= omega[-1])])
 
 
-def _nyquist(data: RunData) -> Figure:
+def _uncertain_loop(data: RunData) -> UncertainLoop:
     assert data.plant is not None
     assert data.synthesis is not None
     frequency = data.control.frequency
     if isinstance(data.plant.uncertainty, ResponsePosterior):
         frequency = data.plant.uncertainty.at(_loop_grid(data), data.plant.level)
-    loop = uncertain_loop(frequency, data.synthesis.controller.response(frequency.omega_rad_s))
+    return uncertain_loop(frequency, data.synthesis.controller.response(frequency.omega_rad_s))
+
+
+def _nyquist(data: RunData) -> Figure:
     margin = data.config.specification.modulus_margin
-    return draw_nyquist(loop, level=frequency.level, modulus_margin=margin, name=data.control.label)
+    return draw_nyquist(
+        _uncertain_loop(data), level=data.level, modulus_margin=margin, name=data.control.label
+    )
+
+
+def _overview(data: RunData) -> Figure:
+    """Three panels of what matters; the step without the disturbance that follows it."""
+    assert data.closed_loop is not None
+    time, reference = data.loop_array("time_s"), data.loop_array("reference")
+    predicted, achieved = data.loop_array("predicted/output"), data.loop_array("achieved/output")
+    assert time is not None
+    assert reference is not None
+    assert predicted is not None
+    assert achieved is not None
+    half = slice(0, time.size // 2)
+    channel = data.config.control_channel
+    step = StepView(
+        time_s=time[half],
+        reference=reference[half],
+        predicted=predicted[0, half],
+        achieved=achieved[:, half],
+        machine=MACHINE_WORDS[data.closed_loop.document["machine"]],
+        output=(channel.output, data.unit(channel.output)),
+    )
+    return draw_overview(
+        data.control.frequency,
+        data.control.nominal,
+        _uncertain_loop(data),
+        step,
+        gain_unit=ratio_unit(data.unit(channel.output), data.unit(channel.input)),
+        modulus_margin=data.config.specification.modulus_margin,
+    )
 
 
 def _sensitivities(data: RunData) -> Figure:
