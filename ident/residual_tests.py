@@ -74,8 +74,8 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     else:
         verdict = (
             f"The residuals are not white ({_p(probability)}, largest correlation "
-            f"{correlation[largest]:+.2f} at lag {lags[largest]}): the bounds may be too narrow; model the noise "
-            "(coloured_noise) or, where that is done already, more of it (max_ar_order)."
+            f"{correlation[largest]:+.2f} at lag {lags[largest]}): the bounds may be too narrow; model the "
+            "noise (coloured_noise) or, where that is done already, more of it (max_ar_order)."
         )
     return ResidualTest(
         "whiteness", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
@@ -88,8 +88,9 @@ def independence_test(
     """Cross-correlation of past input and residual at lags -max_lag..max_lag (residual after input: lag > 0).
 
     Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, so a coloured input or residual does not
-    fail the test by itself. Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0 (dynamics the model lacks) with the level shared
-    over them (Sidak); what stands out at negative lags only says that the output feeds back into the input.
+    fail the test by itself. Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0
+    (dynamics the model lacks) with the level shared over them (Sidak); what stands out at negative lags only
+    says that the output feeds back into the input.
     """
     if len(inputs) != len(residuals) or any(
         u.size != e.size for u, e in zip(inputs, residuals, strict=False)
@@ -148,7 +149,7 @@ def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
     for signal in signals:
         if signal.ndim != 1 or signal.size <= 2 * max_lag or not np.all(np.isfinite(signal)):
             raise ValueError(
-                f"residual tests over {max_lag} lags need finite (T,) signals with T > {2 * max_lag} samples; "
+                f"residual tests over {max_lag} lags need finite (T,) signals with T > {2 * max_lag}; "
                 f"got shape {signal.shape}"
             )
     centred = [np.asarray(signal - signal.mean(), dtype=np.float64) for signal in signals]

@@ -7,8 +7,10 @@ result is not certified or misses its specification (the report is written all t
 from __future__ import annotations
 
 import json
+import os
 import sys
 import traceback
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +25,7 @@ from workflow.errors import (
     EXIT_OK,
     InputError,
     StageError,
+    describe_os_error,
     one_line,
 )
 
@@ -31,9 +34,12 @@ _EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 app = typer.Typer(
     name="flexlink",
     help="From a flexible-link arm and its logs to a robust controller with a certificate.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # markup would swallow every [unit], [section] and [default] in the help
+    epilog="Exit codes: 0 done; 1 internal error; 2 something given is wrong (one line says what and where); "
+    "3 the result is not certified, the report says why; 130 interrupted. Example: flexlink run --out "
+    "runs/first",
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
@@ -54,16 +60,24 @@ def _root(
     pass
 
 
-@app.command()
+@app.command(short_help="Everything, from records to report.html.")
 def run(
     config: Annotated[
-        Path | None, typer.Option(help="TOML file; without it the built-in default arm.", show_default=False)
+        Path | None,
+        typer.Option(
+            help="TOML file (see examples/ and README); without it the built-in default arm.",
+            show_default=False,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Run directory [default: runs/<name>-<date>-<time>]", show_default=False),
+        typer.Option(
+            help="Run directory, new or empty [default: runs/<name>-<date>-<time>]", show_default=False
+        ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in --out; finished stages are taken up.")
+    ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Delete an earlier run in --out first.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -80,7 +94,7 @@ def run(
     _leave(summary.certified, summary.verdict)
 
 
-@app.command()
+@app.command(short_help="Simulate experiments and write them as CSV.")
 def simulate(
     out: Annotated[Path, typer.Option(help="Directory for one CSV file per record; new or empty.")],
     config: Annotated[
@@ -100,30 +114,38 @@ def simulate(
             typer.echo(str(path))
 
 
-@app.command()
+@app.command(short_help="Identify one channel from log files.")
 def identify(
-    log: Annotated[list[Path], typer.Argument(help="CSV, npz or mat; several files are fitted together.")],
-    input_name: Annotated[str, typer.Option("--input", help="Input column.")],
-    output_name: Annotated[str, typer.Option("--output", help="Output column.")],
-    time: Annotated[str | None, typer.Option(help="Time column [s].", show_default=False)] = None,
+    log: Annotated[
+        list[Path],
+        typer.Argument(help="CSV (commas, one header line), npz or mat; several files are fitted together."),
+    ],
+    input_name: Annotated[str, typer.Option("--input", help="Name of the input column.")],
+    output_name: Annotated[str, typer.Option("--output", help="Name of the output column.")],
+    time: Annotated[
+        str | None, typer.Option(help="Name of the time column [s]; this or --dt-s.", show_default=False)
+    ] = None,
     dt_s: Annotated[
-        float | None, typer.Option(help="Sampling period, if no --time.", show_default=False)
+        float | None, typer.Option(help="Sampling period [s], if there is no --time.", show_default=False)
     ] = None,
     validation: Annotated[
         list[Path] | None, typer.Option(help="Log kept for validation (repeatable).", show_default=False)
     ] = None,
     pairs: Annotated[
-        int | None, typer.Option(help="Pole pairs [default: from the data]", show_default=False)
+        int | None,
+        typer.Option(min=0, max=12, help="Pole pairs [default: from the data]", show_default=False),
     ] = None,
     real: Annotated[
-        int | None, typer.Option(help="Real poles [default: from the data]", show_default=False)
+        int | None,
+        typer.Option(min=0, max=8, help="Real poles [default: from the data]", show_default=False),
     ] = None,
-    integrators: Annotated[int, typer.Option(help="Known poles at z = 1.")] = 0,
-    delay: Annotated[int, typer.Option(help="Known delay of the input in samples.")] = 0,
+    integrators: Annotated[int, typer.Option(min=0, max=3, help="Known poles at z = 1.")] = 0,
+    delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
     feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
-    level: Annotated[float, typer.Option(help="Confidence of the ellipses.")] = 0.95,
+    level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
     out: Annotated[
-        Path | None, typer.Option(help="Write model and posterior here (npz).", show_default=False)
+        Path | None,
+        typer.Option(help="Write model and ellipses here (npz), for `flexlink design`.", show_default=False),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -146,9 +168,12 @@ def identify(
         out=out,
     )
     if as_json:
-        _print_json(summary.to_document())
+        document = summary.to_document()
+        _print_json({key: document[key] for key in ("title", "verdict", "numbers", "table")})
     else:
         print_summary(summary)
+        if out is not None:
+            typer.echo(f"model: {out}")
 
 
 @app.command()
@@ -161,9 +186,10 @@ def design(
         typer.Option(help="TOML with the keys of [specification]; for a run directory its own if left out."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Write the controller here (JSON).", show_default=False)
+        Path | None,
+        typer.Option(help="Write the controller here (JSON: discrete state space).", show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Root of the random starts.")] = 2006,
+    seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
     as_json: Json = False,
 ) -> None:
     """Design and certify a controller for an identified plant."""
@@ -178,7 +204,7 @@ def design(
     _leave(summary.certified, summary.verdict)
 
 
-@app.command()
+@app.command(short_help="Write report.html of a run anew.")
 def report(
     directory: Annotated[Path, typer.Argument(help="Run directory.")],
     as_json: Json = False,
@@ -213,6 +239,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in arguments
     if debug:
         arguments.remove("--debug")
+    elif argv is None:
+        # An error is one line. Called from Python (tests!) warnings stay what the caller made of them.
+        warnings.simplefilter("ignore")
+    if not arguments:
+        arguments = ["--help"]
     try:
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         # typer turns Ctrl-C into a silent exit of this code.
@@ -220,7 +251,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted()
     except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has left; there is nobody to tell
+        # Whoever read our output has left; there is nobody to tell, at the last flush neither.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
     except Exception as error:
         if debug:
@@ -236,7 +268,9 @@ def _explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, (InputError, StageError)):
         return str(error), error.exit_code
     if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
-        return f"{error.format_message()} (flexlink --help)", EXIT_BAD_INPUT
+        return f"{error.format_message() or 'no command given'} (flexlink --help)", EXIT_BAD_INPUT
+    if isinstance(error, OSError):  # ours name their file; this is a pipe or a terminal
+        return f"cannot write the output: {describe_os_error(error)}", EXIT_BAD_INPUT
     return f"internal error: {type(error).__name__}: {error} (--debug shows where)", EXIT_INTERNAL
 
 

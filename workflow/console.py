@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.table import Column, Table
 from rich.text import Text
 
+from workflow.errors import printable
 from workflow.summary import RunSummary
 
 
@@ -92,21 +93,33 @@ class TerminalProgress:
         )
 
 
+class _Output(Console):
+    """Standard output; a reader that left is the caller's business (rich would leave with code 1)."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
 def print_summary(summary: RunSummary) -> None:
     """The table of numbers on standard output."""
     # A pipe has no width; 120 columns keep the rows on one line there.
-    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 120)
-    table = Table(title=escape(summary.title), title_justify="left", show_header=False, pad_edge=False)
+    console = _Output(file=sys.stdout, width=None if sys.stdout.isatty() else 120)
+    table = Table(title=_text(summary.title), title_justify="left", show_header=False, pad_edge=False)
     table.add_column("section", style="bold")
     table.add_column("quantity")
     table.add_column("value")
     for section in summary.sections:
         for index, row in enumerate(section.rows):
-            label = escape(section.title) if index == 0 else ""
+            label = _text(section.title) if index == 0 else ""
             table.add_row(
-                label, escape(row.label), escape(row.value), end_section=index == len(section.rows) - 1
+                label, _text(row.label), _text(row.value), end_section=index == len(section.rows) - 1
             )
     console.print(table)
-    console.print(f"{escape(summary.verdict)}", highlight=False, soft_wrap=True)
+    console.print(_text(summary.verdict), highlight=False, soft_wrap=True)
     if summary.report_path:
-        console.print(f"report: {escape(summary.report_path)}", highlight=False, soft_wrap=True)
+        console.print(f"report: {_text(summary.report_path)}", highlight=False, soft_wrap=True)
+
+
+def _text(words: str) -> str:
+    """Words from files and configurations, with neither rich's markup nor the terminal's own codes."""
+    return escape(printable(words))

@@ -6,12 +6,13 @@ import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from control_design.certificate import certify
+from control_design.certificate import Certificate, certify
 from control_design.plant_set import UncertainPlant
-from control_design.specification import Specification
+from control_design.specification import Specification, SpecificationError
 from control_design.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis_result import Outcome
 from ident.embedding import EmbeddingOptions, tangent
@@ -108,15 +109,22 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     for index, entry in enumerate(config.source.records):
         with naming(f"source.records[{index}] ({entry.name})"):
             records.append(simulate_record(config.source, entry, config.run.seed).record)
+    existed = out.is_dir()
+    files: list[Path] = []
     try:
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+        for number, record in enumerate(records, start=1):
+            path = out / f"{number:02d}_{file_name(record.name)}.csv"
+            storage.write_text(path, csv_text(record))
+            files.append(path)
+    except (OSError, InputError) as error:
+        for path in files:  # all of the experiments or none
+            path.unlink()
+        if not existed and out.is_dir():
+            out.rmdir()
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"cannot write {out}: {error.strerror or error}") from error
-    files = []
-    for number, record in enumerate(records, start=1):
-        path = out / f"{number:02d}_{file_name(record.name)}.csv"
-        storage.write_text(path, csv_text(record))
-        files.append(path)
     return files
 
 
@@ -154,6 +162,7 @@ def identify_logs(
         raise InputError(f"--level must lie between 0.5 and 1, got {level}")
     if out is not None:
         storage.check_writable(out)
+    refuse_repeated_files([*logs, *validation])
     used = [read_log(Path(path), [input_name], [output_name], time=time, dt_s=dt_s) for path in logs]
     fresh_logs = [
         read_log(Path(path), [input_name], [output_name], time=time, dt_s=dt_s) for path in validation
@@ -171,6 +180,7 @@ def identify_logs(
         omega = display_grid(found.model, used)
         nominal = nominal_of(posterior, found.model.poles, omega)
         frequency = posterior.at(omega, level)
+        tests = residual_tests(posterior, used)
     about = {
         "name": output_name,
         **describe_model(found),
@@ -178,7 +188,6 @@ def identify_logs(
         "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
         "fit_repeat_percent": {},
     }
-    tests = residual_tests(posterior, used)
     spread = {
         "level": level,
         "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
@@ -194,6 +203,16 @@ def identify_logs(
         numbers={**about, "uncertainty": spread, "file": None if out is None else str(out)},
         verdict="; ".join(found.warnings) or "no warnings",
     )
+
+
+def refuse_repeated_files(paths: Sequence[Path]) -> None:
+    """A log given twice would count its noise twice as well known, or validate what it was fitted to."""
+    seen: set[Path] = set()
+    for path in paths:
+        place = Path(path).resolve()
+        if place in seen:
+            raise InputError(f"{path}: given twice; expected different experiments")
+        seen.add(place)
 
 
 def plant_arrays(model: GobfModel, posterior: ResponsePosterior, level: float) -> dict[str, AnyArray]:
@@ -229,7 +248,8 @@ def design_controller(
     """Design and certify a controller for a run's identified plant, or for a file of `flexlink identify
     --out`.
 
-    With `out` the controller is written as JSON. Raises InputError.
+    With `out` the controller is written as JSON. A specification that no controller can meet is a result (not
+    certified, the reason in `verdict`), as in a run. Raises InputError.
     """
     source = Path(source)
     if out is not None:
@@ -247,25 +267,34 @@ def design_controller(
         specification = check(
             Specification, document.get("specification", document), source=str(specification_path)
         )
+    certificate: Certificate | None = None
+    design: dict[str, Any]
     with naming("design"):
-        result = synthesise([plant], specification, options, rng=stage_rng(seed, "design"))
-        design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": result.explain()}
-        if result.outcome is Outcome.NOT_CONVERGED:
-            certificate = None
+        try:
+            result = synthesise([plant], specification, options, rng=stage_rng(seed, "design"))
+        except SpecificationError as impossible:
+            reason = f"specification not met: {impossible}"
+            design = {"synthesis": None, "met": False, "reason": reason}
         else:
-            certificate = certify(result.controller, [plant], specification)
-            if out is not None:
-                storage.write_text(out, result.controller.to_json())
+            reason = result.explain()
+            design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": reason}
+            if result.outcome is not Outcome.NOT_CONVERGED:
+                certificate = certify(result.controller, [plant], specification)
+                if out is not None:
+                    storage.write_text(out, result.controller.to_json())
     certified = certificate is not None and certificate.certified
+    if certificate is not None and not certified:
+        missed = [item.sentence() for item in certificate.items if not item.met]
+        reason = "not certified: " + ("; ".join(missed) or "unstable, or an ellipse reaches -1")
     verdict = {
         "certificate": None if certificate is None else certificate.to_dict(),
         "certified": certified,
-        "reason": result.explain(),
+        "reason": reason,
     }
     return RunSummary(
         title=f"controller for {plant.name}",
         sections=(Section("design", design_rows(design)), Section("certificate", certificate_rows(verdict))),
         numbers={"design": design, **verdict, "file": str(out) if out is not None and certificate else None},
         certified=certified,
-        verdict=result.explain(),
+        verdict=reason,
     )

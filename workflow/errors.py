@@ -15,7 +15,12 @@ EXIT_NOT_CERTIFIED = 3
 
 def one_line(text: object) -> str:
     """The text without line breaks or runs of blanks, for a message that must stay on one line."""
-    return " ".join(str(text).split())
+    return printable(" ".join(str(text).split()))
+
+
+def printable(text: str) -> str:
+    """Control characters as escapes: a column title from a file must not steer the terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
 class InputError(ValueError):
@@ -50,12 +55,14 @@ def naming(where: str) -> Iterator[None]:
     except np.linalg.LinAlgError as error:
         raise StageError(f"{where}: linear algebra failed: {error}") from error
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
+        # Some complaints of the rooms begin with the file already.
+        raise InputError(error if str(error).startswith(where) else f"{where}: {error}") from error
     except OSError as error:
         raise InputError(f"{where}: {describe_os_error(error)}") from error
 
 
-def describe_os_error(error: OSError) -> str:
-    """`path: reason` without the errno number."""
+def describe_os_error(error: OSError, known: object = None) -> str:
+    """`path: reason` without the errno number; only the reason where the path is `known` to the reader."""
     reason = error.strerror or str(error)
-    return f"{error.filename}: {reason}" if error.filename else reason
+    named = error.filename and str(error.filename) != str(known)
+    return f"{error.filename}: {reason}" if named else reason

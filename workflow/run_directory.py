@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from workflow import storage
-from workflow.errors import InputError, describe_os_error
+from workflow.errors import InputError
 from workflow.storage import AnyArray
 
 LAYOUT_VERSION = 1
@@ -81,7 +81,7 @@ class RunDirectory:
 
     @classmethod
     def check_free(cls, path: Path, *, resume: bool = False, replace: bool = False) -> None:
-        """Refuse, before any work is done, a place where the run could not be written.
+        """Refuse, before any work is done, a place where the run could not be written; nothing is left there.
 
         Raises InputError: not writable, not a directory, not empty with neither `resume` nor `replace`, or
         holding something that is no run (which is never replaced).
@@ -93,17 +93,23 @@ class RunDirectory:
                 ancestor = ancestor.parent
             if not ancestor.is_dir():
                 raise InputError(f"cannot write {path}: {ancestor} is not a directory")
-            if not os.access(ancestor, os.W_OK | os.X_OK):
-                raise InputError(f"cannot write {path}: no permission in {ancestor}")
+            # Permission bits do not tell of read-only file systems, nor bind the administrator: try.
+            trial = ancestor / f".flexlink.{os.getpid()}{storage.TEMPORARY_SUFFIX}"
+            trial.mkdir()
+            trial.rmdir()
             entries = {entry.name for entry in path.iterdir()} if path.is_dir() else set()
         except OSError as error:
-            raise InputError(f"cannot write {path}: {describe_os_error(error)}") from error
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
         entries = {name for name in entries if not name.endswith(storage.TEMPORARY_SUFFIX)}
-        if entries and not (resume or replace):
-            raise InputError(f"{path}: not empty; choose another --out, or continue it with --resume")
         strangers = sorted(entries - set(_OWN_ENTRIES))
         if strangers and "manifest.json" not in entries:
-            raise InputError(f"{path}: not a run directory (it holds {strangers[0]!r}); choose another --out")
+            what = "not a run directory" if resume or replace else "not empty"
+            raise InputError(f"{path}: {what} (it holds {strangers[0]!r}); choose another --out")
+        if entries and not (resume or replace):
+            raise InputError(
+                f"{path}: not empty, an earlier run is there; choose another --out, continue it with "
+                "--resume or start it afresh with --replace"
+            )
 
     @classmethod
     def begin(
@@ -127,14 +133,17 @@ class RunDirectory:
         path = Path(path)
         cls.check_free(path, resume=resume, replace=replace)
         run = cls(path)
-        if replace:
+        if replace and (path / "lock").is_file():
+            with run.locked():  # never under the hands of a living run
+                run.discard()
+        elif replace:
             run.discard()
         try:
             path.mkdir(parents=True, exist_ok=True)
             run.stages_path.mkdir(exist_ok=True)
             run.figures_path.mkdir(exist_ok=True)
         except OSError as error:
-            raise InputError(f"cannot write {path}: {describe_os_error(error)}") from error
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
         if run.manifest_path.is_file():
             run._check_same(config, inputs)
             return run

@@ -23,7 +23,7 @@ _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows like to put a mark in front
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -40,14 +40,44 @@ def check(
     """`document` as a `model`. Raises InputError: one line with `source`, the dotted key and what was
     expected."""
     try:
-        return model.model_validate(document, context=dict(context or {}))
+        found = model.model_validate(document, context=dict(context or {}))
     except ValidationError as error:
         raise InputError(f"{source}: {_first_complaint(model, error)}") from error
+    converted = _first_converted(document, found)
+    if converted:
+        raise InputError(f"{source}: {converted}")
+    return found
+
+
+def _first_converted(given: Any, found: Any, where: str = "") -> str | None:
+    """Complaint about the first value that pydantic took for a number or a switch although it was written as
+    something else.
+
+    `true` is no 1.0 and `"2"` no 2; pydantic's own strict mode would refuse TOML's lists for tuples as well.
+    """
+    if isinstance(given, Mapping):
+        for key, value in given.items():
+            inner = found.get(key) if isinstance(found, Mapping) else getattr(found, str(key), None)
+            complaint = _first_converted(value, inner, f"{where}.{key}" if where else str(key))
+            if complaint:
+                return complaint
+    elif isinstance(given, (list, tuple)) and isinstance(found, (list, tuple)) and len(given) == len(found):
+        for index, (value, inner) in enumerate(zip(given, found, strict=True)):
+            complaint = _first_converted(value, inner, f"{where}[{index}]")
+            if complaint:
+                return complaint
+    elif isinstance(found, bool) and not isinstance(given, bool):
+        return f"{where}: input should be true or false, got {_short(given)}"
+    elif isinstance(found, (int, float)) and not isinstance(found, bool) and isinstance(given, (bool, str)):
+        return f"{where}: input should be a number, got {_short(given)}"
+    return None
 
 
 def _first_complaint(model: type[BaseModel], error: ValidationError) -> str:
     # A misspelt key is also a missing one: the unknown key is what the reader can act on, so it goes first.
     details = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
+    if len(details) > 1 and all(item["type"] == "missing" for item in details):
+        return "missing keys " + ", ".join(_walk(model, item["loc"])[0] for item in details)
     rest = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     return _complaint(model, details[0]) + rest
 

@@ -45,18 +45,25 @@ def write_bytes(path: Path, content: bytes) -> None:
             raise
         _flush_directory(path.parent)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {describe_os_error(error)}") from error
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def check_writable(path: Path) -> None:
-    """Refuse an output file before the work is done: its directory must be there and take new files."""
+    """Refuse an output file before the work is done: its directory must be there and take new files.
+
+    Tried out, because permission bits do not know of read-only file systems or of the administrator.
+    """
     parent = path.absolute().parent
     if path.is_dir():
         raise InputError(f"cannot write {path}: it is a directory")
     if not parent.is_dir():
         raise InputError(f"cannot write {path}: {parent} is not a directory")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise InputError(f"cannot write {path}: no permission in {parent}")
+    trial = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    try:
+        trial.touch()
+        trial.unlink()
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def write_text(path: Path, content: str) -> None:
@@ -74,7 +81,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"), object_hook=decode)
     except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error)}") from error
+        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
     except ValueError as error:
         raise InputError(f"{path}: not valid JSON: {error}") from error
     if not isinstance(document, dict):
@@ -118,9 +125,10 @@ def read_npz(path: Path, *, only: str | None = None) -> dict[str, AnyArray]:
                 raise ValueError("it holds a single array")
             return {name: archive[name] for name in (archive.files if only is None else [only])}
     except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error)}") from error
+        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not an npz file written without pickle: {error}") from error
+        # numpy's own words would recommend to load the file unsafely.
+        raise InputError(f"{path}: expected an npz file of plain arrays (no pickled objects)") from error
 
 
 def sha256_of_bytes(content: bytes) -> str:
@@ -133,7 +141,7 @@ def sha256_of_file(path: Path) -> str:
         with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error)}") from error
+        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
 
 
 def remove_leftovers(directory: Path) -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 ROOT = Path(__file__).resolve().parents[2]
 FAST_ARM = Path(__file__).parent / "data" / "fast_arm.toml"
@@ -21,12 +22,12 @@ class Answer:
     err: str
 
 
-def start_flexlink(*arguments: object) -> subprocess.Popen[bytes]:
+def start_flexlink(*arguments: object, stdout: IO[bytes] | int = subprocess.PIPE) -> subprocess.Popen[bytes]:
     """`flexlink` in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "workflow", *(str(argument) for argument in arguments)],
         cwd=ROOT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
+        stdout=stdout,
         stderr=subprocess.PIPE,
     )

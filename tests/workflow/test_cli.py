@@ -10,6 +10,7 @@ import pytest
 
 from tests.workflow.command import FAST_ARM, start_flexlink
 from workflow.cli import main
+from workflow.errors import InputError
 
 FILES_CONFIG = """
 [run]
@@ -349,4 +350,80 @@ def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
 
 
 def test_main_without_arguments_shows_help(capsys):
-    assert main([]) in (0, 2)
+    assert main([]) == 0
+    captured = capsys.readouterr()
+    assert "Exit codes" in captured.out
+    assert captured.err == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("run", ["[default: runs/<name>-<date>-<time>]"]),
+        ("identify", ["time column [s]", "Sampling period [s]", "[samples]"]),
+        ("design", ["[specification]"]),
+        ("simulate", ["[source]"]),
+    ],
+)
+def test_help_keeps_what_stands_in_brackets(flexlink, command, words):
+    shown = " ".join(flexlink(command, "--help").out.split())
+    for word in words:
+        assert word in shown
+
+
+def test_same_log_twice_is_refused(refused, tmp_path):
+    write_case(tmp_path, good_table())
+    log, options = tmp_path / "log.csv", ["--input", "u", "--output", "y", "--time", "t_s"]
+    assert "given twice" in refused("identify", log, log, *options)
+    assert "given twice" in refused("identify", log, *options, "--validation", tmp_path / "." / "log.csv")
+
+
+def test_design_of_an_impossible_specification_is_three_like_a_run(flexlink, tmp_path):
+    write_case(tmp_path, good_table())
+    options = ["--input", "u", "--output", "y", "--time", "t_s", "--real", "1", "--pairs", "0"]
+    model, wish = tmp_path / "model.npz", tmp_path / "wish.toml"
+    answer = flexlink("identify", tmp_path / "log.csv", *options, "--out", model, "--json")
+    assert "certified" not in json.loads(answer.out)  # nothing was certified yet
+    wish.write_text("bandwidth_rad_s = 200.0\nmodulus_margin = 0.9\n")
+    answer = flexlink("design", model, "--specification", wish, "--out", tmp_path / "controller.json")
+    assert answer.code == 3, answer
+    assert answer.err.count("\n") == 1
+    assert "bandwidth_rad_s = 200" in answer.err
+    assert not (tmp_path / "controller.json").exists()
+
+
+def test_a_full_disk_leaves_no_half_of_the_experiments(refused, monkeypatch, tmp_path):
+    from workflow import storage
+
+    write = storage.write_bytes
+
+    def second_does_not_fit(path, content):
+        if path.name.startswith("02"):
+            raise InputError(f"cannot write {path}: No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(storage, "write_bytes", second_does_not_fit)
+    assert "No space left" in refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_reader_that_leaves_early_is_no_error(fast_run):
+    with start_flexlink("report", fast_run[0]) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+
+
+def test_output_that_cannot_be_written_is_one_line(fast_run):
+    with open("/dev/full", "wb") as full:
+        process = start_flexlink("report", fast_run[0], "--json", stdout=full)
+        _, err = process.communicate()
+    assert process.returncode == 2
+    assert err.decode() == "flexlink: cannot write the output: No space left on device\n"
+
+
+def test_terminal_codes_in_names_are_shown_as_text(refused, tmp_path):
+    (tmp_path / "log.csv").write_text("t,\x1b[31mu,y\n0,1,2\n1,2,3\n")
+    line = refused("identify", tmp_path / "log.csv", "--input", "u", "--output", "y", "--time", "t")
+    assert "\x1b" not in line
+    assert r"\x1b[31mu" in line

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,6 +35,25 @@ def test_non_empty_directory_is_refused_without_resume(tmp_path):
     begin(tmp_path / "run")
     with pytest.raises(InputError, match=r"not empty.*--resume"):
         begin(tmp_path / "run")
+
+
+def test_no_run_is_offered_where_there_is_none(tmp_path):
+    (tmp_path / "01_prbs.csv").write_text("t,u\n")
+    with pytest.raises(InputError, match=r"not empty \(it holds '01_prbs\.csv'\); choose another --out$"):
+        RunDirectory.check_free(tmp_path)
+
+
+def test_a_place_that_takes_no_files_is_refused_before_the_work():
+    with pytest.raises(InputError, match=r"cannot write /proc/run: [^/]*$"):
+        RunDirectory.check_free(Path("/proc/run"))
+
+
+def test_a_living_run_is_not_replaced(tmp_path):
+    run = begin(tmp_path / "run")
+    with run.locked(), pytest.raises(InputError, match="another process"):
+        begin(tmp_path / "run", replace=True)
+    assert run.manifest_path.is_file()
+    begin(tmp_path / "run", replace=True)
 
 
 @pytest.mark.parametrize("how", [{"resume": True}, {"replace": True}])

@@ -17,6 +17,7 @@ class Strict(BaseModel):
 
 class Options(Strict):
     level: float = Field(0.95, gt=0, lt=1)
+    wide: bool = False
 
 
 class FromFiles(Strict):
@@ -56,6 +57,19 @@ SIMULATED = {"kind": "simulated"}
         ),
         ({"source": SIMULATED, "channels": [{}]}, "missing key channels[0].input"),
         ({}, "missing key source"),
+        ({"source": SIMULATED, "channels": [{}, {}]}, "missing keys channels[0].input, channels[1].input"),
+        (
+            {"source": {"kind": "simulated", "bandwidth_rad_s": True}},
+            "source.bandwidth_rad_s: input should be a number, got True",
+        ),
+        (
+            {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": "0.5"}}]},
+            "channels[0].options.level: input should be a number, got '0.5'",
+        ),
+        (
+            {"source": SIMULATED, "channels": [{"input": "u", "options": {"wide": 1}}]},
+            "channels[0].options.wide: input should be true or false, got 1",
+        ),
         ({"source": {}}, "missing key source.kind"),
         ({"source": {"kind": "wire"}}, "source.kind: expected one of 'files', 'simulated', got 'wire'"),
         (
@@ -104,6 +118,12 @@ def test_toml_syntax_error_names_line_and_column(tmp_path):
     path.write_text("[run]\nname = \n")
     with pytest.raises(InputError, match=r"arm\.toml: not valid TOML: .*line 2, column 8"):
         read_toml(path)
+
+
+def test_a_byte_order_mark_is_no_syntax_error(tmp_path):
+    path = tmp_path / "arm.toml"
+    path.write_bytes(b"\xef\xbb\xbf[run]\nname = 'a'\n")
+    assert read_toml(path)[1] == {"run": {"name": "a"}}
 
 
 def test_unreadable_files_are_one_line(tmp_path):

@@ -57,8 +57,18 @@ def test_objects_are_refused_on_writing(tmp_path):
 
 def test_pickle_is_refused_on_reading(tmp_path):
     np.savez(tmp_path / "a.npz", bad=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match=r"a\.npz"):
+    with pytest.raises(InputError, match=r"a\.npz") as caught:
         storage.read_npz(tmp_path / "a.npz")
+    assert "unsafe" not in str(caught.value)  # numpy's own words recommend allow_pickle
+
+
+def test_output_file_is_tried_before_the_work(tmp_path):
+    storage.check_writable(tmp_path / "a.npz")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="it is a directory"):
+        storage.check_writable(tmp_path)
+    with pytest.raises(InputError, match=r"cannot write /proc/a\.npz: [^/]*$"):
+        storage.check_writable(Path("/proc/a.npz"))
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 cut off"])
