@@ -83,6 +83,7 @@ def test_page_and_pictures_are_written(drawn):
         "nyquist",
         "sensitivities",
         "closed-loop",
+        "overview",
     }
     text = drawn.report_path.read_text(encoding="utf-8")
     page = Page(text)
