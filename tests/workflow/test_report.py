@@ -15,7 +15,8 @@ from workflow.errors import InputError
 from workflow.figures.style import Picture
 from workflow.report import write_report
 from workflow.report.words import count, decibels, frequency, listing, number, sentence
-from workflow.run_directory import RunDirectory
+from workflow.run_directory import RunDirectory, StageData
+from workflow.stages.results import load_records
 
 ATTACK = "<script>alert(1)</script>"
 
@@ -189,6 +190,7 @@ def test_without_a_controller_the_page_still_tells_the_rest(undrawn, tmp_path):
     assert "Not certified: there is no controller" in page.text
     assert "lies beyond the Nyquist frequency" in page.text
     assert "There is no controller to certify." in page.text
+    assert "was to be optimised" in page.text
     run = RunDirectory.open(tmp_path / "run")
     assert not list(run.figures_path.glob("nyquist*"))
     assert list(run.figures_path.glob("bode*"))
@@ -200,6 +202,36 @@ def test_without_validation_data_the_page_warns(undrawn, tmp_path):
     assert "no validation record to test it on" in page.text
     assert "this one was used in the fit" in page.text
     assert not list((tmp_path / "run" / "figures").glob("repeats*"))
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        ({}, "Structures tried; the smallest criterion wins."),
+        ({"n_real": 1}, "n_real = 1 by the configuration, the smallest criterion decides the rest."),
+        ({"n_real": 1, "n_pairs": 2}, "asks for n_real = 1 and n_pairs = 2; the criterion, which would"),
+    ],
+)
+def test_the_page_says_who_chose_the_order(undrawn, tmp_path, chosen, words):
+    settings = example.config(channels=1)
+    options = settings.channels[0].identification.model_copy(update=chosen)
+    channel = settings.channels[0].model_copy(update={"identification": options})
+    assert words in page_for(tmp_path, settings.model_copy(update={"channels": (channel,)})).text
+
+
+def test_a_command_beyond_the_records_is_told(undrawn, tmp_path):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    loop = run.load_stage("closed_loop")
+    seen = max(
+        float(np.max(np.abs(item.record.input))) for item in load_records(run) if item.role == "estimation"
+    )
+    words = "times the largest input in the records of the fit"
+    for factor, told in ((1.4, False), (7.0, True)):
+        predicted = {**loop.document["predicted"], "peak_command": factor * seen}
+        run.save_stage("closed_loop", StageData(loop.arrays, {**loop.document, "predicted": predicted}), "x")
+        text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+        assert (f"{factor:.2g} {words}" in text) == told
 
 
 def test_one_channel_alone(undrawn, tmp_path):

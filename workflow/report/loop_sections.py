@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from control_design.synthesis_result import Outcome
 from workflow.report.data import RunData
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text, maybe
@@ -25,16 +27,15 @@ def design_section(data: RunData) -> Section:
         if name == "low_frequency_rejection" and (asked.bandwidth_rad_s is None or asked.integrator):
             continue
         rows.append((name, _setting(value), field.description or ""))
+    result = data.synthesis
     blocks: list[Block] = [
         Text(
             f"A controller of order {asked.controller_order} ({asked.structure}) with "
-            f"{count(asked.computational_delay_samples, 'sample')} of computational delay was optimised "
-            "over the "
-            "ellipses against these requirements."
+            f"{count(asked.computational_delay_samples, 'sample')} of computational delay was "
+            f"{'to be ' if result is None else ''}optimised over the ellipses against these requirements."
         ),
         Table(("requirement", "asked for", "meaning"), tuple(rows)),
     ]
-    result = data.synthesis
     if result is None:
         reason = str(data.design.get("reason", "the design stage left no result"))
         blocks.append(Remarks((sentence(reason),), "warning", "No controller was sought"))
@@ -137,9 +138,8 @@ def margins_section(data: RunData) -> Section:
                 ("margin", "nominal", f"worst case over the {level} ellipses", "specification", "met?"),
                 tuple((*row, _met(state)) for row, state in zip(rows, states, strict=True)),
                 f"Plant {verdict.plant}. Closest to -1 at {frequency(verdict.worst_margin_omega_rad_s)}; "
-                "largest pole "
-                f"radius {number(verdict.pole_radius, 6)}; every member has |S| below -3 dB up to "
-                f"{number(verdict.bandwidth_rad_s)} rad/s.",
+                f"largest pole radius {number(verdict.pole_radius, 6)}; "
+                f"{_bandwidth(verdict.bandwidth_rad_s)}.",
                 states,
             )
         ]
@@ -178,6 +178,12 @@ def margins_section(data: RunData) -> Section:
         Remarks(tuple(map(sentence, certificate.not_checked)), "warning", "What was not checked"),
     ]
     return Section("margins", "Margins and certificate", "Margins", tuple(blocks))
+
+
+def _bandwidth(omega_rad_s: float) -> str:
+    if omega_rad_s > 0:  # false for nan as well
+        return f"every member has |S| below -3 dB up to {number(omega_rad_s)} rad/s"
+    return "|S| is not below -3 dB at low frequencies for every member"
 
 
 def _degrees(radians: float) -> str:
@@ -243,6 +249,7 @@ def closed_loop_section(data: RunData) -> Section:
             "than the controller's own are not in them."
         )
         blocks.append(Remarks((words,), "warning"))
+    blocks += maybe(_beyond_records(data), "warning")
     blocks.append(
         Plot(
             "closed-loop",
@@ -267,6 +274,27 @@ def closed_loop_section(data: RunData) -> Section:
     head = ("quantity", "predicted", first, f"smallest of {draws}", f"largest of {draws}")
     blocks.append(Table(head, tuple(rows)))
     return Section(anchor, title, short, tuple(blocks))
+
+
+def _beyond_records(data: RunData) -> tuple[str, ...]:
+    """A remark where the loop commands far more than the model was ever shown."""
+    if data.closed_loop is None:
+        return ()
+    channel = data.config.control_channel
+    seen = max(
+        float(np.max(np.abs(item.record.siso(channel.input, channel.output).input)))
+        for item in data.records
+        if item.role == "estimation"
+    )
+    peak = float(data.closed_loop.document["predicted"]["peak_command"])
+    if not peak > 1.5 * seen:
+        return ()
+    unit = data.unit(channel.input)
+    return (
+        f"The command reaches {quantity(peak, unit)}, {number(peak / seen, 2)} times the largest input in "
+        f"the records of the fit ({quantity(seen, unit)}): how the arm answers there is not known. Advice: set "
+        "effort_limit or input_limit in [specification], or take a smaller closed_loop.reference_step.",
+    )
 
 
 def _effect(effect: Mapping[str, Any]) -> str:

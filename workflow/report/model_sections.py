@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ident.options import IdentOptions
 from workflow.config import SimulatedSource
 from workflow.report.data import ChannelData, RunData
 from workflow.report.page import Block, Plot, Remarks, Section, Table, Text, heading, maybe
@@ -155,13 +156,32 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
             for step in about["order_table"]
         )
         head = ("real poles", "pairs", "residual sum of squares", "criterion above the best")
-        blocks.append(Table(head, steps, "Structures tried; the smallest criterion wins."))
+        blocks.append(Table(head, steps, _who_chose(data.config.channels[index].identification)))
     return blocks
+
+
+def _who_chose(options: IdentOptions) -> str:
+    """Caption of the table of structures: the criterion decides only what the configuration leaves open."""
+    fixed = [
+        f"{name} = {value}"
+        for name, value in (("n_real", options.n_real), ("n_pairs", options.n_pairs))
+        if value is not None
+    ]
+    if not fixed:
+        return "Structures tried; the smallest criterion wins."
+    if len(fixed) == 2:
+        return (
+            f"Structures passed on the way. The configuration asks for {listing(fixed)}; the criterion, "
+            "which would take the structure with 0, did not decide."
+        )
+    return f"Structures tried; {fixed[0]} by the configuration, the smallest criterion decides the rest."
 
 
 def _rate(z: float, dt_s: float) -> str:
     """Decay rate of a real pole; one at or left of the origin has no counterpart in continuous time."""
-    return number(-math.log(z) / dt_s, 4) if z > 0 else "none (z is not positive)"
+    if z > 0:
+        return number(-math.log(z) / dt_s, 4)
+    return "gone after one sample" if z == 0 else "changes sign every sample"
 
 
 def uncertainty_section(data: RunData) -> Section:
@@ -273,9 +293,9 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         blocks.append(
             Plot(
                 channel_picture("residuals", index, label),
-                "Correlation of the residuals with themselves and with the past input. The verdict takes "
-                "all lags "
-                "together; single lags outside their own band are expected now and then.",
+                f"Correlation of the residuals with themselves{_behind(channel.uncertain)} and with the past "
+                "input. The verdict takes all lags together; single lags outside their own band are expected "
+                "now and then.",
             )
         )
     failed = [test for test in tests if not test["passed"]]
