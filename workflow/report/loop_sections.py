@@ -292,8 +292,9 @@ def _beyond_records(data: RunData) -> tuple[str, ...]:
     unit = data.unit(channel.input)
     return (
         f"The command reaches {quantity(peak, unit)}, {number(peak / seen, 2)} times the largest input in "
-        f"the records of the fit ({quantity(seen, unit)}): how the arm answers there is not known. Advice: set "
-        "effort_limit or input_limit in [specification], or take a smaller closed_loop.reference_step.",
+        f"the records of the fit ({quantity(seen, unit)}): how the arm answers there is not known. "
+        "Advice: set effort_limit or input_limit in [specification], or take a smaller "
+        "closed_loop.reference_step.",
     )
 
 
