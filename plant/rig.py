@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -136,7 +137,7 @@ class Rig(BaseModel):
         """
         text = Path(path).read_bytes()
         try:
-            content = tomllib.loads(text.decode("utf-8"))
+            content = tomllib.loads(text.decode("utf-8-sig"))  # some editors put a mark in front
         except UnicodeDecodeError as error:
             raise ValueError(f"{path}: not UTF-8 text (byte {error.start})") from error
         except tomllib.TOMLDecodeError as error:
@@ -209,7 +210,8 @@ def one_line(error: ValidationError) -> str:
     if kind == "missing":
         text = f"{key}: missing, expected a value"
     elif kind == "extra_forbidden":
-        text = f"{key}: unknown key"
+        close = get_close_matches(key, (*_PARAMETER_KEYS, *Rig.model_fields), n=1, cutoff=0.7)
+        text = f"{key}: unknown key" + (f" (did you mean {close[0]}?)" if close else "")
     elif kind == "value_error":
         text = f"{key}: {message}" if key else message
     else:

@@ -271,6 +271,8 @@ def _explain(error: Exception) -> tuple[str, int]:
         return f"{error.format_message() or 'no command given'} (flexlink --help)", EXIT_BAD_INPUT
     if isinstance(error, OSError):  # ours name their file; this is a pipe or a terminal
         return f"cannot write the output: {describe_os_error(error)}", EXIT_BAD_INPUT
+    if isinstance(error, MemoryError):
+        return f"out of memory ({error}); shorter records, delays and searches need less", EXIT_INTERNAL
     return f"internal error: {type(error).__name__}: {error} (--debug shows where)", EXIT_INTERNAL
 
 

@@ -41,7 +41,7 @@ def test_the_recorded_rigs_are_read(gap_cases):
         ("length_m = 1.0", "length_m = 0.0", "link.length_m: expected greater than 0, got 0.0"),
         ("length_m = 1.0", 'length_m = "1.0"', "link.length_m: expected a valid number, got '1.0'"),
         ("length_m = 1.0", "length_m = true", "link.length_m: expected a valid number, got True"),
-        ("length_m = 1.0", "lenght_m = 1.0", "link.lenght_m: unknown key"),
+        ("length_m = 1.0", "lenght_m = 1.0", "link.lenght_m: unknown key (did you mean link.length_m?)"),
         ("length_m = 1.0", "", "link.length_m: missing, expected a value"),
         ("[payload]\nmass_kg = 0.0", "", "payload: missing, expected a value"),
         ("[payload]", "[payloads]", "payloads: unknown key"),

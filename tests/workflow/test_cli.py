@@ -337,6 +337,19 @@ def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
     assert "Traceback" in flexlink("--debug", "run", "--out", tmp_path / "run").err
 
 
+def test_lack_of_memory_is_no_internal_error(flexlink, monkeypatch, tmp_path):
+    import workflow.entry
+
+    def too_much(*arguments, **options):
+        return np.zeros(2**60)
+
+    monkeypatch.setattr(workflow.entry, "run_from_files", too_much)
+    answer = flexlink("run", "--out", tmp_path / "run")
+    assert answer.code == 1
+    assert answer.err.startswith("flexlink: out of memory (Unable to allocate")
+    assert answer.err.count("\n") == 1
+
+
 def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
     import workflow.entry
 
