@@ -28,8 +28,8 @@ HEADER = """\
 # Made by:  FLEXLINK_DATA=/path/to/data python -m tests.golden.margins
 #
 # `tolerance` is relative. On one machine a run repeats to the last digit. Between machines the libraries
-# round differently, IPOPT ends elsewhere on a flat optimum, and margins that no requirement holds move with it:
-# the tolerances are what other seeds of the synthesis (other starts) were seen to do, rounded up.
+# round differently, IPOPT ends elsewhere on a flat optimum, and margins that no requirement holds move with
+# it: the tolerances are what other seeds of the synthesis (other starts) were seen to do, rounded up.
 """
 
 
