@@ -247,9 +247,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         # typer turns Ctrl-C into a silent exit of this code.
-        return _interrupted() if code == _EXIT_INTERRUPTED else code
+        return _interrupted(arguments) if code == _EXIT_INTERRUPTED else code
     except (KeyboardInterrupt, typer.Abort):
-        return _interrupted()
+        return _interrupted(arguments)
     except BrokenPipeError:
         # Whoever read our output has left; there is nobody to tell, at the last flush neither.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -260,8 +260,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(*_explain(error))
 
 
-def _interrupted() -> int:
-    return _complain("interrupted; `flexlink run --out DIR --resume` continues", _EXIT_INTERRUPTED)
+def _interrupted(arguments: Sequence[str]) -> int:
+    hint = "; `flexlink run --out DIR --resume` continues" if arguments[0] == "run" else ""
+    return _complain(f"interrupted{hint}", _EXIT_INTERRUPTED)
 
 
 def _explain(error: Exception) -> tuple[str, int]:

@@ -359,7 +359,10 @@ def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
     monkeypatch.setattr(workflow.entry, "run_from_files", stop)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 130
-    assert answer.err.count("\n") == 1
+    assert answer.err == "flexlink: interrupted; `flexlink run --out DIR --resume` continues\n"
+    monkeypatch.setattr(workflow.entry, "simulate_to_csv", stop)
+    answer = flexlink("simulate", "--out", tmp_path / "run")
+    assert (answer.code, answer.err) == (130, "flexlink: interrupted\n")
 
 
 def test_main_without_arguments_shows_help(capsys):

@@ -234,6 +234,18 @@ def test_a_command_beyond_the_records_is_told(undrawn, tmp_path):
         assert (f"{factor:.2g} {words}" in text) == told
 
 
+def test_an_error_that_stays_is_told(undrawn, tmp_path):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    loop = run.load_stage("closed_loop")
+    for left, told in ((0.01, False), (-0.2, True)):
+        predicted = {**loop.document["predicted"], "disturbance_left": left}
+        run.save_stage("closed_loop", StageData(loop.arrays, {**loop.document, "predicted": predicted}), "x")
+        text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+        assert ("of error for good, 40 % of the reference step" in text) == told
+        assert ("integrator = true" in text) == told
+
+
 def test_one_channel_alone(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(channels=1))
     assert "Channel hub" not in page.text

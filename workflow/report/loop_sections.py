@@ -273,6 +273,7 @@ def closed_loop_section(data: RunData) -> Section:
     first = "arm, first run" if simulated else "first plant"
     head = ("quantity", "predicted", first, f"smallest of {draws}", f"largest of {draws}")
     blocks.append(Table(head, tuple(rows)))
+    blocks += maybe(_lasting_error(data), "warning")
     return Section(anchor, title, short, tuple(blocks))
 
 
@@ -295,6 +296,27 @@ def _beyond_records(data: RunData) -> tuple[str, ...]:
         f"the records of the fit ({quantity(seen, unit)}): how the arm answers there is not known. "
         "Advice: set effort_limit or input_limit in [specification], or take a smaller "
         "closed_loop.reference_step.",
+    )
+
+
+def _lasting_error(data: RunData) -> tuple[str, ...]:
+    """A remark where a constant disturbance leaves a large part of the reference step as error for good."""
+    if data.closed_loop is None or not data.closed_loop.document["tracking"]:
+        return ()
+    document = data.closed_loop.document
+    left, step = abs(document["predicted"]["disturbance_left"]), document["reference_step"]
+    if not left > 0.05 * step:
+        return ()
+    if data.config.specification.integrator:
+        until, advice = "at the end of the run", "a larger bandwidth_rad_s"
+    else:
+        until, advice = "for good", "integrator = true in [specification]"
+    channel = data.config.control_channel
+    return (
+        f"A constant disturbance of {quantity(document['disturbance'], data.unit(channel.input))} "
+        f"leaves {quantity(left, data.unit(channel.output))} of error {until}, "
+        f"{percent(100 * left / step, 2)} of the reference step. The specification asks for nothing better; "
+        f"where that matters: {advice}.",
     )
 
 
