@@ -14,8 +14,8 @@ from control_design.synthesis import SynthesisOptions
 from ident.embedding import EmbeddingOptions
 from ident.options import IdentOptions
 from workflow.excitations import Excitation
+from workflow.rig_settings import EffectTable, RigChoice
 from workflow.settings import InputPath, check, read_toml
-from workflow.simulated_rig import EffectTable, RigChoice
 
 Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]

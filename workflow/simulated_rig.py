@@ -2,51 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
 
 from ident.record import Record
 from plant import Rig, SampledArm, parse_effect, simulate
-from plant.presets import paper_link
+from workflow.config import SimulatedRecord, SimulatedSource
 from workflow.randomness import stage_rng
-from workflow.settings import expand, resolve
-
-if TYPE_CHECKING:
-    from workflow.config import SimulatedRecord, SimulatedSource
+from workflow.rig_settings import PRESETS
 
 INPUT_NAME = "voltage_V"
 OUTPUT_NAMES = SampledArm.output_names
 UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
-PRESETS: dict[str, Callable[[], Rig]] = {"paper_link": paper_link}
-
-
-def _choose_rig(value: Any, info: ValidationInfo) -> str | Path:
-    """A preset's name, or a rig file that is there and can be read."""
-    if not isinstance(value, (str, Path)):
-        raise ValueError(
-            f"expected the name of a preset ({', '.join(PRESETS)}) or the path of a rig file, got {value!r}"
-        )
-    text = str(value)
-    if text in PRESETS:
-        return text
-    path = resolve(Path(expand(text)), info, kind=f"rig file (presets: {', '.join(PRESETS)})")
-    if not (info.context or {}).get("may_be_gone"):
-        Rig.from_toml(path)
-    return path
-
-
-def _check_effect(value: Any) -> dict[str, Any]:
-    return parse_effect(value).to_dict()
-
-
-RigChoice = Annotated[str | Path, BeforeValidator(_choose_rig), PlainSerializer(str, return_type=str)]
-EffectTable = Annotated[dict[str, Any], BeforeValidator(_check_effect)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,7 +132,11 @@ def test_packaged_default_is_the_example():
     ).read_text()
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.toml")), ids=lambda path: path.stem)
+# own_log.toml is a pattern to fill in and needs its logs made first: test_own_log.py walks through it.
+NAMED_ARMS = sorted(path for path in (ROOT / "examples").glob("*.toml") if path.stem != "own_log")
+
+
+@pytest.mark.parametrize("path", NAMED_ARMS, ids=lambda path: path.stem)
 def test_examples_are_valid_and_say_what_is_not_known(path, monkeypatch, request):
     if "FLEXLINK_DATA" in path.read_text():
         monkeypatch.setenv("FLEXLINK_DATA", str(request.getfixturevalue("flexlink_data")))
