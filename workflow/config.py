@@ -3,7 +3,9 @@ sense."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -31,7 +33,9 @@ class RunSection(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)] = Field(
         "run", description="names the default output directory; letters, digits, '_', '-' and '.'"
     )
-    title: str = Field("", description="headline of the report; the name if empty")
+    title: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$", max_length=120)] = Field(
+        "", description="headline of the report; the name if empty"
+    )
     seed: int = Field(2006, ge=0, description="root of every random stream of the run")
 
 
@@ -169,6 +173,8 @@ class Channel(Section):
 
     @model_validator(mode="after")
     def _one_filter(self) -> Self:
+        if self.input == self.output:
+            raise ValueError(f"input and output are the same column, {self.input!r}")
         if self.increments and (self.band_rad_s or self.bounds_band_rad_s):
             raise ValueError("give increments or a band, not both: each is a filter of its own")
         if self.bounds_band_rad_s is not None and self.band_rad_s is None:
@@ -253,6 +259,7 @@ class RunConfig(Section):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"two records are called {name!r}: give them different names")
+        self._refuse_the_same_rows_twice()
         if not any(record.role == "estimation" for record in self.source.records):
             raise ValueError("no record has role 'estimation': there is nothing to identify from")
         if self.closed_loop.machine == "simulated" and self.source.kind != "simulated":
@@ -264,6 +271,19 @@ class RunConfig(Section):
                 "closed_loop_data.method = 'two_stage' needs references in [source] for every record"
             )
         return self
+
+    def _refuse_the_same_rows_twice(self) -> None:
+        """Rows counted twice shrink every bound, and rows that were fitted validate nothing."""
+        if not isinstance(self.source, FileSource):
+            return
+        for first, second in combinations(self.source.records, 2):
+            ends = [math.inf if r.stop_sample is None else r.stop_sample for r in (first, second)]
+            overlap = first.start_sample < ends[1] and second.start_sample < ends[0]
+            if first.path == second.path and overlap:
+                raise ValueError(
+                    f"records {record_name(first)!r} and {record_name(second)!r} share rows of "
+                    f"{first.path.name}: use each row once"
+                )
 
     @property
     def _has_references(self) -> bool:

@@ -71,12 +71,13 @@ def summarise(run: RunDirectory, config: RunConfig) -> RunSummary:
         )
     design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
     unit = _unit(documents["records"], config.control_channel.output)
+    command_unit = _unit(documents["records"], config.control_channel.input)
     sections = (
         Section("records", record_rows(documents["records"])),
         *channels,
         Section("design", design_rows(design)),
         Section("certificate", certificate_rows(certify)),
-        Section("closed loop", closed_loop_rows(loop, unit)),
+        Section("closed loop", closed_loop_rows(loop, unit, command_unit)),
     )
     certified = (
         bool(certify["certified"]) and loop["skipped"] is None and loop["settled_draws"] == loop["draws"]
@@ -124,13 +125,13 @@ def record_rows(document: Mapping[str, Any]) -> tuple[Row, ...]:
         if chosen:
             seconds = sum(record["duration_s"] for record in chosen)
             samples = sum(record["samples"] for record in chosen)
-            rows.append(Row(role, f"{len(chosen)} records, {samples} samples, {seconds:.4g} s"))
+            rows.append(Row(role, f"{_count(len(chosen), 'record')}, {samples} samples, {seconds:.4g} s"))
     return tuple(rows)
 
 
 def channel_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
     """Structure, modes and fits of one channel."""
-    extras = [f"{found['integrators']} integrator(s)"] if found["integrators"] else []
+    extras = [_count(found["integrators"], "integrator")] if found["integrators"] else []
     extras += [f"delay {found['input_delay_samples']}"] if found["input_delay_samples"] else []
     extras += ["direct term"] if found["feedthrough"] else []
     rows = [Row("order", ", ".join([str(found["order"]), *extras]))]
@@ -158,7 +159,7 @@ def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:
         Row(
             f"{100 * spread['level']:g} % radius",
             ", ".join(
-                f"{band['median_radius_percent']:.2g} % "
+                f"{_percent(band['median_radius_percent'])} % "
                 f"({band['from_rad_s']:.3g}-{band['to_rad_s']:.3g} rad/s)"
                 for band in spread["bands"]
             ),
@@ -236,7 +237,7 @@ def margin_text(margins: Mapping[str, Any]) -> str:
     return f"gain {gain}, phase {phase}, modulus {_text(margins['modulus'])}, delay {delay}"
 
 
-def closed_loop_rows(loop: Mapping[str, Any], unit: str) -> tuple[Row, ...]:
+def closed_loop_rows(loop: Mapping[str, Any], unit: str, command_unit: str) -> tuple[Row, ...]:
     """Prediction beside what the machine did (median and range over the runs)."""
     if loop["skipped"] is not None:
         return (Row("not run", loop["skipped"]),)
@@ -251,7 +252,7 @@ def closed_loop_rows(loop: Mapping[str, Any], unit: str) -> tuple[Row, ...]:
         ("settling time", "settling_time_s", "s"),
         ("steady error", "steady_error", unit),
     )
-    always = (("peak command", "peak_command", ""), ("disturbance peak", "disturbance_peak", unit))
+    always = (("peak command", "peak_command", command_unit), ("disturbance peak", "disturbance_peak", unit))
     for label, key, suffix in (*(tracking if loop["tracking"] else ()), *always):
         achieved = [row[key] for row in loop["achieved"] if row[key] is not None]
         never = len(loop["achieved"]) - len(achieved)
@@ -285,6 +286,14 @@ def _gamma(design: Mapping[str, Any]) -> dict[str, Any]:
 
 def _unit(records: Mapping[str, Any], signal: str) -> str:
     return str(records["records"][0]["units"].get(signal, ""))
+
+
+def _percent(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _text(value: float | str | None, suffix: str = "") -> str:

@@ -17,7 +17,7 @@ class InputDelay(Effect):
     group = "actuator"
     neutral = MappingProxyType({"delay_s": 0.0})
 
-    delay_s: NotNegative = Field(description="delay of the voltage")
+    delay_s: NotNegative = Field(le=60.0, description="delay of the voltage; every sample of it is stored")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, delay_s=machine.voltage.delay_s + self.delay_s)

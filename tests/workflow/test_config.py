@@ -165,3 +165,33 @@ def test_rig_file_is_read_relative_to_the_configuration(tmp_path):
     (tmp_path / "rig.toml").write_text("[link]\nlength_m = -1.0\n")
     with pytest.raises(InputError, match=r"source\.rig: .*rig\.toml"):
         load_config(Path(tmp_path / "arm.toml"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ('{ path = "a.csv", name = "again" }', "share rows of a.csv: use each row once"),
+        ('{ path = "a.csv", name = "fresh", role = "validation", start_sample = 3 }', "share rows of a.csv"),
+    ],
+)
+def test_rows_are_used_once(tmp_path, change, message):
+    (tmp_path / "a.csv").write_text("t,u,y\n0,1,0\n1,0,1\n2,1,1\n3,0,2\n4,1,1\n")
+    text = """[source]
+kind = "files"
+time = "t"
+records = [{ path = "a.csv" }, %s]
+[[channels]]
+input = "u"
+output = "y"
+[specification]
+"""
+    (tmp_path / "own.toml").write_text(text % change)
+    with pytest.raises(InputError, match=message):
+        load_config(tmp_path / "own.toml")
+    apart = '{ path = "a.csv", name = "rest", start_sample = 3 }'
+    first = text.replace('{ path = "a.csv" }', '{ path = "a.csv", stop_sample = 3 }')
+    (tmp_path / "own.toml").write_text(first % apart)
+    assert len(load_config(tmp_path / "own.toml")[0].source.records) == 2
+    (tmp_path / "own.toml").write_text(first.replace('output = "y"', 'output = "u"') % apart)
+    with pytest.raises(InputError, match="input and output are the same column, 'u'"):
+        load_config(tmp_path / "own.toml")

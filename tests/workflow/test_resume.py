@@ -85,7 +85,7 @@ def plain_page(monkeypatch):
     """Resuming is about numbers: an empty page saves the seconds that drawing takes."""
     import workflow.report
 
-    def write(run, config):
+    def write(run, config, progress=None):
         storage.write_text(run.report_path, "<html></html>\n")
         return run.report_path
 

@@ -40,13 +40,13 @@ def draw_overview(
 ) -> Figure:
     """Left: identified gain with its ellipses; middle: the loop around -1; right: the step."""
     with style.house_style():
-        figure = style.new_figure(3.9, 12.0)
+        figure = style.new_figure(4.4, 12.0)
         gain, around, time = figure.subplots(1, 3)
         _draw_gain(gain, frequency, nominal, gain_unit)
         draw_around_minus_one(around, loop, level=frequency.level, modulus_margin=modulus_margin)
         around.set_title("Loop around -1")
         _draw_step(time, step)
-        style.finish(figure, (gain, around, time), columns=4)
+        style.finish(figure, (gain, around, time), columns=5)
     return figure
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -36,14 +36,21 @@ OVERVIEW_CAPTION = (
 )
 
 
-def write_report(run: RunDirectory, config: RunConfig) -> Path:
+def write_report(
+    run: RunDirectory, config: RunConfig, progress: Callable[[float, str], None] | None = None
+) -> Path:
     """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
 
     Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
     Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
     """
     data = load(run, config)
-    pictures = {name: render(draw()) for name, draw in pictures_of(data).items()}
+    drawers = pictures_of(data)
+    pictures = {}
+    for position, (name, draw) in enumerate(drawers.items()):
+        if progress is not None:
+            progress(position / len(drawers), name)
+        pictures[name] = render(draw())
     run.figures_path.mkdir(exist_ok=True)
     written = set()
     for name, picture in pictures.items():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from workflow.report.data import ChannelData, RunData
-from workflow.report.page import Block, Code, Section, Table
+from workflow.report.page import Block, Code, Section, Table, Text
 from workflow.report.words import count, frequency, listing, number, percent, sentence
 
 
@@ -203,15 +203,12 @@ def _open(data: RunData) -> list[str]:
 
 
 def reproducibility_section(data: RunData) -> Section:
-    """Configuration, versions, seed, hashes and timings."""
+    """Configuration, versions, seed and hashes; times differ from run to run and stay in the manifest."""
     manifest = data.manifest
     versions = tuple(
         (name, str(version)) for name, version in sorted(_mapping(manifest.get("versions")).items())
     )
     inputs = tuple((name, str(digest)) for name, digest in _mapping(manifest.get("inputs")).items())
-    stages = tuple(
-        (name, f"{stage['seconds']:.1f}") for name, stage in _mapping(manifest.get("stages")).items()
-    )
     blocks: list[Block] = [
         Table(("what", "value"), (("seed of every random stream", str(data.config.run.seed)), *versions)),
     ]
@@ -219,8 +216,7 @@ def reproducibility_section(data: RunData) -> Section:
         blocks.append(Table(("input file", "SHA-256"), inputs))
     if data.config_text:
         blocks.append(Code("Configuration as it was given (config.toml)", data.config_text))
-    if stages:
-        blocks.append(Table(("stage", "seconds"), stages, "Times of this run."))
+    blocks.append(Text("Times of the stages stand in manifest.json beside this page."))
     return Section("reproduce", "To reproduce this", "Reproduce", tuple(blocks))
 
 

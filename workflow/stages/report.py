@@ -26,7 +26,11 @@ def write_page(stage: StageInput) -> StageData:
     # Imported here: matplotlib takes a second to load, and only this stage draws.
     from workflow.report import write_report
 
-    path = write_report(stage.results, stage.config)
+    path = write_report(
+        stage.results,
+        stage.config,
+        lambda fraction, name: stage.progress.update("report", fraction, name),
+    )
     return StageData(document={"report_sha256": storage.sha256_of_file(path)})
 
 
