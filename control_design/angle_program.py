@@ -83,7 +83,7 @@ class AngleProgram:
             [-np.inf] * cascade.parameters + [1e-4],
             [np.inf] * cascade.parameters + [1e4],
         )
-        bound = _parameter_bounds(cascade)
+        bound = parameter_bounds(cascade)
         lower[: cascade.parameters], upper[: cascade.parameters] = list(bound[0]), list(bound[1])
         rows: list[Symbol] = []
         s_lemma: list[tuple[Rows, Symbol, Symbol, Symbol, Symbol]] = []
@@ -301,7 +301,7 @@ def best_multiplier(a1: Real, b1: Real, a2: Real, b2: Real) -> Real:
     return np.asarray(0.5 * (low + high), dtype=np.float64)
 
 
-def _parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:
+def parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:
     """Logarithms kept within a few decades of the scale: exp() never overflows in a wild step."""
     low: list[float] = []
     for kind in cascade.sections:

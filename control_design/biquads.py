@@ -22,7 +22,7 @@ _NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "secon
 _DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2, "notch": 2}
 
 SOLVER_SLACK = 1e-3
-"""Relative; a bound on the denominators that the solver holds may be off by its acceptable tolerance (1e-4)."""
+"""Relative; a bound on the denominators may be off by the solver's acceptable tolerance (1e-4)."""
 
 
 @dataclass(frozen=True)

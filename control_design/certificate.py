@@ -302,7 +302,7 @@ def _items(
 
 
 def _mode_damping_item(plant: str, modes: Sequence[Mode], specification: Specification) -> SpecificationItem:
-    """Least damped mode of the nominal closed loop inside the band; without one in it, damping is no issue."""
+    """Least damped mode of the nominal closed loop in the band; without one there, damping is no issue."""
     assert specification.mode_damping is not None
     assert specification.mode_band_rad_s is not None
     low, high = specification.mode_band_rad_s

@@ -109,8 +109,8 @@ class Specification(BaseModel):
         default=None,
         gt=0,
         lt=1,
-        description="least damping ratio of the nominal closed loop's modes inside mode_band_rad_s; the certificate "
-        "checks it, the optimiser only sees what the other requirements make of it",
+        description="least damping ratio of the nominal closed loop's modes inside mode_band_rad_s; the "
+        "certificate checks it, the optimiser only sees what the other requirements make of it",
     )
     mode_band_rad_s: tuple[float, float] | None = Field(
         default=None,
@@ -137,8 +137,8 @@ class Specification(BaseModel):
         default=None,
         gt=0,
         le=1,
-        description="least damping ratio of the controller's own pole pairs; without it a controller may answer a "
-        "notch of the plant with a resonance of its own, which then rings in closed loop",
+        description="least damping ratio of the controller's own pole pairs; without it a controller may "
+        "answer a notch of the plant with a resonance of its own, which then rings in closed loop",
     )
     computational_delay_samples: int = Field(
         default=1, ge=0, le=10, description="samples between measuring and applying the command"

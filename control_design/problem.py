@@ -1,0 +1,228 @@
+"""Plants and specification on grids: a lean one for the optimisers, a dense one for their checks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from control_design.angle_program import NlpPoint, Rows
+from control_design.biquads import SOLVER_SLACK, Cascade
+from control_design.controller import Controller
+from control_design.ellipses import Complex, Real
+from control_design.frequency_grid import frequency_grid, local_maxima, plant_grid
+from control_design.plant_set import Mode, UncertainPlant
+from control_design.specification import Specification, performance_modes
+from control_design.stability import closed_loop_poles
+from control_design.synthesis_options import SynthesisOptions
+from control_design.worst_case import KINDS, PlantData, worst_of
+
+_DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
+
+
+class Problem:
+    """What does not depend on the controller's order; the lean grids grow by exchange, the rest is fixed."""
+
+    def __init__(
+        self, plants: tuple[UncertainPlant, ...], specification: Specification, options: SynthesisOptions
+    ) -> None:
+        self.plants, self.spec, self.options = plants, specification, options
+        self.dt_s = plants[0].dt_s
+        self.scale = options.scale_rad_s or _frequency_scale(plants, specification)
+        self.grids: list[Real] = []
+        self.dense: list[PlantData] = []
+        for plant in plants:
+            modes = _grid_modes(plant, specification)
+            extra = () if (band := specification.mode_band(plant)) is None else band
+            lean = frequency_grid(
+                plant.nyquist_rad_s,
+                modes,
+                omega_min_rad_s=options.omega_min_rad_s,
+                n_log=options.grid_points,
+                n_mode=options.mode_points,
+                extra=extra,
+            )
+            dense = frequency_grid(
+                plant.nyquist_rad_s,
+                modes,
+                omega_min_rad_s=options.omega_min_rad_s,
+                n_log=int(0.7 * options.dense_points),
+                n_mode=int(0.3 * options.dense_points),
+                extra=lean,
+            )
+            if plant.own_grid is not None:
+                own = plant.own_grid
+                outside = dense[(dense < own[0] * (1 - 1e-9)) | (dense > own[-1] * (1 + 1e-9))]
+                dense = np.unique(np.concatenate([own[own > 0], outside]))
+            self.grids.append(plant_grid(plant, lean))
+            self.dense.append(PlantData.build(plant, specification, dense))
+
+    @property
+    def integrators(self) -> int:
+        """Integrators of the loop: the controller's and the most of any plant."""
+        return max(plant.n_integrators for plant in self.plants) + int(self.spec.integrator)
+
+    @property
+    def asks_tracking(self) -> bool:
+        return self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
+
+    @property
+    def s_lemma_needed(self) -> bool:
+        """Damping is asked of the measured output itself."""
+        return any(data.gp_max is None and bool(np.any(data.w4 > 0)) for data in self.dense)
+
+    def lean(self) -> list[PlantData]:
+        """Every plant on its lean grid as it is now."""
+        return [
+            PlantData.build(plant, self.spec, grid)
+            for plant, grid in zip(self.plants, self.grids, strict=True)
+        ]
+
+    def rows(self, *, with_damping: bool = True) -> list[Rows]:
+        """Rows of the angle programme; without damping, W4 of the measured output is left out."""
+        rows: list[Rows] = []
+        for data in self.lean():
+            rows.append(self._rows(data, data.delay, with_damping=with_damping))
+            if self.spec.delay_margin_s is not None:
+                late = data.delay * np.exp(-1j * data.ellipses.omega_rad_s * self.spec.delay_margin_s)
+                rows.append(self._delay_copy(data, late))
+        return rows
+
+    def gamma(self, cascade: Cascade, parameters: Real, *, kinds: Sequence[str] = KINDS) -> float:
+        """Weighted worst case on the dense grids; inf if some nominal loop is unstable, an ellipse
+        reaches -1 or the controller rings by itself more than it may."""
+        asked = self.spec.controller_damping
+        if asked is not None and not cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
+            return float("inf")  # a start that IPOPT left infeasible
+        if not self.stable(cascade, parameters):
+            return float("inf")
+        worst = 0.0
+        for data in self.dense:
+            values = data.weighted(cascade.response(parameters, data.ellipses.omega_rad_s))
+            worst = max(worst, float(np.max([np.max(values[kind]) for kind in kinds])))
+        return worst
+
+    def stable(self, cascade: Cascade, parameters: Real) -> bool:
+        """Whether every nominal loop is; false also for a controller that is numerically degenerate."""
+        try:
+            controller = self.controller(cascade, parameters)
+        except ValueError:
+            return False  # no anti-windup gain
+        return all(
+            bool(np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1.0)
+            for plant in self.plants
+        )
+
+    def controller(self, cascade: Cascade, parameters: Real) -> Controller:
+        """The controller of a parameter vector."""
+        a, b, c, d = cascade.state_space(parameters)
+        return Controller(
+            a,
+            b,
+            c,
+            d,
+            self.dt_s,
+            computational_delay_samples=self.spec.computational_delay_samples,
+            input_limit=self.spec.input_limit,
+            rate_limit=self.spec.rate_limit,
+        )
+
+    def at(self, cascade: Cascade, parameters: Real, rows: Sequence[Rows], gamma: float) -> NlpPoint:
+        """Programme point for given controller parameters: angles along the nearest unwrapped phase of 1 +
+        L."""
+        angles = []
+        for plant in rows:
+            loop = cascade.response(parameters, plant.ellipses.omega_rad_s) * plant.delay
+            phase = np.unwrap(np.angle(1.0 + plant.ellipses.centre * loop))
+            middle = 0.5 * (plant.start_window[0] + plant.start_window[1])
+            angles.append(phase - 2 * np.pi * np.round((phase[0] - middle) / (2 * np.pi)))
+        return NlpPoint(np.asarray(parameters), 1.0 / min(max(gamma, 1e-3), 1e3), tuple(angles))
+
+    def add_violated(self, cascade: Cascade, parameters: Real, gamma_grid: float, most: int = 12) -> int:
+        """Put maxima of the dense check that exceed the grid's gamma on the grids; how many were new."""
+        limit = gamma_grid * (1.0 + self.options.exchange_tolerance)
+        added = 0
+        for position, data in enumerate(self.dense):
+            omega = data.ellipses.omega_rad_s
+            worst = worst_of(data.weighted(cascade.response(parameters, omega)))
+            index = [i for i in local_maxima(worst) if worst[i] > limit][:most]
+            new = np.setdiff1d(omega[index], self.grids[position])
+            self.grids[position] = np.union1d(self.grids[position], new)
+            added += new.size
+        return added
+
+    def _rows(self, data: PlantData, delay: Complex, *, with_damping: bool) -> Rows:
+        omega = data.ellipses.omega_rad_s
+        keep_w4 = with_damping or data.gp_max is not None
+        return Rows(
+            ellipses=data.ellipses,
+            delay=delay,
+            w1=np.maximum(data.w1, data.modulus),
+            w3=data.w3,
+            w4=data.w4 if keep_w4 else np.zeros(omega.size),
+            gp_max=data.gp_max,
+            row_scale=self._row_scale(data),
+            start_window=self._start_window(data.plant),
+            reaches_nyquist=True,
+        )
+
+    def _delay_copy(self, data: PlantData, delay: Complex) -> Rows:
+        zero = np.zeros(data.ellipses.omega_rad_s.size)
+        return Rows(
+            ellipses=data.ellipses,
+            delay=delay,
+            w1=zero + _DELAY_COPY_MODULUS,
+            w3=zero,
+            w4=zero,
+            gp_max=None,
+            row_scale=self._row_scale(data),
+            start_window=self._start_window(data.plant),
+            # A fractional delay makes the loop complex at Nyquist: its phase there is not tied to zero.
+            reaches_nyquist=False,
+        )
+
+    def _row_scale(self, data: PlantData) -> Real:
+        """Positive factors that keep rows of one size where 1 + L grows: integrators and steep tracking
+        weights.
+
+        A positive factor on |D_L + N_L| instead of |1 + L| leaves the angles alone; (omega/scale)^i is |D_L|
+        of i integrators.
+        """
+        integrators = data.plant.n_integrators + int(self.spec.integrator)
+        slope = np.minimum(1.0, data.ellipses.omega_rad_s / self.scale) ** integrators
+        return np.asarray(np.minimum(slope, 1.0 / np.maximum(data.w1, 1.0)), dtype=np.float64)
+
+    def _start_window(self, plant: UncertainPlant) -> tuple[float, float]:
+        """Range of the first angle: arg(1 + L) of a stable loop starts at -pi (P + i/2), see
+        `stability.nyquist_count`.
+
+        The angle of a supporting normal may differ from arg(1 + L) by up to pi/2; windows are narrower than
+        pi, so that they cannot take the next branch. With integrators there is more room towards lead: at the
+        lowest frequency the loop may have come some way from its limit already.
+        """
+        integrators = plant.n_integrators + int(self.spec.integrator)
+        centre = -np.pi * (plant.unstable_poles + integrators / 2.0)
+        return (centre - 1.4, centre + 1.4) if integrators == 0 else (centre - 0.63, centre + 1.87)
+
+
+def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specification) -> float:
+    """Frequency around which the controller has to act: bandwidth and lowest mode, or a tenth of Nyquist."""
+    candidates = [mode.omega_rad_s for plant in plants for mode in plant.modes[:1]]
+    if specification.bandwidth_rad_s is not None:
+        candidates.append(3.0 * specification.bandwidth_rad_s)
+    if not candidates:
+        return 0.1 * plants[0].nyquist_rad_s
+    return float(np.exp(np.mean(np.log(candidates))))
+
+
+def _grid_modes(plant: UncertainPlant, specification: Specification) -> tuple[Mode, ...]:
+    """Modes that deserve dense points: the plant's, and the performance channel's where damping is asked
+    for."""
+    modes = list(plant.modes)
+    if specification.mode_peak_ratio is not None:
+        modes += [
+            m
+            for m in performance_modes(plant)
+            if all(abs(m.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
+        ]
+    return tuple(modes)

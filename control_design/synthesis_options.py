@@ -1,0 +1,41 @@
+"""How hard the synthesis searches."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SynthesisOptions(BaseModel):
+    """How hard to search; the defaults solve an order-5 design in a few seconds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    starts: int = Field(
+        default=6, ge=1, le=100, description="random low-gain starts of each order, and as many shaped ones"
+    )
+    agreeing_starts: int = Field(
+        default=3, ge=1, description="stop early when so many starts reach the best value within 0.1 %"
+    )
+    sufficient_gamma: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="stop as soon as a stable design reaches this gamma; 0 = look for the best",
+    )
+    exchange_rounds: int = Field(default=4, ge=0, le=20, description="rounds of adding violated frequencies")
+    exchange_tolerance: float = Field(
+        default=5e-4,
+        gt=0,
+        lt=0.1,
+        description="accepted relative excess of the dense check over the programme",
+    )
+    grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
+    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
+    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
+    iterations: int = Field(default=250, ge=10, le=5000, description="IPOPT iterations per start and round")
+    scale_rad_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="frequency scale of controller parameters and starts; none = from the specification",
+    )
