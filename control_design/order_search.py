@@ -20,11 +20,12 @@ from control_design.worst_case import KINDS
 Told = Callable[[float, str], None]
 
 _DRAWS = 200  # shaped loops drawn; each costs 2 ms
-_EASIER = 3  # solved without W4 first
+_EASIER, _FROM_AFAR = 4, 4  # with tracking: low-gain starts given to the interior point first, and in all
+_SHAPED_TRACKING = 3
 _STEPS = 80
 _POLISHED = 3
 _ITERATIONS = 120  # of the interior point from a descended start: where it works it needs 10 to 60
-_HOPS = 4
+_HOPS = 3
 _AGREE = 1.001
 
 
@@ -123,13 +124,15 @@ class OrderSearch:
         )
         shaped = [parameters for parameters, _ in maker.shaped(_DRAWS, self.options.starts)]
         random = [maker.low_gain() for _ in range(self.options.starts)]
-        if self.problem.s_lemma_needed and self.problem.asks_tracking:
-            shaped = [*self._without_damping(random[:_EASIER]), *shaped]
+        if self.problem.asks_tracking:
+            random = [*self._without_damping(random[:_EASIER]), *random[_EASIER:_FROM_AFAR]]
+            shaped = shaped[:_SHAPED_TRACKING]
         mixed = [start for pair in zip_longest(shaped, random) for start in pair if start is not None]
         return [*self.given, *mixed]
 
     def _without_damping(self, starts: Sequence[Real]) -> list[Real]:
-        """Solutions of the programme without W4, from where W4 on thin ellipses is easier to reach."""
+        """Interior point from low gain, without W4 of the measured output: it crosses steep tracking weights
+        better than the descent, and W4 on thin ellipses is easier to reach from there."""
         program = AngleProgram(
             self.cascade,
             self.problem.rows(with_damping=False),
