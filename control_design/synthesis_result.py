@@ -37,8 +37,10 @@ class BlockingPoint:
 
 @dataclass(frozen=True)
 class StartReport:
-    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid (None =
-    unstable)."""
+    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid.
+
+    gamma_dense None: unstable, or (status "descent") not checked on the dense grid.
+    """
 
     start: int
     status: str
