@@ -14,7 +14,7 @@ from control_design.descent import Descended, MinimaxDescent, natural_units
 from control_design.ellipses import Real
 from control_design.problem import Problem
 from control_design.starts import StartMaker
-from control_design.synthesis_result import StartReport
+from control_design.synthesis_result import LARGEST_GAMMA, StartReport
 from control_design.worst_case import KINDS
 
 Told = Callable[[float, str], None]
@@ -162,7 +162,7 @@ class OrderSearch:
                 len(self.reports) + 1,
                 status,
                 steps,
-                min(grid, 1e300),
+                min(grid, LARGEST_GAMMA),
                 dense if dense is not None and np.isfinite(dense) else None,
             )
         )

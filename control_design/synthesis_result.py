@@ -35,6 +35,10 @@ class BlockingPoint:
     value: float
 
 
+LARGEST_GAMMA = 1e300
+"""What a descent that found no stable loop reports in place of infinity."""
+
+
 @dataclass(frozen=True)
 class StartReport:
     """One start: solver status, iterations, gamma of the programme's grid and of the dense grid.
@@ -47,6 +51,11 @@ class StartReport:
     iterations: int
     gamma_grid: float
     gamma_dense: float | None
+
+    @property
+    def stable(self) -> bool:
+        """Whether it ended in a stable loop; a descent never leaves stability: a finite gamma says it did."""
+        return self.gamma_dense is not None or (self.status == "descent" and self.gamma_grid < LARGEST_GAMMA)
 
 
 @dataclass(frozen=True)

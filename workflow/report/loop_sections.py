@@ -40,11 +40,10 @@ def design_section(data: RunData) -> Section:
         reason = str(data.design.get("reason", "the design stage left no result"))
         blocks.append(Remarks((sentence(reason),), "warning", "No controller was sought"))
         return Section("design", "Controller design", "Design", tuple(blocks))
-    converged = [start for start in result.starts if start.gamma_dense is not None]
+    stable = [start for start in result.starts if start.stable]
     blocks.append(
         Text(
-            f"Outcome: {result.explain()}. {len(converged)} of {count(len(result.starts), 'start')} ended "
-            "in a "
+            f"Outcome: {result.explain()}. {len(stable)} of {count(len(result.starts), 'start')} ended in a "
             "stable loop."
         )
     )
