@@ -3,24 +3,76 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from tests.golden import margins
+from workflow.config import load_config
+from workflow.run_directory import RunDirectory
+from workflow.stages.results import load_plant
+
+Example = Callable[[str], tuple[dict[str, Any], Path]]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory, request) -> Iterator[Example]:
+    """Certified margins and run directory of an example, run once."""
+    done: dict[str, tuple[dict[str, Any], Path]] = {}
+
+    def run(example: str) -> tuple[dict[str, Any], Path]:
+        if example not in done:
+            if example != "default_arm":
+                os.environ["FLEXLINK_DATA"] = str(request.getfixturevalue("flexlink_data"))
+            out = tmp_path_factory.mktemp("margins") / example
+            done[example] = margins.measure(example, out), out
+        return done[example]
+
+    before = os.environ.get("FLEXLINK_DATA")
+    yield run
+    if before is None:
+        os.environ.pop("FLEXLINK_DATA", None)
+    else:
+        os.environ["FLEXLINK_DATA"] = before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("example", margins.EXAMPLES)
-def test_certified_margins_of_the_example_stay_where_they_were(example, tmp_path, request, monkeypatch):
-    if example != "default_arm":
-        monkeypatch.setitem(os.environ, "FLEXLINK_DATA", str(request.getfixturevalue("flexlink_data")))
+def test_certified_margins_of_the_example_stay_where_they_were(example, measured):
     golden = margins.read()[example]
-    measured = margins.measure(example, tmp_path / "run")
-    assert measured.pop("certified") is golden["certified"]
-    assert set(measured) == set(golden["tolerance"]), "golden file and measurement name different numbers"
+    found = dict(measured(example)[0])
+    assert found.pop("certified") is golden["certified"]
+    assert set(found) == set(golden["tolerance"]), "golden file and measurement name different numbers"
     off = {
         name: (value, golden[name])
-        for name, value in measured.items()
+        for name, value in found.items()
         if abs(value - golden[name]) > golden["tolerance"][name] * abs(golden[name])
     }
     assert not off, f"measured against golden: {off}; if meant, rerun python -m tests.golden.margins"
+
+
+@pytest.mark.slow
+def test_zeros_of_the_hub_are_the_modes_of_the_arm_with_the_hub_held(measured, flexlink_data):
+    """Physics that the identification has not seen: drive and angle of one shaft are collocated, so the
+    response has its zeros where the arm swings with the shaft held, and the free decays were recorded like
+    that."""
+    _, out = measured("slfr_krauss_2009")
+    config, _ = load_config(margins.ROOT / "examples" / "slfr_krauss_2009.toml")
+    plant = load_plant(RunDirectory.open(out), config)
+    zeros = np.log(plant.zeros[np.abs(plant.zeros) > 0.5].astype(complex)) / plant.dt_s
+    found_Hz = np.abs(zeros[zeros.imag > 1.0]) / (2 * np.pi)
+    decay = pd.read_csv(flexlink_data / "slfr_krauss_2009" / "free_decay_hub_held_rep1.csv")
+    swing = decay["accel_counts"].to_numpy(float)
+    swing = np.hanning(swing.size) * (swing - swing.mean())
+    frequency_Hz = np.fft.rfftfreq(16 * swing.size, 0.002)
+    spectrum = np.abs(np.fft.rfft(swing, 16 * swing.size))
+    # Measured 2.1 % and 1.7 % apart; the held hub is no ideal clamp (in one decay it slipped), and the gain at a
+    # zero is all noise, so twice that is allowed.
+    for low, high, share in ((1.5, 4.0, 0.04), (15.0, 21.0, 0.035)):
+        inside = (frequency_Hz > low) & (frequency_Hz < high)
+        held_Hz = frequency_Hz[inside][np.argmax(spectrum[inside])]
+        assert np.min(np.abs(found_Hz - held_Hz)) < share * held_Hz, (held_Hz, found_Hz)
