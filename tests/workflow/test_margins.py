@@ -70,8 +70,8 @@ def test_zeros_of_the_hub_are_the_modes_of_the_arm_with_the_hub_held(measured, f
     swing = np.hanning(swing.size) * (swing - swing.mean())
     frequency_Hz = np.fft.rfftfreq(16 * swing.size, 0.002)
     spectrum = np.abs(np.fft.rfft(swing, 16 * swing.size))
-    # Measured 2.1 % and 1.7 % apart; the held hub is no ideal clamp (in one decay it slipped), and the gain at
-    # a zero is all noise, so twice that is allowed.
+    # Measured 2.1 % and 1.7 % apart; the held hub is no ideal clamp (it slipped in one decay), and the gain
+    # at a zero is all noise, so twice that is allowed.
     for low, high, share in ((1.5, 4.0, 0.04), (15.0, 21.0, 0.035)):
         inside = (frequency_Hz > low) & (frequency_Hz < high)
         held_Hz = frequency_Hz[inside][np.argmax(spectrum[inside])]
