@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The same examples on every machine, and no time limit for an example that happens to compile something.
+settings.register_profile("flexlink", deadline=None, derandomize=True)
+settings.load_profile("flexlink")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 
