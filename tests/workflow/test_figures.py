@@ -129,7 +129,7 @@ def closed_loop_figure(name: str = "hub") -> Figure:
 def validation_figure(name: str = "fresh") -> Figure:
     of = example.model()
     fresh = example.record([of], name, 3)
-    return draw_validation(fresh, fit_on_fresh_data(of, fresh), fresh=True, noise_std=0.05)
+    return draw_validation(fresh, fit_on_fresh_data(of, fresh), kept_as="validation", noise_std=0.05)
 
 
 def residuals_figure(name: str = "hub") -> Figure:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -10,14 +12,26 @@ from ident.validation import FreshFit
 from workflow.figures import style
 from workflow.figures.bands import outline
 
+_WORDS = {
+    "validation": "fresh record",
+    "repeat": "repeat of a fitted one",
+    "estimation": "record of the fit",
+}
+
 
 def draw_validation(
-    record: Record, fit: FreshFit, *, fresh: bool, noise_std: float | None = None, zoom_samples: int = 400
+    record: Record,
+    fit: FreshFit,
+    *,
+    kept_as: Literal["validation", "repeat", "estimation"],
+    noise_std: float | None = None,
+    zoom_samples: int = 400,
 ) -> Figure:
     """Above: both outputs, whole and close up. Below: the residual, with +-2 standard deviations of the
     noise.
 
-    `record` has one input and one output; `fresh` says that the fit never saw it.
+    `record` has one input and one output; `kept_as` is its role: a repeat of a fitted experiment is no fresh
+    one.
     """
     measured, time_s = record.output[:, 0], record.time_s
     with style.house_style():
@@ -39,7 +53,7 @@ def draw_validation(
                 lower.axhspan(-2 * noise_std, 2 * noise_std, **style.BAND, zorder=0, label=label)
             lower.set_xlabel("time [s]")
             upper.set_xlim(time[0], time[-1])
-        words = "fresh record" if fresh else "record of the fit"
+        words = _WORDS[kept_as]
         grid[0, 0].set_title(f"{style.plain(record.name, 34)} ({words}): fit {fit.fit_percent:.1f} %")
         grid[0, 1].set_title("Close-up")
         unit = record.output_units[0] if record.output_units else ""

@@ -269,7 +269,13 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         range_of = f"between {percent(worst)} ({worst_name}) and {percent(max(fit for _, fit, _ in fits))}"
         if len(fits) == 1:
             unseen, range_of = f"On the record {worst_name}, which the fit has not seen", percent(worst)
-        blocks.append(Text(f"{unseen}, the model run freely reproduces {range_of} {what}."))
+        only_repeats = not about["fit_validation_percent"]
+        if only_repeats:
+            unseen = "On repeats of the fitted experiment" if len(fits) > 1 else f"On the repeat {worst_name}"
+        text = f"{unseen}, the model run freely reproduces {range_of} {what}."
+        if only_repeats:
+            text += " Repeats show the noise; whether the model holds for another input is not tested."
+        blocks.append(Text(text))
         if worst < 50 and not about["increments"]:
             blocks.append(
                 Remarks(
@@ -287,7 +293,7 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     blocks.append(Plot(channel_picture("validation", index, label), caption))
     if len(fits) > 1:
         rows = tuple((name, role, number(fit, 4)) for name, fit, role in fits)
-        blocks.append(Table(("fresh record", "kept as", "fit [%]"), rows))
+        blocks.append(Table(("record", "kept as", "fit [%]"), rows))
     tests = channel.uncertain["tests"]
     if {"whiteness", "independence"} <= residual_tests(channel).keys():
         blocks.append(

@@ -67,7 +67,7 @@ def _of_channel(data: RunData, index: int, channel: ChannelData) -> dict[str, Dr
         add("error-surface", lambda: _error_surface(channel, pair))
     add("poles", lambda: _poles(data, channel, with_loop=index == data.config.control_index))
     add("bode", lambda: _bode(data, channel))
-    add("validation", lambda: _validation(channel, fresh_index(data, channel)))
+    add("validation", lambda: _validation(data, channel))
     tests = residual_tests(channel)
     if {"whiteness", "independence"} <= tests.keys():
         add(
@@ -169,14 +169,15 @@ def _bode(data: RunData, channel: ChannelData) -> Figure:
     )
 
 
-def _validation(channel: ChannelData, fresh: int | None) -> Figure:
-    found = channel.result.identification
+def _validation(data: RunData, channel: ChannelData) -> Figure:
+    found, fresh = channel.result.identification, fresh_index(data, channel)
     if fresh is None:
         record = channel.result.used[0]
         fit = fit_on_fresh_data(found.model, record)
-    else:
-        record, fit = channel.fresh_records[fresh], channel.result.fresh[fresh]
-    return draw_validation(record, fit, fresh=fresh is not None, noise_std=found.noise_std)
+        return draw_validation(record, fit, kept_as="estimation", noise_std=found.noise_std)
+    record, fit = channel.fresh_records[fresh], channel.result.fresh[fresh]
+    role = next(item.role for item in data.records if item.record.name == fit.name)
+    return draw_validation(record, fit, kept_as=role, noise_std=found.noise_std)
 
 
 def _loop_grid(data: RunData) -> Real:
