@@ -66,11 +66,6 @@ class Problem:
     def asks_tracking(self) -> bool:
         return self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
 
-    @property
-    def s_lemma_needed(self) -> bool:
-        """Damping is asked of the measured output itself."""
-        return any(data.gp_max is None and bool(np.any(data.w4 > 0)) for data in self.dense)
-
     def lean(self) -> list[PlantData]:
         """Every plant on its lean grid as it is now."""
         return [

@@ -47,14 +47,22 @@ def mean_record(records: Sequence[Record], name: str) -> Record:
     )
 
 
+def group_posteriors(
+    groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions | None = None
+) -> list[ResponsePosterior]:
+    """`tangent` for every group of records, all with the model's poles and one fir_length, fit to be
+    combined."""
+    options = options or EmbeddingOptions()
+    length = min(common_fir_length(group, model.poles.doubled(), options) for group in groups)
+    shared = options.model_copy(update={"fir_length": length})
+    return [tangent(group, model, shared) for group in groups]
+
+
 def record_posteriors(
     records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[ResponsePosterior]:
-    """`tangent` for every record alone, all with the model's poles and one fir_length, fit to be combined."""
-    options = options or EmbeddingOptions()
-    length = min(common_fir_length([record], model.poles.doubled(), options) for record in records)
-    shared = options.model_copy(update={"fir_length": length})
-    return [tangent([record], model, shared) for record in records]
+    """`group_posteriors` with every record a group of its own."""
+    return group_posteriors([[record] for record in records], model, options)
 
 
 def combine_posteriors(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -112,10 +112,6 @@ class FrequencyUncertainty:
         """
         offset = self.centre - self._matching(nominal_response)
         return offset, offset_disc_radius(offset, self.covariance, self.level)
-
-    def with_level(self, level: float) -> Self:
-        """The same response and covariance, ellipses drawn at another confidence level."""
-        return replace(self, level=level)
 
     def to_control(self) -> control.FrequencyResponseData:
         """The centre as python-control frequency response data (covariances have no place there)."""

@@ -301,7 +301,6 @@ def _save_uncertainty(
                 "tests": uncertainty_stage.residual_tests(found, result.bounded),
                 "nominal": uncertainty_stage.nominal_row(frequency, nominal),
                 "repeat_scatter": [row.to_dict() for row in scatter_rows()] if scatter else None,
-                "fresh_fit_percent": {fit.name: fit.fit_percent for fit in result.fresh},
             }
         )
     run.save_stage("uncertainty", StageData(arrays, {"channels": about}), "00")

@@ -25,6 +25,7 @@ from workflow.simulated_rig import EncodedArm
 from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.stages.results import (
     ChannelResult,
+    RunRecord,
     load_certificate,
     load_empirical,
     load_frequency,
@@ -197,6 +198,16 @@ def test_scatter_between_records_needs_four_and_widens_the_ellipses():
     for gain in (0.8, 1.2):
         assert np.all(apart.contains(gain * truth))
         assert not np.any(noise.contains(gain * truth))
+    # One record per condition is the same thing said in other words; two records of one condition are one.
+    by_condition = channel.uncertainty.model_copy(update={"method": "conditions"})
+    labels = ["a", "b", "c", "d"]
+    labelled = [RunRecord(r, "estimation", c, "") for r, c in zip(records, labels, strict=True)]
+    np.testing.assert_array_equal(
+        posterior_of(result, by_condition, labelled).at(omega).covariance, apart.covariance
+    )
+    alike = [*labelled[:3], replace(labelled[3], condition="c")]
+    with pytest.raises(ValueError, match="at least four conditions of estimation records; found 3"):
+        posterior_of(result, by_condition, alike)
     few = replace(result, bounded=tuple(records[:3]))
     with pytest.raises(ValueError, match="at least four estimation records; found 3"):
         posterior_of(few, channel.uncertainty, [])

@@ -33,7 +33,7 @@ uncertainty.npz
               of {from_rad_s, to_rad_s, median_radius_percent, largest_radius_percent} (major semi-axis
               over |G|), tests: list of {data "estimation"|record name, ...ResidualTest.to_dict()},
               repeat_scatter: null or list of ScatterRow.to_dict(), nominal {share_inside_percent,
-              largest_distance, at_rad_s}, fresh_fit_percent {record: %} of the posterior mean}
+              largest_distance, at_rad_s}}
     arrays    channel/<k>/posterior/...       ident.ResponsePosterior
               channel/<k>/nominal/...         ident.GobfModel: the identified poles, nearest to the posterior
               channel/<k>/frequency/...       ident.FrequencyUncertainty on the display grid

@@ -83,11 +83,6 @@ def load_posterior(run: RunDirectory, index: int) -> ResponsePosterior:
     return ResponsePosterior.from_arrays(run.load_stage("uncertainty").under(f"channel/{index}/posterior/"))
 
 
-def load_nominal(run: RunDirectory, index: int) -> GobfModel:
-    """What the design calls nominal for channel `index`: the identified poles, nearest to the posterior."""
-    return GobfModel.from_arrays(run.load_stage("uncertainty").under(f"channel/{index}/nominal/"))
-
-
 def load_frequency(run: RunDirectory, index: int) -> FrequencyUncertainty:
     """Ellipses of channel `index` on the display grid."""
     return FrequencyUncertainty.from_arrays(

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 
 from control_design.frequency_grid import frequency_grid
 from control_design.plant_set import Mode
-from ident.conditions import combine_posteriors, record_posteriors
-from ident.embedding import classical, common_fir_length, tangent
+from ident.conditions import combine_posteriors, group_posteriors, record_posteriors
+from ident.embedding import classical, tangent
 from ident.model import GobfModel
 from ident.nominal import nominal_near
 from ident.nonparametric import empirical_frf
@@ -59,11 +59,6 @@ def find_uncertainty(stage: StageInput) -> StageData:
             nominal = nominal_of(posterior, model.poles, nominal_grid(omega, channel))
             empirical = empirical_response(result.bounded, channel, model.integrators)
             scatter = scatter_of(channel, result, records, bands_of(omega))
-            fresh = {
-                item.record.name: fit_on_fresh_data(posterior, as_bounded(item.record, channel)).fit_percent
-                for item in records
-                if item.role != "estimation"
-            }
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in posterior.to_arrays().items()}
         arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
@@ -80,7 +75,6 @@ def find_uncertainty(stage: StageInput) -> StageData:
                 "tests": residual_tests(posterior, result.bounded),
                 "repeat_scatter": scatter,
                 "nominal": nominal_row(posterior.at(nominal_grid(omega, channel)), nominal),
-                "fresh_fit_percent": fresh,
             }
         )
     return StageData(arrays, {"channels": about})
@@ -95,28 +89,18 @@ def posterior_of(
         return classical(result.bounded, model, options)
     if options.method == "tangent":
         return tangent(result.bounded, model, options)
-    if options.method == "records":
-        if len(result.bounded) < 4:
-            raise ValueError(
-                "uncertainty.method = 'records' needs at least four estimation records; "
-                f"found {len(result.bounded)}"
-            )
-        each = record_posteriors(result.bounded, model, options)
-        return combine_posteriors(each, small_sample_level=options.level)
     condition = {item.record.name: item.condition for item in records}
     groups: dict[str, list[Record]] = {}
     for record in result.bounded:
-        groups.setdefault(condition[record.name] or record.name, []).append(record)
+        known = condition.get(record.name) if options.method == "conditions" else None
+        groups.setdefault(known or record.name, []).append(record)
     if len(groups) < 4:
+        what = "estimation records" if options.method == "records" else "conditions of estimation records"
         raise ValueError(
-            "uncertainty.method = 'conditions' needs estimation records of at least four conditions "
-            f"(found {len(groups)}); with fewer use 'records'"
+            f"uncertainty.method = {options.method!r} needs at least four {what}; found {len(groups)}"
         )
-    length = min(common_fir_length(group, model.poles.doubled(), options) for group in groups.values())
-    shared = options.model_copy(update={"fir_length": length})
-    return combine_posteriors(
-        [tangent(group, model, shared) for group in groups.values()], small_sample_level=options.level
-    )
+    each = group_posteriors(list(groups.values()), model, options)
+    return combine_posteriors(each, small_sample_level=options.level)
 
 
 def nominal_grid(omega: npt.NDArray[np.float64], channel: Channel) -> npt.NDArray[np.float64]:
