@@ -120,18 +120,8 @@ def draw_sensitivities(
                 )
             axes.set_xscale("log")
             axes.set_yscale("log")
-            axes.set_title(f"{curve.symbol}: {curve.meaning}", fontsize=9.5)
-            if not curve.exact:
-                axes.text(
-                    0.98,
-                    0.97,
-                    "band: an upper bound",
-                    transform=axes.transAxes,
-                    ha="right",
-                    va="top",
-                    fontsize=8.5,
-                    color="#555555",
-                )
+            note = "" if curve.exact else " (band: upper bound)"
+            axes.set_title(f"{curve.symbol}: {curve.meaning}{note}", fontsize=9.5)
             axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
             axes.set_ylim(*_range(curve))
             axes.set_xlim(curve.omega_rad_s[0], curve.omega_rad_s[-1])
