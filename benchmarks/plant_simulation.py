@@ -6,6 +6,7 @@ the stepper.
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable
 
@@ -28,14 +29,14 @@ SIZES: dict[str, dict[str, float]] = {
 }
 
 
-def best_of(repeats: int, work: Callable[[], object]) -> float:
-    """Shortest wall time in seconds."""
+def median_of(repeats: int, work: Callable[[], object]) -> float:
+    """Median wall time in seconds."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
         work()
         times.append(time.perf_counter() - start)
-    return min(times)
+    return statistics.median(times)
 
 
 def step_time_s(rig: Rig, effects: tuple[Effect, ...], voltage: np.ndarray, measure: bool) -> float:
@@ -48,7 +49,7 @@ def step_time_s(rig: Rig, effects: tuple[Effect, ...], voltage: np.ndarray, meas
                 arm.measure()
             arm.advance(value)
 
-    return best_of(3, loop) / voltage.size
+    return median_of(3, loop) / voltage.size
 
 
 def main() -> None:
@@ -63,7 +64,7 @@ def main() -> None:
         cases[name] = parse_effects([{"name": name, **size}])
     print(f"{'6 s record at 5 ms':28s} {'ms':>8s}")
     for name, effects in cases.items():
-        print(f"{name:28s} {1e3 * best_of(9, lambda e=effects: simulate(rig, voltage, e)):8.2f}")
+        print(f"{name:28s} {1e3 * median_of(9, lambda e=effects: simulate(rig, voltage, e)):8.2f}")
     print(f"{'closed-loop step':28s} {'us':>8s}")
     for name in ("nominal", "coulomb_friction"):
         for measure in (False, True):
