@@ -1,5 +1,6 @@
 """From an uncertain frequency response to a certified controller."""
 
+from control_design.c_code import c_header, c_source
 from control_design.certificate import Certificate, PlantVerdict, SpecificationItem, certify
 from control_design.closed_loop import (
     ClosedLoopTrajectory,
@@ -47,6 +48,8 @@ __all__ = [
     "SynthesisOptions",
     "SynthesisResult",
     "UncertainPlant",
+    "c_header",
+    "c_source",
     "certify",
     "simulate",
     "step_metrics",

@@ -1,0 +1,109 @@
+"""The generated C, compiled by the machine's compiler, against the Python controller."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from control_design import Controller
+from control_design.c_code import c_header, c_source
+
+_DT = 0.005
+_COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+needs_compiler = pytest.mark.skipif(
+    _COMPILER is None, reason="no C compiler (cc, gcc or clang) on this machine"
+)
+
+
+def _controller(order: int, **fields) -> Controller:
+    rng = np.random.default_rng(order)
+    a = rng.standard_normal((order, order))
+    if order:
+        a *= 0.95 / np.max(np.abs(np.linalg.eigvals(a)))
+    b, c = 0.3 * rng.standard_normal((order, 1)), rng.standard_normal((1, order))
+    return Controller(a, b, c, np.full((1, 1), 2.0), _DT, **fields)
+
+
+def _compiled(controller: Controller, folder, number: str = "double"):
+    """(step, reset) of the compiled controller, with its state inside."""
+    (folder / "arm.c").write_text(c_source(controller, "arm", number))
+    library = folder / "arm.so"
+    command = [_COMPILER, "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+    command += ["-shared", "-fPIC", str(folder / "arm.c"), "-o", str(library)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    code = ctypes.CDLL(str(library))
+    real = ctypes.c_double if number == "double" else ctypes.c_float
+    code.arm_step.restype = real
+    code.arm_step.argtypes = [ctypes.c_void_p, real]
+    state = ctypes.create_string_buffer(8 * (controller.order + 4))
+    return lambda error: code.arm_step(state, error), lambda: code.arm_reset(
+        ctypes.c_void_p(ctypes.addressof(state))
+    )
+
+
+def _closed_loop(step, n_samples: int = 2000):
+    """Commands of a step reference on a lightly damped mode, delayed by one sample; outside of both codes."""
+    w, zeta = 15.0, 0.02
+    matrix = scipy.linalg.expm(np.array([[0, 1, 0], [-(w**2), -2 * zeta * w, w**2], [0, 0, 0]]) * _DT)
+    x, previous, commands = np.zeros(2), 0.0, []
+    for k in range(n_samples):
+        reference = 1.0 if k < n_samples // 2 else -0.5
+        command = step(0.4 * (reference - x[0]))
+        x = matrix[:2, :2] @ x + matrix[:2, 2] * previous
+        previous = command
+        commands.append(command)
+    return np.array(commands)
+
+
+@needs_compiler
+@pytest.mark.parametrize("order", [0, 1, 4, 9])
+@pytest.mark.parametrize("limits", [{}, {"input_limit": 0.5}, {"input_limit": 0.5, "rate_limit": 15.0}])
+def test_a_closed_loop_run_with_saturation_agrees_to_1e_12(tmp_path, order, limits):
+    controller = _controller(order, **limits)
+    step, reset = _compiled(controller, tmp_path)
+    reset()
+    ours = controller.stepper()
+    expected = _closed_loop(ours.step)
+    found = _closed_loop(step)
+    if limits:
+        assert np.sum(np.abs(expected) == 0.5) > 20, "the run must saturate to mean anything"
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
+    reset()
+    np.testing.assert_array_equal(_closed_loop(step), found)
+
+
+@needs_compiler
+def test_single_precision_agrees_to_its_own_rounding(tmp_path):
+    controller = _controller(4, input_limit=0.5)
+    step, reset = _compiled(controller, tmp_path, "float")
+    reset()
+    difference = _closed_loop(step) - _closed_loop(controller.stepper().step)
+    assert 0 < np.max(np.abs(difference)) < 1e-3
+
+
+@needs_compiler
+def test_header_and_source_belong_together(tmp_path):
+    controller = _controller(2, name="a */ tricky name \n")
+    (tmp_path / "arm.h").write_text(c_header(controller, "arm"))
+    (tmp_path / "main.c").write_text(
+        '#include "arm.h"\nint main(void) { arm_state s; arm_reset(&s); return arm_step(&s, 0.0) != 0.0; }\n'
+    )
+    (tmp_path / "arm.c").write_text('#include "arm.h"\n' + c_source(controller, "arm"))
+    program = tmp_path / "program"
+    files = [str(tmp_path / "main.c"), str(tmp_path / "arm.c")]
+    subprocess.run(
+        [_COMPILER, "-std=c99", "-Werror", *files, "-o", str(program)], check=True, capture_output=True
+    )
+    assert subprocess.run([str(program)], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("prefix", ["", "2fast", "a-b", "a b"])
+def test_a_prefix_that_is_no_identifier_is_refused(prefix):
+    with pytest.raises(ValueError, match="C identifier"):
+        c_source(_controller(1), prefix)
