@@ -1,0 +1,243 @@
+"""Which modes stay when more poles are allowed? The stabilisation plot of modal analysis.
+
+A pole pair is *stable* when its counterpart in the fit with one pair less lies within 1 % in frequency and
+5 % in damping (Peeters and De Roeck, Mechanical Systems and Signal Processing 13(6), 1999; their third
+criterion, the mode shape, needs several sensors). In that literature each order is a subspace or
+least-squares fit that scatters its superfluous poles, so that staying alone tells a mode from noise. Here
+every order is grown from the one below and polished, and a pair that has settled on a peak of the noise
+stays there too. So each pair is also asked whether the data would miss it: taken out, with the other poles
+where they are, Ne ln(J0/J1) must exceed 4 ln Ne, the criterion by which `identify` chooses the order (design
+4.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ident.arrays import RealArray, readonly_real
+from ident.identification import Identification
+from ident.least_squares import fit
+from ident.options import IdentOptions
+from ident.order_selection import Progress, effective_samples
+from ident.pole_search import PoleSearch
+from ident.poles import Poles
+from ident.polish import Polished
+from ident.record import Record
+from ident.regression import Regression, prepare, thinned
+
+FREQUENCY_TOLERANCE = 0.01
+DAMPING_TOLERANCE = 0.05
+
+_BEYOND_CHOSEN = 3
+_MOST_PAIRS = 12
+_FEWEST_ORDERS = 2
+# Below this share of the output's power residuals are rounding, and poles fitted to them mean nothing.
+_EXPLAINED = 1e-18
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class StableMode(NamedTuple):
+    """A column of the plot: mean frequency and damping over the fits in which it is stable and needed."""
+
+    omega_rad_s: float
+    zeta: float
+    n_orders: int
+
+
+@dataclass(frozen=True, eq=False)
+class Stabilisation:
+    """Pole pairs of fits with 0, 1, 2 ... pairs.
+
+    Attributes
+    ----------
+    counts : (S,) int array
+        Pole pairs of each fit, 0, 1, 2 ...
+    rss : (S,) array
+        Residual sum of squares of each fit.
+    n_real : int
+        Real poles of every fit (known ones not counted).
+    chosen : int
+        Pole pairs of the identified model.
+    n_pairs : (K,) int array
+        For each pole pair, the number of pairs of the fit it belongs to; ascending.
+    omega_rad_s, zeta : (K,) arrays
+    previous : (K,) int array
+        Index of the counterpart with one pair less, within `FREQUENCY_TOLERANCE`; -1 where there is none.
+    same_damping : (K,) bool array
+        Whether its damping is within `DAMPING_TOLERANCE` as well.
+    needed : (K,) bool array
+        Whether the data would miss the pair in that fit.
+    """
+
+    counts: IntArray
+    rss: RealArray
+    n_real: int
+    chosen: int
+    n_pairs: IntArray
+    omega_rad_s: RealArray
+    zeta: RealArray
+    previous: IntArray
+    same_damping: BoolArray
+    needed: BoolArray
+
+    def __post_init__(self) -> None:
+        for name in ("rss", "omega_rad_s", "zeta"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        for name, kind in (
+            ("counts", np.int64),
+            ("n_pairs", np.int64),
+            ("previous", np.int64),
+            ("same_damping", np.bool_),
+            ("needed", np.bool_),
+        ):
+            array = np.array(getattr(self, name), dtype=kind)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        each = (self.omega_rad_s, self.zeta, self.previous, self.same_damping, self.needed)
+        if any(array.shape != self.n_pairs.shape for array in each) or self.counts.shape != self.rss.shape:
+            raise ValueError("need one entry per pole pair (K,), and counts and rss one per fit (S,)")
+
+    @property
+    def stable(self) -> BoolArray:
+        """(K,): same frequency and same damping as with one pair less."""
+        return np.asarray((self.previous >= 0) & self.same_damping)
+
+    def columns(self) -> tuple[StableMode, ...]:
+        """Modes that are stable and needed in at least two fits, by frequency."""
+        chain = np.arange(self.n_pairs.size)
+        for k in range(self.n_pairs.size):  # ascending: the counterpart has been given its chain already
+            if self.previous[k] >= 0:
+                chain[k] = chain[self.previous[k]]
+        modes = []
+        for start in np.unique(chain):
+            here = np.flatnonzero((chain == start) & self.stable & self.needed)
+            if here.size >= _FEWEST_ORDERS:
+                omega, zeta = np.mean(self.omega_rad_s[here]), np.mean(self.zeta[here])
+                modes.append(StableMode(float(omega), float(zeta), int(here.size)))
+        return tuple(sorted(modes))
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        return {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Stabilisation:
+        """Inverse of `to_arrays`."""
+        values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
+        return cls(**(values | {name: int(values[name]) for name in ("n_real", "chosen")}))
+
+
+def stabilisation(
+    records: Sequence[Record],
+    found: Identification,
+    options: IdentOptions | None = None,
+    *,
+    max_pairs: int | None = None,
+    progress: Progress | None = None,
+) -> Stabilisation:
+    """Fits with 0, 1, ... max_pairs pole pairs around an identification of the same records.
+
+    records and options are those `found` came from; its number of real poles and its structure (offset,
+    initial state) are kept throughout. max_pairs: none given means three more than were chosen, twelve at
+    most; the data may end the growth earlier (too few samples, nothing left to explain). At the chosen number
+    of pairs the poles are those of the model. Records longer than `options.search_samples` are thinned as for
+    the search.
+    """
+    options = options or IdentOptions()
+    part, in_mid_record = thinned(records, options.search_samples)
+    structure = found.structure
+    if in_mid_record:
+        structure = replace(structure, estimate_initial_state=True)
+    data = prepare(part, structure)
+    search = PoleSearch(data, options)
+    fixed_real, fixed_pairs = search.fixed.real.size, search.fixed.pairs.size
+    n_real = found.model.poles.real.size - fixed_real
+    chosen = found.model.poles.pairs.size - fixed_pairs
+    most = min(chosen + _BEYOND_CHOSEN, _MOST_PAIRS) if max_pairs is None else max_pairs
+    fits: list[Polished] = []
+    for count in range(most + 1):
+        if progress is not None:
+            progress(count / (most + 1), f"{count} pole pairs")
+        if not data.n_samples > 2 * data.n_parameters(search.fixed.order + n_real + 2 * count):
+            break
+        if fits and fits[-1].rss <= _EXPLAINED * float(data.y @ data.y):
+            break
+        end = search.joint(n_real, 0) if count == 0 else search.add_pair(fits[-1].poles)
+        if count == chosen:
+            known = search.descend(found.model.poles, "the model's own poles")
+            end = min(known, end, key=lambda candidate: candidate.rss)
+        fits.append(end)
+    return _compared(data, fits, n_real, chosen, fixed_real, fixed_pairs)
+
+
+def _compared(
+    data: Regression, fits: Sequence[Polished], n_real: int, chosen: int, fixed_real: int, fixed_pairs: int
+) -> Stabilisation:
+    n_pairs: list[int] = []
+    previous: list[int] = []
+    omegas: list[float] = []
+    zetas: list[float] = []
+    same_damping: list[bool] = []
+    needed: list[bool] = []
+    before: tuple[RealArray, RealArray, int] = (np.zeros(0), np.zeros(0), 0)
+    for count, end in enumerate(fits):
+        order = np.argsort(end.poles.omega_rad_s(data.dt_s)[fixed_pairs:]) + fixed_pairs
+        omega, zeta = end.poles.omega_rad_s(data.dt_s)[order], end.poles.zeta()[order]
+        match = _counterparts(omega, before[0])
+        first = len(n_pairs)
+        n_pairs += [count] * omega.size
+        omegas += omega.tolist()
+        zetas += zeta.tolist()
+        previous += [before[2] + j if j >= 0 else -1 for j in match]
+        same_damping += [
+            bool(j >= 0 and abs(z - before[1][j]) < DAMPING_TOLERANCE * before[1][j])
+            for z, j in zip(zeta, match, strict=True)
+        ]
+        needed += _needed(data, end, order)
+        before = (omega, zeta, first)
+    return Stabilisation(
+        counts=np.arange(len(fits)),
+        rss=np.array([end.rss for end in fits]),
+        n_real=n_real,
+        chosen=chosen,
+        n_pairs=np.array(n_pairs, dtype=np.int64),
+        omega_rad_s=np.array(omegas),
+        zeta=np.array(zetas),
+        previous=np.array(previous, dtype=np.int64),
+        same_damping=np.array(same_damping, dtype=np.bool_),
+        needed=np.array(needed, dtype=np.bool_),
+    )
+
+
+def _counterparts(omega: RealArray, before: RealArray) -> list[int]:
+    """For each frequency the index of its counterpart, nearest first and each used once; -1 without one."""
+    match = [-1] * omega.size
+    if before.size == 0:
+        return match
+    away = np.abs(omega[:, None] - before) / before
+    for flat in np.argsort(away, axis=None):
+        i, j = divmod(int(flat), before.size)
+        if not away[i, j] < FREQUENCY_TOLERANCE:
+            break
+        if match[i] < 0 and j not in match:
+            match[i] = j
+    return match
+
+
+def _needed(data: Regression, end: Polished, pairs: IntArray) -> list[bool]:
+    """Whether the data miss each pair when it is taken out and the other poles stay where they are."""
+    worth = effective_samples(fit(data, end.poles).residual, data.starts)
+    floor = max(_EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
+    answers = []
+    for index in pairs:
+        without = fit(data, Poles(end.poles.real, np.delete(end.poles.pairs, index))).rss
+        gain = worth * np.log(max(without, floor) / max(end.rss, floor))
+        answers.append(bool(gain > 4 * np.log(worth)))
+    return answers
