@@ -1,0 +1,288 @@
+"""A measured frequency response in, a GOBF model with everything needed to judge it out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from scipy.stats import chi2
+
+from ident.arrays import RealArray, readonly_real
+from ident.embedding import EmbeddingOptions
+from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.frf_embedding import embed_response
+from ident.frf_polish import to_log
+from ident.frf_regression import FrfFit, FrfRegression, fit_response, pole_directions, prepare_response
+from ident.frf_search import FrfSearch
+from ident.model import GobfModel
+from ident.options import IdentOptions
+from ident.order_selection import OrderStep
+from ident.pole_warnings import pole_warnings
+from ident.poles import Poles
+from ident.posterior import ResponsePosterior
+from ident.search_trace import SearchTrace
+
+# The covariances explain the residual if chi-square is no less probable than this.
+_LEVEL = 0.99
+
+__all__ = ["FrfIdentification", "identify_frf"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrfIdentification:
+    """A model fitted to a measured frequency response, and how well it fits.
+
+    Attributes
+    ----------
+    model : GobfModel
+    posterior : ResponsePosterior
+        Tangent embedding on the same rows; `posterior.at(omega)` gives ellipses at any frequency.
+    omega_rad_s : (F,) array
+        Frequencies of the measurement.
+    residual : (F,) complex array
+        Measured minus fitted response.
+    distance : (F,) array
+        Its length in units of the measurement's own ellipses (at their level; 1 = on the boundary).
+    rss : float
+        Chi-square: sum of squared residuals, each in units of the given covariance.
+    degrees_of_freedom : int
+        Measured real numbers minus unknowns.
+    dispersion : float
+        rss / degrees_of_freedom; near 1 if the covariances explain the residual.
+    decay_std_per_s (R,), omega_std_rad_s (P,), zeta_std (P,) : arrays
+        Standard deviations of the searched poles' decay, natural frequency and damping ratio, to first
+        order; multiplied by sqrt(dispersion) where that is above 1. In the order of the model's poles; known
+        poles (first of each type) have 0.
+    order_table : tuple of OrderStep
+    verdicts : tuple of str
+    search : SearchTrace
+    """
+
+    model: GobfModel
+    posterior: ResponsePosterior
+    omega_rad_s: RealArray
+    residual: np.ndarray[Any, np.dtype[np.complex128]]
+    distance: RealArray
+    rss: float
+    degrees_of_freedom: int
+    decay_std_per_s: RealArray
+    omega_std_rad_s: RealArray
+    zeta_std: RealArray
+    order_table: tuple[OrderStep, ...]
+    verdicts: tuple[str, ...]
+    search: SearchTrace
+
+    def __post_init__(self) -> None:
+        for name in ("omega_rad_s", "distance", "decay_std_per_s", "omega_std_rad_s", "zeta_std"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        residual = np.array(self.residual, dtype=np.complex128)
+        residual.setflags(write=False)
+        object.__setattr__(self, "residual", residual)
+        if not (self.omega_rad_s.shape == residual.shape == self.distance.shape):
+            raise ValueError("omega_rad_s, residual and distance must be (F,)")
+        if not self.degrees_of_freedom > 0:
+            raise ValueError(f"degrees_of_freedom must be positive; got {self.degrees_of_freedom}")
+
+    @property
+    def dispersion(self) -> float:
+        """rss / degrees_of_freedom."""
+        return self.rss / self.degrees_of_freedom
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to look at before trusting the model, one sentence each."""
+        return self.search.warnings
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        arrays: dict[str, np.ndarray[Any, Any]] = {
+            name: getattr(self, name)
+            for name in (
+                "omega_rad_s",
+                "residual",
+                "distance",
+                "decay_std_per_s",
+                "omega_std_rad_s",
+                "zeta_std",
+            )
+        }
+        arrays["rss"] = np.array(self.rss)
+        arrays["degrees_of_freedom"] = np.array(self.degrees_of_freedom)
+        arrays["order_counts"] = np.array([(s.n_real, s.n_pairs) for s in self.order_table]).reshape(-1, 2)
+        arrays["order_values"] = np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2)
+        arrays["verdicts"] = np.array(self.verdicts, dtype=np.str_)
+        for prefix, part in (
+            ("model_", self.model.to_arrays()),
+            ("posterior_", self.posterior.to_arrays()),
+            ("search_", self.search.to_arrays()),
+        ):
+            arrays |= {prefix + key: value for key, value in part.items()}
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+
+        def under(prefix: str) -> dict[str, np.ndarray[Any, Any]]:
+            return {
+                key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)
+            }
+
+        return cls(
+            model=GobfModel.from_arrays(under("model_")),
+            posterior=ResponsePosterior.from_arrays(under("posterior_")),
+            omega_rad_s=arrays["omega_rad_s"],
+            residual=arrays["residual"],
+            distance=arrays["distance"],
+            rss=float(arrays["rss"]),
+            degrees_of_freedom=int(arrays["degrees_of_freedom"]),
+            decay_std_per_s=arrays["decay_std_per_s"],
+            omega_std_rad_s=arrays["omega_std_rad_s"],
+            zeta_std=arrays["zeta_std"],
+            order_table=tuple(
+                OrderStep(int(n_real), int(n_pairs), float(rss), float(criterion))
+                for (n_real, n_pairs), (rss, criterion) in zip(
+                    arrays["order_counts"], arrays["order_values"], strict=True
+                )
+            ),
+            verdicts=tuple(str(item) for item in arrays["verdicts"]),
+            search=SearchTrace.from_arrays(under("search_")),
+        )
+
+
+def identify_frf(
+    response: FrequencyUncertainty,
+    options: IdentOptions | None = None,
+    embedding: EmbeddingOptions | None = None,
+) -> FrfIdentification:
+    """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
+
+    Parameters
+    ----------
+    response : FrequencyUncertainty
+        Measurement with a covariance at every frequency (`from_csv`, `from_frf_repeats`, `empirical_frf`).
+        Errors of different frequencies are taken as independent: one that all of them share (the amplitude
+        of a run, the gain of an amplifier) is not seen in the residual and not in the posterior.
+    options : IdentOptions
+        Numbers of poles, integrators, feedthrough, delay and bounds as for records. What only records have
+        (offset, initial state) must be left at "auto" or False.
+    embedding : EmbeddingOptions
+        fir_length, hyperparameters and prior_no_remainder are used.
+
+    Raises
+    ------
+    ValueError
+        If a frequency has no covariance, there are too few frequencies for the order asked for, or an option
+        asks for an offset or initial state.
+
+    Notes
+    -----
+    Poles by DIRECT in log coordinates and Levenberg-Marquardt, pair by pair, the number of poles by the
+    criterion of the time domain with the measured real numbers (two per frequency) in place of samples. The
+    result is deterministic.
+    """
+    options = options or IdentOptions()
+    if options.estimate_offset is True or options.estimate_initial_state is True:
+        raise ValueError("a frequency response has no offset and no initial state; leave them at 'auto'")
+    data = prepare_response(
+        response,
+        integrators=options.integrators,
+        delay_samples=options.input_delay_samples,
+        feedthrough=options.feedthrough,
+    )
+    fixed = options.fixed()
+    searched = (options.n_real or 0) + 2 * (options.n_pairs or 0)
+    needed = data.n_parameters(fixed.order + searched, fixed.order)
+    if not data.n_rows > needed:
+        raise ValueError(
+            f"{response.omega_rad_s.size} frequencies are too few for order {fixed.order + searched}, which "
+            f"has {needed} unknowns; expected at least {needed // 2 + 1}"
+        )
+    search = FrfSearch(data, options)
+    best = search.run()
+    poles = _in_order(best.poles, fixed)
+    fit = fit_response(data, poles)
+    freedom = data.n_rows - data.n_parameters(poles.order, fixed.order)
+    decay, omega, zeta = _pole_deviations(data, poles, fit, fixed, max(1.0, fit.rss / freedom))
+    model = GobfModel(
+        poles=poles,
+        coefficients=fit.coefficients,
+        dt_s=response.dt_s,
+        feedthrough=fit.feedthrough,
+        integrators=options.integrators,
+        input_delay_samples=options.input_delay_samples,
+    )
+    posterior = embed_response(
+        data,
+        poles,
+        fixed,
+        integrators=options.integrators,
+        input_delay_samples=options.input_delay_samples,
+        options=embedding,
+    )
+    return FrfIdentification(
+        model=model,
+        posterior=posterior,
+        omega_rad_s=response.omega_rad_s,
+        residual=response.centre - fit.response,
+        distance=response.normalised_distance(fit.response),
+        rss=fit.rss,
+        degrees_of_freedom=freedom,
+        decay_std_per_s=decay,
+        omega_std_rad_s=omega,
+        zeta_std=zeta,
+        order_table=search.table(best),
+        verdicts=(_residual_verdict(fit.rss, freedom),),
+        search=SearchTrace(
+            tuple(search.stages),
+            tuple(search.minima),
+            tuple(dict.fromkeys(pole_warnings(poles, fixed, search.bounds, response.dt_s))),
+            search.evaluations,
+        ),
+    )
+
+
+def _residual_verdict(rss: float, freedom: int) -> str:
+    low, high = chi2.ppf(1 - _LEVEL, freedom), chi2.ppf(_LEVEL, freedom)
+    numbers = f"chi-square {rss:.4g} with {freedom} degrees of freedom, {low:.4g} to {high:.4g} expected"
+    if rss > high:
+        return (
+            f"The residual is larger than the covariances explain ({numbers}): the order is too low, the "
+            "plant is not linear, or the covariances are too small; the posterior is widened accordingly."
+        )
+    if rss < low:
+        return f"The residual is smaller than the covariances say ({numbers}): they are on the safe side."
+    return f"The covariances explain the residual ({numbers})."
+
+
+def _in_order(poles: Poles, fixed: Poles) -> Poles:
+    """Known poles first as they are, then real ones from slow to fast and pairs by frequency."""
+    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
+    return Poles(
+        np.concatenate([fixed.real, np.sort(real)[::-1]]),
+        np.concatenate([fixed.pairs, pairs[np.argsort(np.abs(np.log(pairs)))]]),
+    )
+
+
+def _pole_deviations(
+    data: FrfRegression, poles: Poles, fit: FrfFit, fixed: Poles, scale: float
+) -> tuple[RealArray, RealArray, RealArray]:
+    """Standard deviations of decay (R,) [1/s], omega (P,) [rad/s] and zeta (P,) from the Kaufman Jacobian."""
+    n_real, n_pairs = fixed.real.size, fixed.pairs.size
+    directions = pole_directions(data, poles, fit, n_real, n_pairs)
+    decay = np.zeros(poles.real.size)
+    omega, zeta = np.zeros(poles.pairs.size), np.zeros(poles.pairs.size)
+    if directions.shape[1] == 0:
+        return decay, omega, zeta
+    inverse = np.linalg.pinv(directions, rcond=1e-10)
+    spread = np.sqrt(scale * np.sum(inverse**2, axis=1))
+    x = to_log(poles, n_real, n_pairs)
+    n_free = poles.real.size - n_real
+    # d decay / d ln(1 - a) = (1 - a) / (a dt): infinite at a = 0, where decay itself is.
+    with np.errstate(divide="ignore"):
+        decay[n_real:] = spread[:n_free] * np.exp(x[:n_free]) / np.abs(poles.real[n_real:]) / data.dt_s
+    omega[n_pairs:] = spread[n_free::2] * np.exp(x[n_free::2]) / data.dt_s
+    zeta[n_pairs:] = spread[n_free + 1 :: 2] * np.exp(x[n_free + 1 :: 2])
+    return decay, omega, zeta

@@ -1,0 +1,183 @@
+"""GOBF models from measured frequency responses: known plants by scipy, derivatives, coverage, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.frequency_fit import FrfIdentification, identify_frf
+from ident.frf_polish import from_log, to_log
+from ident.frf_regression import fit_response, pole_directions, prepare_response
+from ident.options import IdentOptions
+from ident.poles import Poles
+from ident.uncertainty import FrequencyUncertainty
+from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
+
+OMEGA = np.geomspace(0.5, 300, 120)
+TRUE_DECAY, TRUE_OMEGA = np.array([0.1, 25.0]), 2 * np.pi * np.array(P2_HZ)
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return p2(0)
+
+
+def measured(response, seed, relative=0.05, absolute=3e-4, turn=None):
+    """Response with Gaussian errors of known covariance; turned ellipses three times as long as wide if
+    asked."""
+    rng = np.random.default_rng(seed)
+    size = np.hypot(relative * np.abs(response), absolute * np.abs(response).max())
+    axes = np.ones(2) if turn is None else np.array([1.0, 1 / 3])
+    angle = np.zeros(response.size) if turn is None else rng.uniform(0, np.pi, response.size)
+    rotation = np.exp(1j * angle)
+    error = (
+        size
+        * rotation
+        * (axes[0] * rng.standard_normal(response.size) + 1j * axes[1] * rng.standard_normal(response.size))
+    )
+    matrix = np.stack(
+        [np.stack([rotation.real, -rotation.imag], -1), np.stack([rotation.imag, rotation.real], -1)], -2
+    )
+    covariance = matrix @ (np.diag(axes**2) * size[:, None, None] ** 2) @ matrix.transpose(0, 2, 1)
+    return FrequencyUncertainty(OMEGA, response + error, covariance, DT_S)
+
+
+def test_exact_response_gives_the_exact_poles(plant):
+    response = plant.response(OMEGA)
+    tiny = np.stack([np.eye(2) * (1e-6 * abs(g)) ** 2 for g in response])
+    found = identify_frf(FrequencyUncertainty(OMEGA, response, tiny, DT_S), IdentOptions(n_real=2, n_pairs=3))
+    poles = found.model.poles
+    # Errors of 1e-13 of the response (the reference solves), 1e6 conditioning: 1e-6 of the poles is generous.
+    np.testing.assert_allclose(poles.omega_rad_s(DT_S), TRUE_OMEGA, rtol=1e-6)
+    np.testing.assert_allclose(poles.zeta(), P2_ZETA, rtol=1e-5)
+    np.testing.assert_allclose(poles.decay_per_s(DT_S), TRUE_DECAY, rtol=1e-4)
+    np.testing.assert_allclose(found.model.frequency_response(OMEGA), response, rtol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [None, True])
+def test_poles_and_order_from_noisy_data(plant, turn):
+    response = plant.response(OMEGA)
+    found = identify_frf(measured(response, 1, turn=turn))
+    poles = found.model.poles
+    assert (poles.real.size, poles.pairs.size) == (2, 3)
+    for estimate, truth, deviation in (
+        (poles.decay_per_s(DT_S), TRUE_DECAY, found.decay_std_per_s),
+        (poles.omega_rad_s(DT_S), TRUE_OMEGA, found.omega_std_rad_s),
+        (poles.zeta(), np.array(P2_ZETA), found.zeta_std),
+    ):
+        # Sixteen numbers in all: 4 standard deviations are exceeded once in a thousand choices of seeds.
+        assert np.all(np.abs(estimate - truth) < 4 * deviation)
+    assert 0.7 < found.dispersion < 1.3  # chi-square with 224 degrees of freedom: sd 0.094
+    assert "covariances explain the residual" in found.verdicts[0]
+    assert found.posterior.at(OMEGA).contains(response).mean() > 0.8
+    assert not found.warnings
+
+
+def test_posterior_widens_when_the_covariances_are_too_small(plant):
+    response = plant.response(OMEGA)
+    honest = measured(response, 2)
+    bold = FrequencyUncertainty(OMEGA, honest.centre, honest.covariance / 16, DT_S)
+    options = IdentOptions(n_real=2, n_pairs=3)
+    right, wide = identify_frf(honest, options), identify_frf(bold, options)
+    assert wide.dispersion == pytest.approx(16 * right.dispersion, rel=1e-3)
+    assert "larger than the covariances explain" in wide.verdicts[0]
+    ratio = wide.posterior.at(OMEGA).enclosing_radius() / right.posterior.at(OMEGA).enclosing_radius()
+    # Both rest on the same scatter; the honest one is not narrowed below its covariances.
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.15)
+
+
+def test_integrator_delay_and_direct_term_are_known_factors(plant):
+    inner = plant.response(OMEGA) + 0.05
+    z = np.exp(1j * OMEGA * DT_S)
+    response = inner * z / (z - 1) * z**-3
+    relative = np.stack([np.eye(2) * (0.01 * abs(g)) ** 2 for g in response])
+    rng = np.random.default_rng(3)
+    noisy = response + 0.01 * np.abs(response) * (rng.standard_normal(120) + 1j * rng.standard_normal(120))
+    options = IdentOptions(n_real=2, n_pairs=3, integrators=1, feedthrough=True, input_delay_samples=3)
+    found = identify_frf(FrequencyUncertainty(OMEGA, noisy, relative, DT_S), options)
+    assert found.model.poles.omega_rad_s(DT_S)[:2] == pytest.approx(TRUE_OMEGA[:2], rel=2e-3)
+    assert found.model.poles.real[0] == 0.0
+    assert found.posterior.integrators == 1
+    assert found.posterior.input_delay_samples == 3
+    error = np.abs(found.model.frequency_response(OMEGA) / response - 1)
+    assert np.median(error) < 0.01
+    assert found.posterior.at(OMEGA).contains(response).mean() > 0.8
+
+
+def test_directions_are_the_derivative_of_the_refitted_response(plant):
+    response = measured(plant.response(OMEGA), 4)
+    data = prepare_response(response, integrators=0, delay_samples=0, feedthrough=True)
+    poles = Poles.from_continuous(
+        decay_per_s=[0.3, 20.0], omega_rad_s=[15.0, 70.0], zeta=[0.03, 0.1], dt_s=DT_S
+    )
+    fit = fit_response(data, poles)
+    gradient = -2 * pole_directions(data, poles, fit, 0, 0).T @ fit.residual
+    x, step = to_log(poles, 0, 0), 1e-5
+    for i in range(x.size):
+        ends = []
+        for sign in (1, -1):
+            moved = x.copy()
+            moved[i] += sign * step
+            ends.append(fit_response(data, from_log(moved, poles, 0, 0)).rss)
+        numeric = (ends[0] - ends[1]) / (2 * step)
+        # Central differences: rounding 1e-16 J / step and step^2 J''' are both near 1e-10 of J here.
+        assert gradient[i] == pytest.approx(numeric, rel=1e-5, abs=1e-8 * fit.rss)
+
+
+def test_response_at_zero_and_nyquist_counts_once(plant):
+    omega = np.concatenate([[0.0], OMEGA, [np.pi / DT_S]])
+    response = plant.response(omega)
+    covariance = np.stack([np.eye(2) * (0.02 * abs(g)) ** 2 for g in response])
+    covariance[0, 1, 1] = covariance[-1, 1, 1] = 0.0
+    data = prepare_response(
+        FrequencyUncertainty(omega, response, covariance, DT_S),
+        integrators=0,
+        delay_samples=0,
+        feedthrough=False,
+    )
+    assert data.n_rows == 2 * omega.size - 2
+
+
+def test_round_trip_is_exact(plant):
+    found = identify_frf(measured(plant.response(OMEGA), 5), IdentOptions(n_real=1, n_pairs=1))
+    again = FrfIdentification.from_arrays(found.to_arrays())
+    for name, value in found.to_arrays().items():
+        np.testing.assert_array_equal(again.to_arrays()[name], value)
+
+
+def test_bad_input_is_refused(plant):
+    response = plant.response(OMEGA)
+    good = measured(response, 6)
+    exact = FrequencyUncertainty(OMEGA, response, np.zeros((OMEGA.size, 2, 2)), DT_S)
+    with pytest.raises(ValueError, match="exactly known"):
+        identify_frf(exact)
+    with pytest.raises(ValueError, match="no offset and no initial state"):
+        identify_frf(good, IdentOptions(estimate_offset=True))
+    few = FrequencyUncertainty(OMEGA[:6], good.centre[:6], good.covariance[:6], DT_S)
+    with pytest.raises(ValueError, match="6 frequencies are too few for order 8"):
+        identify_frf(few, IdentOptions(n_real=2, n_pairs=3))
+
+
+@pytest.mark.slow
+def test_ellipses_cover_and_pole_deviations_are_right_over_100_seeds(plant):
+    grid = np.geomspace(0.5, 300, 200)
+    truth, response = plant.response(grid), plant.response(OMEGA)
+    true = np.concatenate([TRUE_DECAY, TRUE_OMEGA, P2_ZETA])
+    hits, scores, right = [], [], 0
+    for seed in range(100):
+        found = identify_frf(measured(response, 1000 + seed))
+        poles = found.model.poles
+        hits.append(found.posterior.at(grid).contains(truth))
+        if (poles.real.size, poles.pairs.size) != (2, 3):
+            continue
+        right += 1
+        estimate = np.concatenate([poles.decay_per_s(DT_S), poles.omega_rad_s(DT_S), poles.zeta()])
+        deviation = np.concatenate([found.decay_std_per_s, found.omega_std_rad_s, found.zeta_std])
+        scores.append((estimate - true) / deviation)
+    assert right >= 97
+    covered = np.array(hits)
+    # Responses of one seed are smooth: about 15 independent frequencies each, sd of the mean 0.6 %.
+    assert covered.mean() == pytest.approx(0.95, abs=0.025)
+    assert covered.mean(axis=0).min() > 0.85
+    # 100 draws: the sampling error of a standard deviation is 7 %; 4 of those.
+    np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.28)
