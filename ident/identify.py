@@ -227,7 +227,7 @@ def _result(
     fixed = search.fixed
     bounds = Bounds.from_options(options, data.longest, data.dt_s)
     warnings = [
-        *advice(records, data, best.poles.order),
+        *advice(records, data, model, residuals, fixed),
         *pole_warnings(best.poles, fixed, bounds, data.dt_s),
     ]
     return Identification(

@@ -1,4 +1,8 @@
-"""What can be seen in the records before any fit: unusable ones are refused, doubtful ones get advice."""
+"""What the records themselves say about a fit: unusable ones are refused, doubtful ones get advice.
+
+Every sentence names what was seen and what to do about it, and appears only where that would help: the
+benchmark plants and the examples are quiet (`tests/ident/test_input_checks.py`).
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,29 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.signal
+from scipy.stats import chi2
 
 from ident.arrays import RealArray
+from ident.model import GobfModel
+from ident.order_selection import effective_samples
+from ident.poles import Poles
 from ident.record import Record
 from ident.regression import Regression
 
-# Above the last frequency with this share of the largest spectral density the input says next to nothing.
-_WEAK_INPUT = 1e-4
+# An input is there at a frequency if it has this share of the density that it would have if its power were
+# spread evenly up to Nyquist ...
+_WEAK_INPUT = 1e-2
+# ... or if what the model makes of it stands this far above what the model leaves; never below this share of
+# its largest density, where windows leak.
+_ABOVE_NOISE = 3.0
+_LEAKAGE = 1e-6
+# A pole that decays by less than exp(-1/2) within the longest record is not told from one that does not.
+_DECAYS = 0.5
+# A straight line has to be this much of a residual's power, and this improbable, to be called a drift.
+_DRIFT_SHARE = 0.2
+_DRIFT_LEVEL = 1e-5
+# Deviations from an operating point this many times larger are lost beside it.
+_LARGE_OFFSET = 10.0
 
 
 def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> None:
@@ -37,21 +57,65 @@ def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> 
         )
 
 
-def advice(records: Sequence[Record], data: Regression, order: int) -> list[str]:
-    """One sentence per doubt: few samples, narrow input, clipped signals."""
+def advice(
+    records: Sequence[Record],
+    data: Regression,
+    model: GobfModel,
+    residuals: Sequence[RealArray],
+    fixed: Poles,
+) -> list[str]:
+    """One sentence per doubt about the records behind a fitted model; residuals (T,) one per record.
+
+    `fixed` are the poles that were given (they come first among the model's).
+    """
+    return [
+        *_too_short(data, model, fixed),
+        *_weak_input(records, data, model, residuals),
+        *_clipped(records),
+        *_drifting(records, residuals),
+        *_far_from_zero(records, data),
+    ]
+
+
+def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
     sentences = []
-    needed = data.n_parameters(order)
+    needed = data.n_parameters(model.order)
     if data.n_samples < 10 * needed:
         sentences.append(
             f"only {data.n_samples} samples for {needed} unknowns: record longer, or fit fewer poles; "
             "below ten samples per unknown the choice of the poles is itself uncertain"
         )
-    limit = excitation_limit_rad_s(records)
-    if limit < 0.6 * np.pi / data.dt_s:
-        sentences.append(
-            f"the input is not exciting above {limit:.3g} rad/s: the model there is extrapolation; "
-            "use an input with power up to the frequency you need"
-        )
+    dt_s, poles = model.dt_s, model.poles
+    still = 1e-3 / data.longest  # slower ones have come to the bound, which pole_warnings speaks of
+    rates = [("real pole", -float(np.log(a))) for a in poles.real[fixed.real.size :] if a > 0]
+    rates += [
+        (f"pole pair at {omega:.4g} rad/s", -float(np.log(abs(p))))
+        for p, omega in zip(poles.pairs, poles.omega_rad_s(dt_s), strict=True)
+    ][fixed.pairs.size :]
+    for name, rate in rates:
+        if 1.01 * still < rate < _DECAYS / data.longest:
+            sentences.append(
+                f"the {name} decays with a time constant of {dt_s / rate:.3g} s, but the longest record has "
+                f"only {data.longest * dt_s:.3g} s: its rate is a guess; record {2 * dt_s / rate:.2g} s or "
+                "more, or give the pole as known (integrators, fixed_poles)"
+            )
+    return sentences
+
+
+def _weak_input(
+    records: Sequence[Record], data: Regression, model: GobfModel, residuals: Sequence[RealArray]
+) -> list[str]:
+    limit = excitation_limit_rad_s(records, model, residuals)
+    if limit >= 0.6 * np.pi / data.dt_s:
+        return []
+    return [
+        f"the input is not exciting above {limit:.3g} rad/s: the model there is extrapolation; "
+        "use an input with power up to the frequency you need"
+    ]
+
+
+def _clipped(records: Sequence[Record]) -> list[str]:
+    sentences = []
     for record in records:
         for kind, signal, names in (
             ("input", record.input, record.input_names),
@@ -61,37 +125,100 @@ def advice(records: Sequence[Record], data: Regression, order: int) -> list[str]
             if share > 0:
                 sentences.append(
                     f"{record.label}: {share:.1%} of {kind} '{names[0]}' stand at its very limit, as if "
-                    "saturated "
-                    "or clipped: lower the amplitude, or cut those samples out"
+                    "saturated or clipped: lower the amplitude, or cut those samples out"
                 )
     return sentences
 
 
-def excitation_limit_rad_s(records: Sequence[Record]) -> float:
-    """Highest frequency at which the input of any record still has 1e-4 of its largest spectral density,
-    rad/s."""
-    highest = 0.0
+def _drifting(records: Sequence[Record], residuals: Sequence[RealArray]) -> list[str]:
+    sentences = []
+    for record, residual in zip(records, residuals, strict=True):
+        if residual.size < 50:
+            continue
+        line = np.linspace(-1.0, 1.0, residual.size)
+        centred = residual - residual.mean()
+        slope = float(line @ centred / (line @ line))
+        power, rest = float(centred @ centred), centred - slope * line
+        if not power > 0:
+            continue
+        share = 1 - float(rest @ rest) / power
+        worth = effective_samples(rest, np.array([0, residual.size]))
+        if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chi2.isf(_DRIFT_LEVEL, 1):
+            sentences.append(
+                f"{record.label}: output '{record.output_names[0]}' drifts by {2 * slope:+.3g} over the record "
+                f"without a cause in the input ({share:.0%} of what the model leaves): take the trend "
+                "off, or fit within a band above it"
+            )
+    return sentences
+
+
+def _far_from_zero(records: Sequence[Record], data: Regression) -> list[str]:
+    sentences = []
     for record in records:
+        u = record.input[:, 0]
+        if abs(u.mean()) > _LARGE_OFFSET * u.std() and not data.structure.estimate_initial_state:
+            sentences.append(
+                f"{record.label}: input '{record.input_names[0]}' stands at {u.mean():.4g} and moves by "
+                f"{u.std():.2g} only, but the fit starts from rest at zero: subtract the operating point "
+                "from input and output"
+            )
+    return sentences
+
+
+def excitation_limit_rad_s(
+    records: Sequence[Record],
+    model: GobfModel | None = None,
+    residuals: Sequence[RealArray] = (),
+) -> float:
+    """Highest frequency at which the input of any record is there, rad/s.
+
+    There is: with a hundredth of the density of an evenly spread input of the same power, or, where the
+    model's output spectrum tells, with three times the residual's density in what it drives. A band that only
+    the plant's own roll-off hides is not blamed on the input.
+    """
+    highest = 0.0
+    for index, record in enumerate(records):
         u = record.input[:, 0]
         segment = int(min(u.size, max(64, u.size // 8)))
         frequency, density = scipy.signal.welch(u - u.mean(), fs=1 / record.dt_s, nperseg=segment)
-        # Leakage of a window may carry a strong line one bin further, no more.
-        strong = np.flatnonzero(density >= _WEAK_INPUT * density.max())
-        highest = max(highest, 2 * np.pi * float(frequency[strong[-1]]))
+        present = density >= _WEAK_INPUT * density.mean()
+        if model is not None and residuals[index].size >= segment:
+            _, noise = scipy.signal.welch(residuals[index], fs=1 / record.dt_s, nperseg=segment)
+            gain = np.abs(model.frequency_response(2 * np.pi * frequency[1:]))
+            seen = gain**2 * density[1:] >= _ABOVE_NOISE * _smooth(noise)[1:]
+            present[1:] |= seen & (density[1:] >= _LEAKAGE * density.max())
+        highest = max(highest, 2 * np.pi * float(frequency[np.flatnonzero(present)[-1]]))
     return highest
+
+
+def _smooth(density: RealArray) -> RealArray:
+    """Mean over 11 neighbouring lines: a noise spectrum of few averages has holes that are chance."""
+    window = np.ones(min(11, density.size))
+    return np.asarray(
+        np.convolve(density, window, "same") / np.convolve(np.ones(density.size), window, "same")
+    )
 
 
 def clipped_share(signal: RealArray) -> float:
     """Share of samples that stand at an extreme value which is suspiciously frequent, else 0.
 
     Suspicious: at least 1 % of the samples, and five times as many as at the next level (a slow sine in a
-    converter's steps has 2.4 times). Signals of a few levels (binary, multilevel inputs) are left alone.
+    converter's steps has 2.4 times), in more than one stretch unless that one is 5 % of the record (a machine
+    that sticks where it turns does so once). A signal at rest before and after the experiment is not held
+    against it. Signals of a few levels, and those that spend most of their time at both extremes, are binary
+    or multilevel by design and left alone.
     """
     levels, counts = np.unique(signal, return_counts=True)
-    if levels.size < 10:
+    if levels.size < 10 or counts[0] + counts[-1] > 0.5 * signal.size:
         return 0.0
+    changes = np.flatnonzero(np.diff(signal))
+    inside = signal[changes[0] + 1 : changes[-1] + 1]
     share = 0.0
-    for count, neighbour in ((counts[0], counts[1]), (counts[-1], counts[-2])):
-        if count >= max(0.01 * signal.size, 5, 5 * neighbour):
-            share += float(count / signal.size)
+    for extreme, neighbour in ((levels[0], counts[1]), (levels[-1], counts[-2])):
+        at = inside == extreme
+        count = int(np.count_nonzero(at))
+        stretches = np.count_nonzero(at[1:] & ~at[:-1]) + int(at[:1].any())
+        often = stretches >= 2 or count >= 0.05 * signal.size
+        if often and count >= max(0.01 * signal.size, 5, 5 * neighbour):
+            share += count / signal.size
     return share
