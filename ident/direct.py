@@ -1,4 +1,4 @@
-"""DIRECT over the unit cube: NLopt's variants and scipy's, recorded point by point."""
+"""DIRECT over the unit cube: in batches, NLopt's variants and scipy's, recorded point by point."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ from typing import Any
 import numpy as np
 
 from ident.arrays import RealArray
+from ident.batched_direct import minimise_in_batches
 from ident.options import Algorithm
 
 
 def minimise(
-    cost: Callable[[RealArray], float], dimension: int, algorithm: Algorithm, evaluations: int
+    cost: Callable[[RealArray], RealArray], dimension: int, algorithm: Algorithm, evaluations: int
 ) -> tuple[RealArray, RealArray]:
-    """Points (E, D) of the unit cube that DIRECT looked at, in order, and their costs (E,)."""
+    """Points (E, D) of the unit cube that DIRECT looked at, in order, and their costs (E,).
+
+    cost maps points (K, D) to their costs (K,); only "DIRECT_L" asks for more than one at a time.
+    """
+    if algorithm == "DIRECT_L":
+        return minimise_in_batches(cost, dimension, evaluations)
     points: list[RealArray] = []
     costs: list[float] = []
 
     def recorded(x: Any, *_: Any) -> float:
         point = np.array(x, dtype=np.float64)
-        value = cost(point)
+        value = float(cost(point[np.newaxis])[0])
         points.append(point)
         costs.append(value)
         return value

@@ -10,6 +10,7 @@ from ident.poles import Poles
 from ident.structure import Structure
 
 Algorithm = Literal[
+    "DIRECT_L",
     "GN_DIRECT_L",
     "GN_DIRECT",
     "GN_DIRECT_NOSCAL",
@@ -60,7 +61,11 @@ class IdentOptions(BaseModel):
         "auto", description="records need not start from rest; auto: kept if the data ask for it"
     )
 
-    algorithm: Algorithm = Field("GN_DIRECT_L", description="NLopt's DIRECT variants, or scipy's")
+    algorithm: Algorithm = Field(
+        "DIRECT_L",
+        description="DIRECT_L: NLopt's GN_DIRECT_L point for point, but points of an iteration evaluated together; "
+        "or NLopt's DIRECT variants themselves, or scipy's",
+    )
     coordinates: Literal["log", "raw"] = Field(
         "log",
         description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the "

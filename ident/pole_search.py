@@ -138,7 +138,7 @@ class PoleSearch:
         return self.descend(rough.poles, stage)
 
     def _global(self, title: str, cost: CandidateCost, evaluations: int) -> RealArray:
-        points, costs = minimise(cost, cost.space.dimension, self.options.algorithm, evaluations)
+        points, costs = minimise(cost.log, cost.space.dimension, self.options.algorithm, evaluations)
         self.evaluations += cost.evaluations
         self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
         return best_apart(points, costs, self.options.starts)

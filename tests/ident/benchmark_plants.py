@@ -95,3 +95,26 @@ def p2(seed, n_samples=2000, snr_db=35):
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.integers(0, 2, n_samples) * 2.0 - 1, 2)[rng.integers(0, 2) :][:n_samples]
     return _truth(system, u, snr_db, rng, f"P2 {seed}")
+
+
+# (natural frequency in rad/s, zeta) of the modes of P3.
+P3_MODES = {
+    3: ((12.0, 0.015), (45.0, 0.015), (110.0, 0.02)),
+    5: ((9.0, 0.01), (33.0, 0.01), (80.0, 0.012), (160.0, 0.015), (260.0, 0.02)),
+}
+
+
+def p3(n_modes, seed, snr_db, n_samples=2000):
+    """Three or five modes beside 1/(s^2 + 0.3 s), residues (-1)^i 1.2/i; output scaled to 0.1265."""
+    blocks, B, C = [np.array([[0.0, 1.0], [0.0, -0.3]])], [0.0, 1.0], [1.0, 0.0]
+    for i, (omega, zeta) in enumerate(P3_MODES[n_modes], start=1):
+        blocks.append(np.array([[0.0, 1.0], [-(omega**2), -2 * zeta * omega]]))
+        B += [0.0, 1.0]
+        C += [(-1) ** i * 1.2 / i, 0.0]
+    drive, out = np.array(B)[:, None], np.array(C)[None, :]
+    continuous = (scipy.linalg.block_diag(*blocks), drive, out, np.zeros((1, 1)))
+    A, B, C, D = scipy.signal.cont2discrete(continuous, DT_S)[:4]
+    u = max_length_sequence(1, n_samples)
+    scale = 0.1265 / np.std(run((A, B, C, D), u))
+    name = f"P3 {n_modes} modes {snr_db} dB {seed}"
+    return _truth((A, B, scale * C, scale * D), u, snr_db, np.random.default_rng(seed), name)

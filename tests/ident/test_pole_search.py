@@ -66,7 +66,7 @@ def test_an_empty_box_is_refused():
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_variant_of_direct_finds_the_lowest_of_many_minima(algorithm):
     def cost(x):
-        return float(np.sum((x - [0.3, 0.8]) ** 2 - 0.02 * np.cos(40 * (x - [0.3, 0.8]))))
+        return np.sum((x - [0.3, 0.8]) ** 2 - 0.02 * np.cos(40 * (x - [0.3, 0.8])), axis=-1)
 
     points, costs = minimise(cost, 2, algorithm, 800)
     assert len(costs) >= 300
