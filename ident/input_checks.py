@@ -13,9 +13,11 @@ import scipy.signal
 from scipy.stats import chi2
 
 from ident.arrays import RealArray
+from ident.least_squares import linearisation
 from ident.model import GobfModel
 from ident.order_selection import effective_samples
 from ident.poles import Poles
+from ident.polish import pole_system
 from ident.record import Record
 from ident.regression import Regression
 
@@ -26,8 +28,10 @@ _WEAK_INPUT = 1e-2
 # its largest density, where windows leak.
 _ABOVE_NOISE = 3.0
 _LEAKAGE = 1e-6
-# A pole that decays by less than exp(-1/2) within the longest record is not told from one that does not.
-_DECAYS = 0.5
+# A rate of decay within this factor either way (95 %) is known; beyond, the record does not tell it.
+_KNOWN_WITHIN = 2.0
+# Real poles with time constants above this share of the record count as slow; others have their own advice.
+_SLOW = 0.5
 # A straight line has to be this much of a residual's power, and this improbable, to be called a drift.
 _DRIFT_SHARE = 0.2
 _DRIFT_LEVEL = 1e-5
@@ -85,19 +89,41 @@ def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
             f"only {data.n_samples} samples for {needed} unknowns: record longer, or fit fewer poles; "
             "below ten samples per unknown the choice of the poles is itself uncertain"
         )
-    dt_s, poles = model.dt_s, model.poles
-    still = 1e-3 / data.longest  # slower ones have come to the bound, which pole_warnings speaks of
-    rates = [("real pole", -float(np.log(a))) for a in poles.real[fixed.real.size :] if a > 0]
-    rates += [
-        (f"pole pair at {omega:.4g} rad/s", -float(np.log(abs(p))))
-        for p, omega in zip(poles.pairs, poles.omega_rad_s(dt_s), strict=True)
-    ][fixed.pairs.size :]
-    for name, rate in rates:
-        if 1.01 * still < rate < _DECAYS / data.longest:
+    return sentences + _unknown_rates(data, model, fixed)
+
+
+def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
+    """Poles whose decay the records do not tell, by the Gauss-Newton covariance for white noise."""
+    poles, dt_s = model.poles, model.dt_s
+    n_real, n_pairs = fixed.real.size, fixed.pairs.size
+    here = linearisation(data, poles)
+    normal, _ = pole_system(here, poles, n_real, n_pairs)
+    if normal.size == 0 or not data.n_samples > data.n_parameters(poles.order):
+        return []
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    noise = here.rss / (data.n_samples - data.n_parameters(poles.order))
+    deviation = np.sqrt(noise * np.maximum(np.diag(inverse), 0.0)) / scale
+    # Unknowns of the polish: 1 - a of the real poles, then decay and angle per sample of each pair.
+    n_free = poles.real.size - n_real
+    still = 1.01e-3 / data.longest  # slower ones have come to the bound, which pole_warnings speaks of
+    seconds = data.longest * dt_s
+    sentences = []
+    for rate, spread in zip(1 - poles.real[n_real:], deviation[:n_free], strict=True):
+        if still < rate < 1 / (_SLOW * data.longest) and 1.96 * spread > np.log(_KNOWN_WITHIN) * rate:
             sentences.append(
-                f"the {name} decays with a time constant of {dt_s / rate:.3g} s, but the longest record has "
-                f"only {data.longest * dt_s:.3g} s: its rate is a guess; record {2 * dt_s / rate:.2g} s or "
-                "more, or give the pole as known (integrators, fixed_poles)"
+                f"a real pole decays with a time constant of about {dt_s / rate:.0f} s, give or take a factor "
+                f"of two at best, in {seconds:.3g} s of record: record longer, or give it as known "
+                "(integrators, fixed_poles)"
+            )
+    omegas = poles.omega_rad_s(dt_s)[n_pairs:]
+    rates = -np.log(np.abs(poles.pairs[n_pairs:]))
+    for omega, rate, spread in zip(omegas, rates, deviation[n_free::2], strict=True):
+        if rate > still and 1.96 * spread > np.log(_KNOWN_WITHIN) * rate:
+            sentences.append(
+                f"the damping of the pole pair at {omega:.4g} rad/s is known to a factor of two at best: "
+                f"record longer than {seconds:.3g} s, drive it harder, or fit one pair less if it is no mode "
+                "of the machine"
             )
     return sentences
 
@@ -145,7 +171,7 @@ def _drifting(records: Sequence[Record], residuals: Sequence[RealArray]) -> list
         worth = effective_samples(rest, np.array([0, residual.size]))
         if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chi2.isf(_DRIFT_LEVEL, 1):
             sentences.append(
-                f"{record.label}: output '{record.output_names[0]}' drifts by {2 * slope:+.3g} over the record "
+                f"{record.label}: output '{record.output_names[0]}' drifts by {2 * slope:+.3g} in all, "
                 f"without a cause in the input ({share:.0%} of what the model leaves): take the trend "
                 "off, or fit within a band above it"
             )
