@@ -11,6 +11,7 @@ import numpy as np
 from ident.arrays import RealArray, readonly_real
 from ident.model import GobfModel
 from ident.order_selection import OrderStep
+from ident.prior_tests import PriorTest
 from ident.search_trace import SearchTrace
 from ident.structure import Structure
 
@@ -38,7 +39,9 @@ class Identification:
     order_table : tuple of OrderStep
         Every structure that was tried, by order.
     verdicts : tuple of str
-        One sentence for each question that was left to the data.
+        One sentence for each question that was left to the data, and for each prior that they judged.
+    prior_tests : tuple of PriorTest
+        The same verdicts on priors with their numbers.
     search : SearchTrace
     """
 
@@ -53,6 +56,7 @@ class Identification:
     order_table: tuple[OrderStep, ...]
     verdicts: tuple[str, ...]
     search: SearchTrace
+    prior_tests: tuple[PriorTest, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
@@ -76,6 +80,7 @@ class Identification:
                     structure.feedthrough,
                     structure.estimate_offset,
                     structure.estimate_initial_state,
+                    structure.relative_degree,
                 ],
                 dtype=np.int64,
             ),
@@ -89,6 +94,16 @@ class Identification:
             ).reshape(-1, 2),
             "order_values": np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2),
             "verdicts": np.array(self.verdicts, dtype=np.str_),
+            "prior_texts": np.array([(t.prior, t.verdict) for t in self.prior_tests], dtype=np.str_).reshape(
+                -1, 2
+            ),
+            "prior_values": np.array(
+                [
+                    (t.refused, t.imposed, t.statistic, t.limit, t.degrees_of_freedom)
+                    for t in self.prior_tests
+                ],
+                dtype=np.float64,
+            ).reshape(-1, 5),
         }
         arrays |= {f"residual{i}": residual for i, residual in enumerate(self.residuals)}
         arrays |= {f"model_{key}": value for key, value in self.model.to_arrays().items()}
@@ -97,11 +112,15 @@ class Identification:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Identification:
-        integrators, delay, feedthrough, offset, initial_state = (int(item) for item in arrays["structure"])
+        integrators, delay, feedthrough, offset, initial_state, relative_degree = (
+            int(item) for item in arrays["structure"]
+        )
         names = tuple(str(item) for item in arrays["record_names"])
         return cls(
             model=GobfModel.from_arrays(_under("model_", arrays)),
-            structure=Structure(integrators, delay, bool(feedthrough), bool(offset), bool(initial_state)),
+            structure=Structure(
+                integrators, delay, bool(feedthrough), bool(offset), bool(initial_state), relative_degree
+            ),
             record_names=names,
             residuals=tuple(arrays[f"residual{i}"] for i in range(len(names))),
             fit_percent=arrays["fit_percent"],
@@ -116,6 +135,20 @@ class Identification:
             ),
             verdicts=tuple(str(item) for item in arrays["verdicts"]),
             search=SearchTrace.from_arrays(_under("search_", arrays)),
+            prior_tests=tuple(
+                PriorTest(
+                    str(prior),
+                    bool(refused),
+                    bool(imposed),
+                    float(value),
+                    float(bound),
+                    int(degrees),
+                    str(verdict),
+                )
+                for (prior, verdict), (refused, imposed, value, bound, degrees) in zip(
+                    arrays["prior_texts"], arrays["prior_values"], strict=True
+                )
+            ),
         )
 
 

@@ -18,9 +18,22 @@ from ident.pole_search import PoleSearch
 from ident.pole_warnings import pole_warnings
 from ident.poles import Poles
 from ident.polish import Bounds, Polished, free_optimality
+from ident.prior_tests import (
+    Fitted,
+    PriorTest,
+    best_under_relative_degree,
+    delay_test,
+    direct_term_test,
+    fixed_poles_test,
+    integrators_test,
+    not_imposed,
+    relative_degree_test,
+    too_few_poles,
+)
 from ident.record import Record
 from ident.regression import Regression, prepare, thinned
-from ident.search_trace import SearchTrace
+from ident.search_trace import PolishedMinimum, SearchTrace
+from ident.structured_fit import structured_fit, structured_optimality
 
 # A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
 _NUISANCE_LEVEL = 0.99
@@ -63,13 +76,16 @@ def identify(
     structure = options.structure()
     if in_mid_record:
         structure = replace(structure, estimate_initial_state=True)
-    outcome = _searched(prepare(part, structure), options, lambda f, message: report(0.45 * f, message))
+    outcome = _searched(prepare(part, structure), options, lambda f, message: report(0.4 * f, message))
     if options.estimate_initial_state == "auto" and not in_mid_record:
         outcome = _searched_with_initial_state(part, outcome, report)
-    report(0.95, "polish and tests on all samples")
-    fitted = _fitted_on_all(records, options, outcome)
+    report(0.85, "polish and tests on all samples")
+    data, best, verdicts = _fitted_on_all(records, options, outcome)
+    report(0.9, "tests of what is stated as known")
+    data, best, tests = _priors_judged(records, part, outcome, data, best)
+    result = _result(records, data, best, outcome, verdicts, tests)
     report(1.0, "identified")
-    return fitted
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +162,12 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
         end = search.descend(without.poles, "with initial state")
     if end.poles.order == 0 or not _nuisance_test("initial state", (data, without), (free, end)).needed:
         return outcome
-    return _searched(free, options, lambda fraction, message: report(0.5 + 0.45 * fraction, message))
+    return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message))
 
 
-def _fitted_on_all(records: Sequence[Record], options: IdentOptions, outcome: _Outcome) -> Identification:
+def _fitted_on_all(
+    records: Sequence[Record], options: IdentOptions, outcome: _Outcome
+) -> tuple[Regression, Polished, tuple[str, ...]]:
     """Polish on all samples and decide what was left to the data: initial state first, then the offset."""
     structure, search, best = outcome.data.structure, outcome.search, outcome.best
     if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
@@ -176,8 +194,58 @@ def _fitted_on_all(records: Sequence[Record], options: IdentOptions, outcome: _O
         test = _nuisance_test(name, without, with_it)
         verdicts.append(test.verdict())
         data, best = with_it if test.needed else without
-    best = replace(best, poles=_in_order(best.poles, search.fixed))
-    return _result(records, data, best, outcome, tuple(verdicts))
+    return data, best, tuple(verdicts)
+
+
+def _priors_judged(
+    records: Sequence[Record], part: Sequence[Record], outcome: _Outcome, data: Regression, best: Polished
+) -> tuple[Regression, Polished, tuple[PriorTest, ...]]:
+    """Test what the options state as known, and impose the relative degree.
+
+    Each test starts from a model that the data have not refused yet: where the integrators are refused, the
+    relative degree is judged with slow poles in their place.
+    """
+    options = outcome.search.options
+    search = PoleSearch(data, options)
+    search.minima = list(outcome.search.minima)
+    given = judged = Fitted(data, best, search)
+    tests: list[PriorTest] = []
+    if best.poles.order == 0:
+        return data, best, ()
+    if options.integrators:
+        test, free = integrators_test(records, (part, outcome.data.structure), given)
+        tests.append(test)
+        outcome.search.evaluations += free.search.evaluations
+        if test.refused:
+            judged = free
+    if options.fixed_poles:
+        tests.append(fixed_poles_test(given))
+    if "input_delay_samples" in options.model_fields_set:
+        tests.append(delay_test(records, given))
+    asked = options.relative_degree
+    if asked is None:
+        return data, best, tuple(tests)
+    relative_degree, end = 1, best
+    if asked in (1, "auto"):
+        tests.append(direct_term_test(records, judged))
+    trials = (2, 3) if asked == "auto" else (asked,) if asked > 1 else ()
+    for trial in trials:
+        if trial > min(best.poles.order, judged.end.poles.order):
+            if asked != "auto":
+                tests.append(too_few_poles(trial, best.poles.order))
+            break
+        test, constrained = relative_degree_test(judged, trial)
+        if asked == "auto" and test.refused:
+            tests.append(not_imposed(test))
+            break
+        tests.append(test)
+        relative_degree = trial
+        end = constrained if judged is given else best_under_relative_degree(given, trial)
+    if relative_degree > 1:
+        data = replace(data, structure=replace(data.structure, relative_degree=relative_degree))
+        best = end
+        outcome.search.minima.append(PolishedMinimum("relative degree", best.poles, best.rss))
+    return data, best, tuple(tests)
 
 
 def _in_order(poles: Poles, fixed: Poles) -> Poles:
@@ -204,11 +272,20 @@ def _silent(fraction: float, message: str) -> None:
 
 
 def _result(
-    records: Sequence[Record], data: Regression, best: Polished, outcome: _Outcome, verdicts: tuple[str, ...]
+    records: Sequence[Record],
+    data: Regression,
+    best: Polished,
+    outcome: _Outcome,
+    verdicts: tuple[str, ...],
+    tests: tuple[PriorTest, ...],
 ) -> Identification:
     search = outcome.search
     options = search.options
-    linear = fit(data, best.poles)
+    best = replace(best, poles=_in_order(best.poles, search.fixed))
+    relative_degree = data.structure.relative_degree
+    linear = (
+        structured_fit(data, best.poles, relative_degree) if relative_degree > 1 else fit(data, best.poles)
+    )
     model = GobfModel(
         poles=best.poles,
         coefficients=linear.coefficients,
@@ -229,7 +306,26 @@ def _result(
     warnings = [
         *advice(records, data, model, residuals, fixed),
         *pole_warnings(best.poles, fixed, bounds, data.dt_s),
+        *(
+            test.verdict
+            for test in tests
+            if test.refused and (test.imposed or options.relative_degree != "auto")
+        ),
     ]
+    if relative_degree > 1:
+        optimality = structured_optimality(
+            data,
+            best.poles,
+            relative_degree,
+            bounds,
+            n_fixed_real=fixed.real.size,
+            n_fixed_pairs=fixed.pairs.size,
+        )
+    else:
+        optimality = free_optimality(
+            linearisation(data, best.poles), best.poles, bounds, fixed.real.size, fixed.pairs.size
+        )
+    unknowns = data.n_parameters(best.poles.order) - (relative_degree - 1)
     return Identification(
         model=model,
         structure=data.structure,
@@ -239,13 +335,12 @@ def _result(
             [100 * (1 - np.linalg.norm(r) / size) for r, size in zip(residuals, spread, strict=True)]
         ),
         rss=linear.rss,
-        noise_std=float(np.sqrt(linear.rss / (data.n_samples - data.n_parameters(best.poles.order)))),
-        tangent_optimality=free_optimality(
-            linearisation(data, best.poles), best.poles, bounds, fixed.real.size, fixed.pairs.size
-        ),
+        noise_std=float(np.sqrt(linear.rss / (data.n_samples - unknowns))),
+        tangent_optimality=optimality,
         order_table=outcome.selection.table(outcome.best),
-        verdicts=verdicts,
+        verdicts=(*verdicts, *(test.verdict for test in tests)),
         search=SearchTrace(
             tuple(search.stages), tuple(search.minima), tuple(dict.fromkeys(warnings)), search.evaluations
         ),
+        prior_tests=tests,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -27,8 +27,10 @@ Algorithm = Literal[
 class IdentOptions(BaseModel):
     """What to fit and how to search for the poles (design 4.3).
 
-    Numbers of poles left at None are chosen from the data, step by step. The box of the search comes from the
-    data alone (record length and sampling time) where no bound is given; a given bound also binds the polish.
+    What is stated as known (integrators, fixed_poles, input_delay_samples, relative_degree) is tested against
+    the data (`ident.prior_tests`): if they refuse it, it is kept and a warning says so. Numbers of poles left
+    at None are chosen from the data, step by step. The box of the search comes from the data alone (record
+    length and sampling time) where no bound is given; a given bound also binds the polish.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -54,6 +56,11 @@ class IdentOptions(BaseModel):
         False, description="direct term from the input to the output of the same sample"
     )
     input_delay_samples: int = Field(0, ge=0, description="known whole delay of the input")
+    relative_degree: Annotated[int, Field(ge=1, le=6)] | Literal["auto"] | None = Field(
+        None,
+        description="known relative degree of the continuous-time plant behind a zero-order hold (torque to "
+        "angle: 2), tested and kept; auto: the largest of 1 to 3 that the data do not refuse",
+    )
     estimate_offset: bool | Literal["auto"] = Field(
         "auto", description="unknown constant on the output of each record; auto: kept if the data ask for it"
     )
@@ -99,7 +106,27 @@ class IdentOptions(BaseModel):
             if self.coordinates == "raw" and not (lowest is None and highest is None):
                 raise ValueError(f"{low} and {high} need coordinates = 'log'")
         self.fixed()
+        self._refuse_impossible_relative_degree()
         return self
+
+    def _refuse_impossible_relative_degree(self) -> None:
+        if self.relative_degree is None:
+            return
+        if self.feedthrough:
+            raise ValueError("relative_degree of 1 or more excludes a direct term; set feedthrough = false")
+        for re, im in self.fixed_poles:
+            if im == 0 and not re > 0:
+                raise ValueError(
+                    "relative_degree needs poles with a continuous-time counterpart; fixed_poles has "
+                    f"[{re:.6g}, 0], expected a positive real part"
+                )
+        if isinstance(self.relative_degree, int) and None not in (self.n_real, self.n_pairs):
+            order = self.fixed().order + (self.n_real or 0) + 2 * (self.n_pairs or 0)
+            if order < self.relative_degree:
+                raise ValueError(
+                    f"relative_degree = {self.relative_degree} needs at least that many poles, integrators "
+                    f"counted; got {order}"
+                )
 
     def fixed(self) -> Poles:
         """The fixed poles; ValueError if one is not inside the unit circle.

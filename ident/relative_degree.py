@@ -140,7 +140,8 @@ def _append(
 def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
     """Unitary (2, 2) U with U^* block U lower triangular; block is [[., .], [b, c]] with b != 0."""
     x, y = pole.conjugate() - block[1, 1], block[1, 0]
-    return np.array([[y, x], [-np.conj(x), y]], dtype=np.complex128) / np.hypot(abs(x), y)
+    vectors = np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y)
+    return np.asarray(vectors, dtype=np.complex128)
 
 
 @numba.njit(cache=True)

@@ -16,7 +16,9 @@ class Structure:
 
     The nuisance columns belong to each record by itself: a constant (`estimate_offset`), and with
     `estimate_initial_state` the free responses of all poles together with the polynomials that the
-    integrators leave free (1, k, ... up to k^(integrators - 1)).
+    integrators leave free (1, k, ... up to k^(integrators - 1)). `relative_degree` is that of the
+    continuous-time plant behind the hold: 1 asks for nothing beyond the absence of a direct term, more are
+    linear conditions on the coefficients (`ident.relative_degree`).
     """
 
     integrators: int = 0
@@ -24,12 +26,18 @@ class Structure:
     feedthrough: bool = False
     estimate_offset: bool = False
     estimate_initial_state: bool = False
+    relative_degree: int = 1
 
     def __post_init__(self) -> None:
         if not (self.integrators >= 0 and self.input_delay_samples >= 0):
             raise ValueError(
                 "integrators and input_delay_samples must not be negative; "
                 f"got {self.integrators} and {self.input_delay_samples}"
+            )
+        if not self.relative_degree >= 1 or (self.feedthrough and self.relative_degree > 1):
+            raise ValueError(
+                "relative_degree must be at least 1, and 1 with a direct term; got "
+                f"{self.relative_degree} and feedthrough = {self.feedthrough}"
             )
 
     @property

@@ -267,7 +267,7 @@ def structured_optimality(
     n_fixed_real: int = 0,
     n_fixed_pairs: int = 0,
 ) -> float:
-    """|P r|/|r| over the tangent directions of the constrained models that no bound holds: 0 at an optimum."""
+    """|P r|/|r| over the tangent directions of the constrained models that no bound holds; 0: an optimum."""
     unknowns = _Unknowns(poles, bounds, n_fixed_real, n_fixed_pairs)
     x = unknowns.start()
     if x.size == 0:

@@ -1,0 +1,379 @@
+"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree (design 4.3).
+
+Each is a generalised likelihood ratio Ne ln(J with the prior / J without) against a chi-square quantile, Ne
+being the number of independent samples the residual is worth (`effective_samples`). A pole at z = 1 lies on
+the edge of the stable ones, where the chi-square quantile is on the safe side: a true prior is refused less
+often than in 1 % of all records.
+
+A refused prior is kept all the same: who gives it may know the machine better than one record does, and a
+model whose structure was changed in silence is the worse surprise. The verdict says so and what to do. What
+was left to the data (`relative_degree = "auto"`) is imposed only as far as the data agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from ident.arrays import RealArray
+from ident.least_squares import fit
+from ident.order_selection import OrderSelection, effective_samples
+from ident.pole_search import PoleSearch
+from ident.poles import Poles
+from ident.polish import Polished
+from ident.record import Record
+from ident.regression import Regression, prepare
+from ident.structure import Structure
+from ident.structured_fit import structured_polish
+
+TEST_LEVEL = 0.99
+# Slow poles that freed integrators start from, as decays over the whole record.
+_SLOW_STARTS = {
+    1: ((0.1,), (1.0,), (5.0,), (20.0,)),
+    2: ((0.1, 1.0), (0.3, 5.0), (1.0, 20.0), (10.0, 30.0)),
+    3: ((0.1, 0.5, 2.0), (0.3, 2.0, 10.0), (2.0, 10.0, 30.0)),
+}
+# Two freed integrators may also have become a slow oscillation: turns over the whole record.
+_SLOW_TURNS = (0.3, 1.0, 3.0)
+# Descents that only compare starts stop when this fraction of J is left to gain.
+_ROUGH = 1e-4
+
+
+@dataclass(frozen=True)
+class PriorTest:
+    """Verdict of the data on one prior.
+
+    statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
+    above it the prior is refused; a cancelled integrator is refused the other way round (`integrators_test`,
+    the verdict says so). imposed says whether the model keeps to the prior; verdict is one sentence, with
+    advice where it is refused.
+    """
+
+    prior: str
+    refused: bool
+    imposed: bool
+    statistic: float
+    limit: float
+    degrees_of_freedom: int
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        return {
+            "prior": self.prior,
+            "refused": self.refused,
+            "imposed": self.imposed,
+            "statistic": self.statistic,
+            "limit": self.limit,
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "verdict": self.verdict,
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> PriorTest:
+        """Inverse of `to_dict`."""
+        return cls(**document)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An optimum on all samples, and the search (options, bounds, trace) it belongs to."""
+
+    data: Regression
+    end: Polished
+    search: PoleSearch
+
+    @property
+    def residual(self) -> RealArray:
+        return fit(self.data, self.end.poles).residual
+
+    def worth(self) -> float:
+        """Independent samples that the residual is worth."""
+        return effective_samples(self.residual, self.data.starts)
+
+
+def statistic(rss_with_prior: float, without: Fitted) -> float:
+    """Ne ln(J with the prior / J without); not below 0, where only descents that ended early can bring it."""
+    ratio = max(rss_with_prior, 1e-300) / max(without.end.rss, 1e-300)
+    # Residuals at rounding level (noise-free data) decide nothing.
+    if rss_with_prior <= 1e-18 * float(without.data.y @ without.data.y):
+        return 0.0
+    return max(0.0, float(without.worth() * np.log(ratio)))
+
+
+def limit(degrees_of_freedom: int) -> float:
+    return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
+
+
+def _judged(prior: str, value: float, degrees_of_freedom: int, without: str, advice: str) -> PriorTest:
+    """`without`: what the data were offered instead; `advice`: what to do if they take it."""
+    bound = limit(degrees_of_freedom)
+    numbers = _numbers(value, bound)
+    if value > bound:
+        verdict = (
+            f"{prior} refused by the data: {without} fits better than chance allows ({numbers}); kept as "
+            f"asked, but {advice}"
+        )
+    else:
+        verdict = f"{prior} accepted: {without} fits no better than chance would ({numbers})"
+    return PriorTest(prior, value > bound, True, value, bound, degrees_of_freedom, verdict)
+
+
+def _numbers(value: float, bound: float) -> str:
+    return f"test statistic {value:.1f} against {bound:.1f} at {TEST_LEVEL:.0%}"
+
+
+def integrators_test(
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+) -> tuple[PriorTest, Fitted]:
+    """Integrators against as many free slow poles, order and numerator the same; also the fit with them free.
+
+    `searched` are the records that are searched (see `ident.regression.thinned`) and what is estimated on
+    them. The alternative is searched anew, too: wrong integrators lose a mode, and no descent from there
+    finds it again. An integrator that a zero of the model cancels is refused as well: with enough other poles
+    no freed pole can improve on it, but the model with one integrator and one zero less is as good. It has
+    to gain what the choice of the order asks of any pole, 2 ln Ne.
+    """
+    k = given.data.structure.integrators
+    free = _without_integrators(records, searched, given)
+    advice = "a wrong one spoils all that is slow and can lose a mode: set "
+    for fewer in range(k - 1, -1, -1):
+        if fewer == 0 or _fewer_integrators_value(records, free, fewer) <= limit(fewer):
+            advice += f"integrators = {fewer}" + (", which the data accept" if fewer else "")
+            break
+    value = statistic(given.end.rss, free)
+    name = f"integrators = {k}"
+    test = _judged(name, value, k, "a slow pole in place of each", advice)
+    if not test.refused:
+        needless, price = _one_integrator_less_value(records, given), 2 * float(np.log(given.worth()))
+        if needless <= price:
+            verdict = (
+                f"{name} not supported by the data: one integrator and one zero less fit as well (test "
+                f"statistic {needless:.1f} against {price:.1f}, the price of a pole), so a zero of the model "
+                f"cancels it; kept as asked, but set integrators = {k - 1}"
+            )
+            test = PriorTest(name, True, True, needless, price, 1, verdict)
+    return test, free
+
+
+def _without_integrators(
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+) -> Fitted:
+    k, fixed = given.data.structure.integrators, given.search.fixed
+    plain = given.end.poles
+    others = Poles(plain.real[k:], plain.pairs)
+    n_real = plain.real.size - fixed.real.size + k
+    n_pairs = plain.pairs.size - fixed.pairs.size
+    options = given.search.options.model_copy(
+        update={"integrators": 0, "n_real": n_real, "n_pairs": n_pairs, "decay_min_per_s": None}
+    )
+
+    def prepared(chosen: Sequence[Record], structure: Structure) -> Regression:
+        # The polynomials that integrators leave free belong to both sides of the comparison.
+        polynomials = prepare(chosen, structure).polynomials
+        return replace(prepare(chosen, replace(structure, integrators=0)), polynomials=polynomials)
+
+    data = prepared(records, given.data.structure)
+    search = PoleSearch(data, options)
+    starts = [
+        others.appended(Poles(1 - np.array(decays) / data.longest)) for decays in _SLOW_STARTS.get(k, ())
+    ]
+    if k >= 2:
+        rest = 1 - np.array([0.3] * (k - 2)) / data.longest
+        for turns in _SLOW_TURNS:
+            pair = np.exp(2 * np.pi * turns / data.longest * np.array([-0.3 + 1j]))
+            starts.append(others.appended(Poles(rest, pair)))
+    ends = [search.descend(start, "integrators freed", _ROUGH) for start in starts]
+    found = OrderSelection(PoleSearch(prepared(*searched), options), _silent).run()
+    ends.append(search.descend(found.poles, "integrators freed", _ROUGH))
+    best = min(ends, key=lambda end: end.rss)
+    return Fitted(data, search.descend(best.poles, "integrators freed"), search)
+
+
+def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
+    """Statistic of `fewer` integrators against none: the slowest real poles of the free fit become theirs."""
+    n_fixed = free.search.fixed.real.size
+    own = np.sort(free.end.poles.real[n_fixed:])
+    if own.size < fewer:
+        return np.inf
+    structure = replace(free.data.structure, integrators=fewer)
+    options = free.search.options.model_copy(update={"integrators": fewer})
+    data = replace(prepare(records, structure), polynomials=free.data.polynomials)
+    start = Poles(
+        np.concatenate([np.zeros(fewer), free.end.poles.real[:n_fixed], own[: own.size - fewer]]),
+        free.end.poles.pairs,
+    )
+    end = PoleSearch(data, options).descend(start, "fewer integrators")
+    return statistic(end.rss, free)
+
+
+def _one_integrator_less_value(records: Sequence[Record], given: Fitted) -> float:
+    """Statistic of the model with one integrator less and the same other poles against the given one."""
+    k = given.data.structure.integrators
+    structure = replace(given.data.structure, integrators=k - 1)
+    data = replace(prepare(records, structure), polynomials=given.data.polynomials)
+    search = PoleSearch(data, given.search.options.model_copy(update={"integrators": k - 1}))
+    poles = given.end.poles
+    if poles.order == 1:
+        return np.inf
+    less = search.descend(Poles(poles.real[1:], poles.pairs), "one integrator less")
+    return statistic(less.rss, given)
+
+
+def fixed_poles_test(given: Fitted) -> PriorTest:
+    """Poles fixed by the user against the same poles left free, from where they are."""
+    options = given.search.options
+    search = PoleSearch(given.data, options.model_copy(update={"fixed_poles": ()}))
+    freed = Fitted(given.data, search.descend(given.end.poles, "fixed poles freed"), search)
+    k = options.integrators
+    n_real, n_pairs = given.search.fixed.real.size - k, given.search.fixed.pairs.size
+    real, pairs = freed.end.poles.real[k : k + n_real], freed.end.poles.pairs[:n_pairs]
+    where = ", ".join([f"[{a:.6g}, 0]" for a in real] + [f"[{p.real:.6g}, {p.imag:.6g}]" for p in pairs])
+    return _judged(
+        "fixed_poles",
+        statistic(given.end.rss, freed),
+        n_real + 2 * n_pairs,
+        f"leaving them free (they move to {where})",
+        "leave them to the search, or check sampling time and units",
+    )
+
+
+def delay_test(records: Sequence[Record], given: Fitted) -> PriorTest:
+    """The input delay against one sample less and one more, on the rows that all three explain.
+
+    The models are not nested; under a true delay the statistic is mostly negative (shown as 0), so one
+    degree of freedom is on the safe side.
+    """
+    structure = given.data.structure
+    delay = structure.input_delay_samples
+    best, chosen = 0.0, delay + 1
+    for other in (delay - 1, delay + 1):
+        if other < 0:
+            continue
+        data = prepare(records, replace(structure, input_delay_samples=other))
+        search = PoleSearch(data, given.search.options.model_copy(update={"input_delay_samples": other}))
+        shifted = Fitted(data, search.descend(given.end.poles, "other delay"), search)
+        common = max(delay, other)
+        ours, theirs = (_rows_from(item, common - d) for item, d in ((given, delay), (shifted, other)))
+        value = shifted.worth() * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
+        if ours <= 1e-18 * float(given.data.y @ given.data.y):
+            value = 0.0
+        if value > best:
+            best, chosen = value, other
+    plural = "s" if chosen != 1 else ""
+    return _judged(
+        f"input_delay_samples = {delay}",
+        best,
+        1,
+        f"a delay of {chosen} sample{plural}",
+        f"set input_delay_samples = {chosen}, and look for the sample of delay in the time stamps",
+    )
+
+
+def _rows_from(fitted: Fitted, skip: int) -> float:
+    residual = fitted.residual
+    parts = [residual[fitted.data.segment(i)][skip:] for i in range(fitted.data.n_records)]
+    return float(sum(part @ part for part in parts))
+
+
+def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
+    """Relative degree 1 (no direct term) against a model with one."""
+    data = prepare(records, replace(given.data.structure, feedthrough=True))
+    data = replace(data, polynomials=given.data.polynomials)
+    search = PoleSearch(data, given.search.options.model_copy(update={"feedthrough": True}))
+    free = Fitted(data, search.descend(given.end.poles, "direct term"), search)
+    return _judged(
+        "relative_degree = 1",
+        statistic(given.end.rss, free),
+        1,
+        "a model with a direct term",
+        "set feedthrough = true and leave out relative_degree, or check whether the input runs late",
+    )
+
+
+def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Polished]:
+    """Relative degree r >= 2 against 1, and the best fit under it.
+
+    `free` is the optimum without the conditions. The descent under them starts there and, because a wrong
+    start can lose a mode, from further optima of the search with as many poles.
+    """
+    constrained = best_under_relative_degree(free, relative_degree)
+    # Nested models: the free fit is at least as good as one that starts from the constrained optimum.
+    again = free.search.descend(constrained.poles, "relative degree released")
+    if again.rss < free.end.rss:
+        free = replace(free, end=again)
+    test = _judged(
+        f"relative_degree = {relative_degree}",
+        statistic(constrained.rss, free),
+        relative_degree - 1,
+        "a numerator without that limit",
+        f"set relative_degree = {relative_degree - 1} or leave it out (an input that is not held constant "
+        "between samples, or a filter in the sensor, blurs it)",
+    )
+    return test, constrained
+
+
+def not_imposed(test: PriorTest) -> PriorTest:
+    """The same refusal for a prior that nobody stated: it was only tried."""
+    verdict = test.verdict.split("; kept as asked")[0] + "; not imposed"
+    return replace(test, imposed=False, verdict=verdict)
+
+
+def too_few_poles(relative_degree: int, order: int) -> PriorTest:
+    """A relative degree above the number of poles that the data showed."""
+    prior = f"relative_degree = {relative_degree}"
+    verdict = (
+        f"{prior} not imposed: the model has only {order} poles, integrators counted; state n_real and "
+        "n_pairs, or record more"
+    )
+    return PriorTest(prior, True, False, 0.0, limit(relative_degree - 1), relative_degree - 1, verdict)
+
+
+def best_under_relative_degree(free: Fitted, relative_degree: int) -> Polished:
+    """Best descent under the relative degree from the free optimum and the next two other ones."""
+    search, poles = free.search, free.end.poles
+    starts = [poles]
+    for minimum in sorted(search.minima, key=lambda item: item.rss):
+        other = minimum.poles
+        if (other.real.size, other.pairs.size) != (poles.real.size, poles.pairs.size):
+            continue
+        if all(_distance(other, start) > 0.15 for start in starts):
+            starts.append(other)
+        if len(starts) == 3:
+            break
+    fixed = search.fixed
+
+    def descended(start: Poles, tolerance: float) -> Polished:
+        return structured_polish(
+            free.data,
+            start,
+            relative_degree,
+            search.bounds,
+            n_fixed_real=fixed.real.size,
+            n_fixed_pairs=fixed.pairs.size,
+            tolerance=tolerance,
+        )
+
+    rough = min((descended(start, _ROUGH) for start in starts), key=lambda end: end.rss)
+    return descended(rough.poles, 1e-9)
+
+
+def _distance(one: Poles, other: Poles) -> float:
+    """Largest change of a pole in natural logarithm of decay, or of frequency and decay of a pair."""
+    real = np.abs(np.log(np.sort(1 - one.real) / np.sort(1 - other.real)))
+    first, second = np.sort_complex(np.log(one.pairs)), np.sort_complex(np.log(other.pairs))
+    return float(
+        max(
+            np.max(real, initial=0.0),
+            np.max(np.abs(np.log(first.real / second.real)), initial=0.0),
+            np.max(np.abs(np.log(first.imag / second.imag)), initial=0.0),
+        )
+    )
+
+
+def _silent(fraction: float, message: str) -> None:
+    """Default progress: nobody listens."""
