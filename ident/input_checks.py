@@ -112,7 +112,7 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     for rate, spread in zip(1 - poles.real[n_real:], deviation[:n_free], strict=True):
         if still < rate < 1 / (_SLOW * data.longest) and 1.96 * spread > np.log(_KNOWN_WITHIN) * rate:
             sentences.append(
-                f"a real pole decays with a time constant of about {dt_s / rate:.0f} s, give or take a factor "
+                f"a real pole decays with a time constant of {dt_s / rate:.0f} s, give or take a factor "
                 f"of two at best, in {seconds:.3g} s of record: record longer, or give it as known "
                 "(integrators, fixed_poles)"
             )
