@@ -7,13 +7,14 @@ benchmark plants and the examples are quiet (`tests/ident/test_input_checks.py`)
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy.signal
 from scipy.stats import chi2
 
 from ident.arrays import RealArray
-from ident.least_squares import linearisation
+from ident.least_squares import fit, linearisation
 from ident.model import GobfModel
 from ident.order_selection import effective_samples
 from ident.poles import Poles
@@ -35,6 +36,8 @@ _SLOW = 0.5
 # A straight line has to be this much of a residual's power, and this improbable, to be called a drift.
 _DRIFT_SHARE = 0.2
 _DRIFT_LEVEL = 1e-5
+# A line serves as well as a slow pole if it leaves at most this much more.
+_AS_WELL = 1.05
 # Deviations from an operating point this many times larger are lost beside it.
 _LARGE_OFFSET = 10.0
 
@@ -76,7 +79,7 @@ def advice(
         *_too_short(data, model, fixed),
         *_weak_input(records, data, model, residuals),
         *_clipped(records),
-        *_drifting(records, residuals),
+        *_drifting(records, data, model, residuals, fixed),
         *_far_from_zero(records, data),
     ]
 
@@ -156,7 +159,25 @@ def _clipped(records: Sequence[Record]) -> list[str]:
     return sentences
 
 
-def _drifting(records: Sequence[Record], residuals: Sequence[RealArray]) -> list[str]:
+def _drifting(
+    records: Sequence[Record],
+    data: Regression,
+    model: GobfModel,
+    residuals: Sequence[RealArray],
+    fixed: Poles,
+) -> list[str]:
+    # A machine that integrates also integrates friction and offsets of its drive: its output walks away
+    # without any fault of the record.
+    if model.integrators:
+        return []
+    slow = np.flatnonzero(1 - model.poles.real < 1 / (_SLOW * data.longest))
+    if slow.size:
+        return [
+            f"a real pole with a time constant of {data.dt_s / (1 - model.poles.real[i]):.3g} s describes a "
+            f"drift of '{model.output_name}', a straight line does it as well: take the trend off the output"
+            for i in slow[slow >= fixed.real.size]
+            if _is_a_line(data, model.poles, int(i))
+        ]
     sentences = []
     for record, residual in zip(records, residuals, strict=True):
         if residual.size < 50:
@@ -176,6 +197,19 @@ def _drifting(records: Sequence[Record], residuals: Sequence[RealArray]) -> list
                 "off, or fit within a band above it"
             )
     return sentences
+
+
+def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
+    """Whether a straight line on each record serves as well as the slow real pole `index`."""
+    degree = data.polynomials.shape[0]
+    lines = [
+        np.polynomial.legendre.legvander(np.linspace(-1, 1, n), max(degree, 1)) for n in np.diff(data.starts)
+    ]
+    with_lines = replace(data, polynomials=np.ascontiguousarray(np.concatenate(lines).T))
+    without = Poles(np.delete(poles.real, index), poles.pairs)
+    if not data.n_samples > with_lines.n_parameters(without.order):
+        return False
+    return fit(with_lines, without).rss <= _AS_WELL * fit(data, poles).rss
 
 
 def _far_from_zero(records: Sequence[Record], data: Regression) -> list[str]:

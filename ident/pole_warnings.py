@@ -24,7 +24,7 @@ def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> li
             sentences.append(
                 f"a real pole went to the slow bound (a = {a:.9g}): it is an integrator as far as the "
                 "record can "
-                "tell; try integrators = 1 more and compare"
+                "tell; try integrators = 1 more and compare, or take the trend off an output that only drifts"
             )
         elif 1 - a >= bounds.distance_max / close:
             sentences.append(

@@ -1,0 +1,219 @@
+"""Each warning on a record made to deserve it, saying what to do; none on records that deserve none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from ident import IdentOptions, identify
+from ident.input_checks import clipped_share, excitation_limit_rad_s
+from ident.record import Record
+from tests.ident.benchmark_plants import DT_S, as_record, p1, p2
+from tests.ident.three_mode_arm import random_arm
+
+NYQUIST = np.pi / DT_S
+
+
+def warnings_of(record, **options):
+    return identify([record], IdentOptions(**options)).warnings
+
+
+def only(warnings, words):
+    (sentence,) = [warning for warning in warnings if words in warning]
+    assert "\n" not in sentence
+    assert ":" in sentence or ";" in sentence  # what was seen, and what to do
+    return sentence
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clean_records_are_quiet(seed):
+    assert warnings_of(p2(seed).record) == ()
+    assert warnings_of(p2(seed, 1000, 30).record) == ()
+    assert warnings_of(p1(seed).record, integrators=2) == ()
+    assert warnings_of(random_arm(np.random.default_rng(seed)).record) == ()
+
+
+def filtered(u, noise_std=0.01, seed=0):
+    """A mode at 30 rad/s, damping 0.05, and a fast pole."""
+    w, zeta = 30.0, 0.05
+    mode = [1, -2 * np.exp(-zeta * w * DT_S) * np.cos(w * np.sqrt(1 - zeta**2) * DT_S)]
+    denominator = np.polymul([*mode, np.exp(-2 * zeta * w * DT_S)], [1, -0.6])
+    y = scipy.signal.lfilter([0, 0.02, 0.01], denominator, u)
+    return y + noise_std * y.std() * np.random.default_rng(seed).normal(size=u.size)
+
+
+def binary(n=4000, hold=2, seed=1):
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.choice([-1.0, 1.0], n // hold + 1), hold)[:n]
+
+
+# Weak input
+
+
+def test_an_input_of_low_frequencies_is_named_with_its_limit():
+    low_pass = scipy.signal.butter(6, 60.0 / NYQUIST, output="sos")
+    u = scipy.signal.sosfilt(low_pass, np.random.default_rng(0).normal(size=6000))
+    sentence = only(warnings_of(as_record(u, filtered(u)), n_real=1, n_pairs=1), "not exciting above")
+    limit = float(sentence.split("above ")[1].split(" rad/s")[0])
+    assert 50 < limit < 150
+    assert "use an input with power up to" in sentence
+
+
+def test_noise_on_the_measured_input_does_not_hide_that():
+    rng = np.random.default_rng(0)
+    low_pass = scipy.signal.butter(6, 60.0 / NYQUIST, output="sos")
+    u = scipy.signal.sosfilt(low_pass, rng.normal(size=6000))
+    measured = u + 0.01 * u.std() * rng.normal(size=u.size)  # 1 %: -40 dB of power, spread up to Nyquist
+    only(warnings_of(as_record(measured, filtered(u)), n_real=1, n_pairs=1), "not exciting above")
+
+
+def test_a_weak_input_that_stands_above_a_small_noise_is_enough():
+    """The same roll-off is no fault where the sensor is good enough."""
+    u = scipy.signal.lfilter([0.01], [1, -1.8, 0.81], np.random.default_rng(0).normal(size=6000))
+    y = filtered(u, noise_std=0.0)
+    u_limits = []
+    for noise_std in (1e-6, 0.3):
+        record = as_record(u, y + noise_std * y.std() * np.random.default_rng(1).normal(size=u.size))
+        found = identify([record], IdentOptions(n_real=1, n_pairs=1))
+        u_limits.append(excitation_limit_rad_s([record], found.model, found.residuals))
+    assert u_limits[0] > 0.9 * NYQUIST
+    assert u_limits[1] < 0.6 * NYQUIST
+
+
+def test_the_plants_own_roll_off_is_not_blamed_on_the_input():
+    u = np.random.default_rng(0).normal(size=4000)
+    y = scipy.signal.lfilter([0, 1e-4], np.polymul([1, -0.99], [1, -0.98]), u)
+    record = as_record(u, y + 0.1 * y.std() * np.random.default_rng(1).normal(size=u.size))
+    assert not any("exciting" in warning for warning in warnings_of(record, n_real=2, n_pairs=0))
+
+
+# Saturation
+
+
+def saturated(signal, share=0.9):
+    limit = np.quantile(np.abs(signal), share)
+    return np.clip(signal, -limit, limit)
+
+
+def test_clipped_output_and_saturated_input_are_named():
+    u = np.repeat(np.random.default_rng(0).normal(size=1000), 4)
+    y = filtered(u)
+    sentence = only(warnings_of(as_record(u, saturated(y)), n_real=1, n_pairs=1), "clipped")
+    assert "output 'y'" in sentence
+    assert "lower the amplitude, or cut" in sentence
+    sentence = only(warnings_of(as_record(saturated(u), y), n_real=1, n_pairs=1), "clipped")
+    assert "input 'u'" in sentence
+
+
+def test_a_full_scale_converter_is_clipping():
+    y = filtered(binary())
+    counts = np.clip(np.round(600 * y / y.std() + 512), 0, 1023)  # ten bits
+    assert clipped_share(counts) > 0.05
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        binary(),
+        binary() + 1e-3 * np.random.default_rng(0).normal(size=4000),  # measured
+        np.round(500 * (binary() + 2e-3 * np.random.default_rng(0).normal(size=4000))),  # in counts
+        scipy.signal.lfilter([0.5], [1, -0.5], binary(hold=40)).round(6),  # through an amplifier
+        np.round(50 * np.sin(0.01 * np.arange(5000))),  # slow sine in encoder steps
+        np.round(20 * scipy.signal.chirp(np.linspace(0, 20, 5000), 0.1, 20, 8.0)),
+        np.concatenate([np.zeros(900), np.round(100 * (1 - np.cos(np.linspace(0, 6, 2000)))), np.zeros(900)]),
+        np.random.default_rng(0).integers(-3, 4, 4000).astype(float),  # seven levels by design
+    ],
+    ids=["binary", "measured", "counts", "amplifier", "sine", "chirp", "rest", "levels"],
+)
+def test_what_is_no_clipping(signal):
+    assert clipped_share(signal) == 0
+
+
+def test_a_machine_that_sticks_where_it_turns_is_not_clipped():
+    angle = np.concatenate([np.linspace(0, 100, 1500), np.full(60, 100.0), np.linspace(100, -90, 2500)])
+    assert clipped_share(np.round(angle)) == 0
+
+
+# Short records
+
+
+def test_a_slow_pole_and_a_short_record():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=1000)
+    y = scipy.signal.lfilter([0, 1.0], [1, -0.9999], u)  # 50 s in 5 s of record
+    y += 0.3 * y.std() * rng.normal(size=u.size)
+    found = identify([as_record(u, y)], IdentOptions(n_real=1, n_pairs=0))
+    sentence = only(found.warnings, "real pole")
+    assert "integrator" in sentence
+
+
+def test_a_slow_pole_that_the_noise_leaves_alone_is_no_doubt():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=1000)
+    y = scipy.signal.lfilter([0, 1.0], [1, -0.9995], u) + 1e-4 * rng.normal(size=u.size)
+    assert warnings_of(as_record(u, y), n_real=1, n_pairs=0) == ()
+
+
+def test_a_damping_nobody_can_tell_is_named():
+    """One pair more than the machine has: it sits on the noise."""
+    warnings = warnings_of(p2(1).record, n_real=2, n_pairs=5)
+    named = [warning for warning in warnings if "pole pair" in warning]
+    assert len(named) >= 2
+    assert all("fit one pair less" in warning for warning in named)
+    assert not any("damping of the pole pair" in w for w in warnings_of(p2(1).record, n_real=2, n_pairs=3))
+
+
+def test_few_samples_for_the_unknowns():
+    sentence = only(warnings_of(p2(0, 80).record, n_real=2, n_pairs=1), "unknowns")
+    assert "record longer, or fit fewer poles" in sentence
+
+
+# Trend and offset
+
+
+@pytest.mark.parametrize(("n_real", "of"), [(1, "real pole"), (2, "real pole"), (0, "output")])
+def test_a_trend_of_the_output_is_named(n_real, of):
+    """Whether a slow pole has taken it up or it is left in the residual."""
+    y = filtered(binary())
+    trend = np.linspace(0, 2.0 * y.std(), y.size)
+    warnings = warnings_of(as_record(binary(), y + trend), n_real=n_real, n_pairs=1)
+    sentence = only(warnings, "drift of" if n_real else "drifts by")
+    assert of in sentence
+    assert "take the trend off" in sentence
+    if not n_real:
+        size = float(sentence.split("drifts by ")[1].split(" ")[0].rstrip(","))
+        assert size == pytest.approx(trend[-1], rel=0.2)
+
+
+def test_a_walk_of_an_integrating_machine_is_no_trend():
+    for record in (p1(0).record, p1(1).record):
+        assert not any("drift of" in w or "drifts by" in w for w in warnings_of(record))
+
+
+def test_a_slow_disturbance_is_no_trend_and_neither_is_an_offset():
+    y = filtered(binary())
+    wave = 0.3 * y.std() * np.sin(np.arange(y.size) * 2 * np.pi / 500)
+    assert not any("drift" in w for w in warnings_of(as_record(binary(), y + wave), n_real=1, n_pairs=1))
+    assert warnings_of(as_record(binary(), y + 7.0), n_real=1, n_pairs=1) == ()
+
+
+def test_an_operating_point_far_from_zero_is_named():
+    u = 50.0 + binary()
+    y = 3.0 + filtered(binary())
+    options = {"n_real": 1, "n_pairs": 1, "estimate_initial_state": False}
+    sentence = only(warnings_of(as_record(u, y), **options), "stands at 50")
+    assert "subtract the operating point" in sentence
+    # With unknown initial states the constant is theirs, and nothing is wrong.
+    found = identify([as_record(u, y)], IdentOptions(n_real=1, n_pairs=1))
+    assert found.structure.estimate_initial_state
+    assert found.warnings == ()
+    assert found.model.poles.omega_rad_s(DT_S)[0] == pytest.approx(30.0, rel=0.01)
+
+
+def test_warnings_name_the_file(tmp_path):
+    path = tmp_path / "log 7.csv"
+    y = saturated(filtered(binary()))
+    np.savetxt(path, np.column_stack([binary(), y]), delimiter=",", header="u,y", comments="")
+    record = Record.from_csv(path, ["u"], ["y"], dt_s=DT_S)
+    assert only(warnings_of(record, n_real=1, n_pairs=1), "clipped").startswith(str(path))
