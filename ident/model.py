@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 
 from ident.arrays import ComplexArray, RealArray, readonly_real
 from ident.basis import basis_response, basis_state_space, regressor
@@ -113,6 +114,24 @@ class GobfModel:
         C = self.feedthrough * signal_c
         C[0, here] += self.coefficients
         return A, B, C, self.feedthrough * signal_d
+
+    def zeros(self) -> ComplexArray:
+        """Finite zeros (Z,) of the basis part, by magnitude; those of delay and integrators are at 0 and left
+        out.
+
+        Generalised eigenvalues of the system pencil, so nothing is expanded into polynomials. A zero beyond
+        1e4 is one at infinity that rounding has brought back, and is left out as well.
+        """
+        basis = basis_state_space(self.poles)
+        n = self.order
+        pencil = np.block(
+            [[basis.A, basis.B], [self.coefficients[None, :], np.full((1, 1), self.feedthrough)]]
+        )
+        unit = np.diag(np.concatenate([np.ones(n), np.zeros(1)]))
+        alpha, beta = scipy.linalg.eigvals(pencil, unit, homogeneous_eigvals=True)
+        finite = np.abs(alpha) <= 1e4 * np.abs(beta)
+        values = np.asarray(alpha[finite] / beta[finite], dtype=np.complex128)
+        return values[np.argsort(np.abs(values), kind="stable")]
 
     def to_control(self) -> Any:
         """The same model as a `control.StateSpace` with dt = dt_s."""

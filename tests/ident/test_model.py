@@ -4,6 +4,7 @@ import control
 import numpy as np
 import pytest
 
+from ident.basis import basis_response
 from ident.model import GobfModel
 from ident.poles import Poles
 
@@ -79,3 +80,20 @@ def test_frequencies_must_make_sense():
         MODEL.frequency_response(np.array([np.nan]))
     with pytest.raises(ValueError, match="omega = 0"):
         MODEL.frequency_response(np.array([0.0]))
+
+
+def test_zeros_are_where_the_response_vanishes_and_all_of_them_are_found():
+    poles = Poles.from_continuous(decay_per_s=[3.0], omega_rad_s=[15.0, 70.0], zeta=[0.01, 0.2], dt_s=0.005)
+    model = GobfModel(poles, [0.1, -0.2, 0.3, 0.05, -0.01], 0.005)
+    zeros = model.zeros()
+    # Numerator of sum_i c_i L_i by partial fractions, an independent way: order 5, strictly proper.
+    values = poles.values
+    unit = np.exp(2j * np.pi * np.arange(16) / 16)
+    response = (basis_response(poles, unit) @ model.coefficients) * np.prod(unit[:, None] - values, axis=1)
+    numerator = np.fft.fft(response)[:5] / 16  # coefficients of z^0 .. z^4
+    expected = np.roots(numerator[::-1].real)
+    np.testing.assert_allclose(np.sort_complex(zeros), np.sort_complex(expected), rtol=1e-7)
+    assert (
+        GobfModel(poles, np.zeros(5), 0.005, feedthrough=2.0).zeros().size == 5
+    )  # those of all poles cancel
+    assert GobfModel(Poles(), [], 0.005, feedthrough=2.0).zeros().size == 0
