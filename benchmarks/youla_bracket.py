@@ -1,0 +1,66 @@
+"""What any controller could reach on the flexible link with ellipses, beside the published bracket.
+
+    OMP_NUM_THREADS=1 python -m benchmarks.youla_bracket [--scenarios A B C] [--fine] [--no-write]
+
+--fine adds a row with a larger basis and grid: how far the default ones are from their limits. No random
+numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from benchmarks.results_file import ResultsFile
+from control_design.example_plants import flexible_link, flexible_link_specification
+from control_design.youla import YoulaOptions, youla_bracket
+
+PUBLISHED = {"A": (0.912, 0.931, 0.945), "B": (0.916, 1.065, 1.205), "C": (0.916, 1.268, 1.705)}
+OURS_BY_ORDER = {"A": (0.9368, 0.9307), "B": (1.0851, 1.0819), "C": (1.3346, 1.2771)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenarios", nargs="+", choices=list(PUBLISHED), default=list(PUBLISHED))
+    parser.add_argument("--fine", action="store_true")
+    parser.add_argument("--no-write", action="store_true")
+    arguments = parser.parse_args()
+    settings = {"default": YoulaOptions()}
+    if arguments.fine:
+        settings["fine"] = YoulaOptions(
+            real_poles=50, pairs_per_mode=20, grid_points=400, mode_points=250, dense_points=20_000
+        )
+    with ResultsFile("youla_bracket", seeds="none", write=not arguments.no_write) as out:
+        out(
+            "Worst case of max(|W1 S|, |W3 K S|): none goes below 'inscribed', some controller reaches the others."
+        )
+        out(
+            "reach = published (a smaller basis gives larger values); excess = our order 5 / 6 over 'ellipse'."
+        )
+        out(
+            "scenario  basis    functions  inscribed (reach)  ellipse (reach)  enclosing (reach)"
+            "  excess 5 / 6 %  CPU s"
+        )
+        for scenario in arguments.scenarios:
+            plant, specification = flexible_link(scenario), flexible_link_specification(5)
+            for name, options in settings.items():
+                begin = time.process_time()
+                bracket = youla_bracket(plant, specification, options)
+                spent = time.process_time() - begin
+                one = bracket.plants[0]
+                values = (bracket.inscribed, bracket.ellipse, bracket.enclosing)
+                cells = "  ".join(
+                    f"{value:>9.4f} ({reach:.3f})"
+                    for value, reach in zip(values, PUBLISHED[scenario], strict=True)
+                )
+                excess = [100 * bracket.excess(gamma) for gamma in OURS_BY_ORDER[scenario]]
+                out(
+                    f"{scenario:>8}  {name:<7}  {one.functions:>9}  {cells}  "
+                    f"{excess[0]:>6.1f} / {excess[1]:.1f}  {spent:>7.1f}"
+                )
+
+
+if __name__ == "__main__":
+    main()

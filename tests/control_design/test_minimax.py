@@ -1,0 +1,93 @@
+"""Smallest worst ratio: problems with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from control_design.minimax import PlaneRows, plane, smallest_ratio, turning
+
+
+def _rows(at, factor, offset, level, slope=None, reach=None):
+    size = at.size
+    return PlaneRows(
+        at,
+        turning(np.asarray(factor, complex)),
+        plane(np.asarray(offset, complex)),
+        np.asarray(level, float),
+        np.zeros((size, 2)) if slope is None else slope,
+        np.zeros((size, 2, 2)) if reach is None else reach,
+        np.zeros((size, 2)),
+    )
+
+
+def test_smallest_circle_around_points():
+    # Equilateral triangle and points inside: centre and radius are the triangle's.
+    corners = 2 + 1j + 3 * np.exp(2j * np.pi * np.arange(3) / 3)
+    points = np.concatenate([corners, [2 + 1.5j, 1 + 1j]])
+    basis = np.array([[1.0 + 0j, 1j]])
+    rows = _rows(np.zeros(5, int), np.ones(5), -points, np.ones(5))
+    point = smallest_ratio(basis, rows)
+    np.testing.assert_allclose(point.x, [2.0, 1.0], atol=1e-4)
+    assert point.gamma == pytest.approx(3.0, rel=2e-5)
+
+
+def test_real_ratio_agrees_with_bisection_over_linear_programmes():
+    rng = np.random.default_rng(0)
+    size, n = 40, 5
+    a, b = rng.standard_normal((size, n)), rng.standard_normal(size)
+    e, slope = 1 + rng.uniform(size=size), 0.2 * rng.standard_normal((size, n))
+    # Real numerators by a real basis per row; the slope acts on the imaginary part, which carries slope x.
+    basis = a + 1j * slope
+    keep_real = np.zeros((size, 2, 2))
+    keep_real[:, 0, 0] = 1.0
+    rows = PlaneRows(
+        np.arange(size),
+        keep_real,
+        plane(b + 0j),
+        e,
+        np.tile([0.0, 1.0], (size, 1)),
+        0 * keep_real,
+        np.zeros((size, 2)),
+    )
+    got = smallest_ratio(basis, rows).gamma
+    low, high = 0.0, 10.0
+    for _ in range(40):
+        mid = 0.5 * (low + high)
+        matrix = np.vstack([a - mid * slope, -a - mid * slope])
+        answer = linprog(
+            np.zeros(n), A_ub=matrix, b_ub=np.concatenate([mid * e - b, mid * e + b]), bounds=(None, None)
+        )
+        low, high = (low, mid) if answer.status == 0 else (mid, high)
+    assert got == pytest.approx(high, rel=5e-5)
+
+
+def test_reach_makes_a_norm_constraint():
+    # |y - 1| <= gamma (1 - |y|) for real y: worst at y = 0 is 1, at y = 1/2 also 1; every y in [0, 1) gives
+    # (1 - y)/(1 - y) = 1, and outside it is more.
+    rows = _rows(np.zeros(1, int), [1.0], [-1.0], [1.0], reach=np.eye(2)[None])
+    point = smallest_ratio(np.array([[1.0 + 0j]]), rows)
+    assert point.gamma == pytest.approx(1.0, rel=1e-6)
+
+
+def test_denominators_that_start_negative_are_made_positive_first():
+    # m = 1 - |y - 3| and 1.5 - |y - 3.4 - 0.5j| are both positive near 3 only; numerator |y - 2.5| vanishes
+    # there.
+    rows = PlaneRows(
+        np.zeros(2, int),
+        np.tile(np.eye(2), (2, 1, 1)),
+        np.array([[-2.5, 0.0], [-2.5, 0.0]]),
+        np.array([1.0, 1.5]),
+        np.zeros((2, 2)),
+        np.tile(np.eye(2), (2, 1, 1)),
+        np.array([[-3.0, 0.0], [-3.4, -0.5]]),
+    )
+    point = smallest_ratio(np.array([[1.0 + 0j, 1j]]), rows, np.array([0.0, 0.0]))
+    assert point.gamma < 1e-3
+    np.testing.assert_allclose(point.x, [2.5, 0.0], atol=1e-3)
+
+
+def test_denominator_that_cannot_be_positive_is_said():
+    rows = _rows(np.zeros(1, int), [1.0], [-1.0], [-1.0], reach=np.eye(2)[None])
+    assert smallest_ratio(np.array([[1.0 + 0j]]), rows).gamma == np.inf
