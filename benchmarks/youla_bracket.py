@@ -33,12 +33,8 @@ def main() -> None:
             real_poles=50, pairs_per_mode=20, grid_points=400, mode_points=250, dense_points=20_000
         )
     with ResultsFile("youla_bracket", seeds="none", write=not arguments.no_write) as out:
-        out(
-            "Worst case of max(|W1 S|, |W3 K S|): none goes below 'inscribed', some controller reaches the others."
-        )
-        out(
-            "reach = published (a smaller basis gives larger values); excess = our order 5 / 6 over 'ellipse'."
-        )
+        out("Worst case of max(|W1 S|, |W3 K S|): none below 'inscribed', the others are reached.")
+        out("reach = published (smaller basis, larger values); excess = our order 5 / 6 over 'ellipse'.")
         out(
             "scenario  basis    functions  inscribed (reach)  ellipse (reach)  enclosing (reach)"
             "  excess 5 / 6 %  CPU s"

@@ -211,10 +211,11 @@ class _Bracket:
         ellipse, _, _ = self._exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
         offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
         exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
+        ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
         return PlantBracket(
             self.plant.name,
-            inscribed,
-            min(ellipse, enclosing),
+            min(inscribed, ellipse),
+            ellipse,
             enclosing,
             grid_value,
             half.gamma,

@@ -121,7 +121,7 @@ def test_link_bracket_encloses_published_values_and_our_order_5():
     assert 0.985 * 0.916 < bracket.inscribed < 0.916
     assert 0.985 * 1.065 < bracket.ellipse < 1.065
     assert 0.985 * 1.205 < bracket.enclosing < 1.205
-    assert "2.6 % above" in bracket.sentence(1.0851, 5)
+    assert "2.7 % above" in bracket.sentence(1.0851, 5)
     assert YoulaBracket.from_dict(json.loads(json.dumps(bracket.to_dict()))) == bracket
 
 
