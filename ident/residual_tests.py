@@ -121,7 +121,7 @@ def independence_test(
         verdict = (
             f"The residuals depend on the input {worst} samples before (correlation "
             f"{correlation[max_lag + worst]:+.2f}, {_p(probability)}): the model lacks dynamics or delay "
-            "there."
+            "there; allow more poles, a direct term or another delay."
         )
     before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
     if before > deviation * norm.ppf(1 - (1 - level) / (2 * max(max_lag, 1))):
@@ -129,6 +129,43 @@ def independence_test(
     return ResidualTest(
         "independence", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
     )
+
+
+def residual_advice(
+    whiteness: ResidualTest, independence: ResidualTest, *, noise_order: int = 0
+) -> list[str]:
+    """What to do about tests that fail, one sentence each; nothing where both pass.
+
+    noise_order: order of the noise model behind which whiteness was tested, 0 without one.
+    """
+    sentences = []
+    if not independence.passed:
+        after = int(
+            independence.lags[
+                np.argmax(np.where(independence.lags >= 0, np.abs(independence.correlation), 0))
+            ]
+        )
+        sentences.append(
+            f"the residuals depend on the input, most {after} samples after it: allow a pole pair or a real "
+            "pole more, a direct term, or another delay; if that does not help, the machine is not linear at "
+            "this amplitude (dry friction, saturation), and the bounds hold for this kind of input only"
+        )
+    if not whiteness.passed and noise_order:
+        sentences.append(
+            f"the residuals are coloured even behind a noise model of order {noise_order}: the bounds may be "
+            "too narrow; "
+            + ("raise max_ar_order" if independence.passed else "cure the dependence on the input first")
+        )
+    elif not whiteness.passed:
+        sentences.append(
+            "the residuals are coloured, and the bounds take them as white: "
+            + (
+                "model the noise (coloured_noise = true)"
+                if independence.passed
+                else "cure the dependence on the input first, then model the noise (coloured_noise = true)"
+            )
+        )
+    return sentences
 
 
 def _p(probability: float) -> str:

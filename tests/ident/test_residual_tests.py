@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.residual_tests import ResidualTest, independence_test, whiteness_test
+from ident.residual_tests import (
+    ResidualTest,
+    independence_test,
+    residual_advice,
+    whiteness_test,
+)
 
 
 def coloured(rng, n, pole):
@@ -107,3 +112,24 @@ def test_round_trip_and_bad_input():
         whiteness_test([])
     with pytest.raises(ValueError, match="max_lag"):
         whiteness_test([np.zeros(100)], max_lag=0)
+
+
+def test_advice_says_what_to_do_about_which_test():
+    rng = np.random.default_rng(8)
+    u, white = rng.standard_normal(2000), rng.standard_normal(2000)
+    colour = coloured(rng, 2000, 0.8)
+    driven = white.copy()
+    driven[5:] += 0.5 * u[:-5]
+    good = whiteness_test([white]), independence_test([u], [white])
+    assert residual_advice(*good) == []
+    (sentence,) = residual_advice(whiteness_test([colour]), independence_test([u], [colour]))
+    assert "coloured_noise = true" in sentence
+    (sentence,) = residual_advice(whiteness_test([colour]), independence_test([u], [colour]), noise_order=8)
+    assert "order 8" in sentence
+    assert "max_ar_order" in sentence
+    (sentence,) = residual_advice(good[0], independence_test([u], [driven]))
+    assert "5 samples after" in sentence
+    assert "pole pair" in sentence
+    both = residual_advice(whiteness_test([colour]), independence_test([u], [driven]))
+    assert len(both) == 2
+    assert "first" in both[1]
