@@ -220,15 +220,11 @@ def _priors_judged(
             judged = free
     if options.fixed_poles:
         tests.append(fixed_poles_test(given))
-    if "input_delay_samples" in options.model_fields_set:
-        tests.append(delay_test(records, given))
     asked = options.relative_degree
-    if asked is None:
-        return data, best, tuple(tests)
-    relative_degree, end = 1, best
     if asked in (1, "auto"):
         tests.append(direct_term_test(records, judged))
-    trials = (2, 3) if asked == "auto" else (asked,) if asked > 1 else ()
+    relative_degree, end = 1, best
+    trials = (2, 3) if asked == "auto" else (asked,) if asked is not None and asked > 1 else ()
     for trial in trials:
         if trial > min(best.poles.order, judged.end.poles.order):
             if asked != "auto":
@@ -241,6 +237,8 @@ def _priors_judged(
         tests.append(test)
         relative_degree = trial
         end = constrained if judged is given else best_under_relative_degree(given, trial)
+    if "input_delay_samples" in options.model_fields_set:
+        tests.append(delay_test(records, given, relative_degree))
     if relative_degree > 1:
         data = replace(data, structure=replace(data.structure, relative_degree=relative_degree))
         best = end

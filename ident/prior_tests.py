@@ -28,7 +28,7 @@ from ident.polish import Polished
 from ident.record import Record
 from ident.regression import Regression, prepare
 from ident.structure import Structure
-from ident.structured_fit import structured_polish
+from ident.structured_fit import structured_fit, structured_polish
 
 TEST_LEVEL = 0.99
 # Slow poles that freed integrators start from, as decays over the whole record.
@@ -135,8 +135,8 @@ def integrators_test(
     `searched` are the records that are searched (see `ident.regression.thinned`) and what is estimated on
     them. The alternative is searched anew, too: wrong integrators lose a mode, and no descent from there
     finds it again. An integrator that a zero of the model cancels is refused as well: with enough other poles
-    no freed pole can improve on it, but the model with one integrator and one zero less is as good. It has
-    to gain what the choice of the order asks of any pole, 2 ln Ne.
+    no freed pole can improve on it, but the model with one integrator and one zero less is as good, while
+    no other pole can be spared. It has to gain what the choice of the order asks of any pole, 2 ln Ne.
     """
     k = given.data.structure.integrators
     free = _without_integrators(records, searched, given)
@@ -150,7 +150,7 @@ def integrators_test(
     test = _judged(name, value, k, "a slow pole in place of each", advice)
     if not test.refused:
         needless, price = _one_integrator_less_value(records, given), 2 * float(np.log(given.worth()))
-        if needless <= price:
+        if needless <= price and not _one_real_pole_less_value(given) <= price:
             verdict = (
                 f"{name} not supported by the data: one integrator and one zero less fit as well (test "
                 f"statistic {needless:.1f} against {price:.1f}, the price of a pole), so a zero of the model "
@@ -217,11 +217,23 @@ def _one_integrator_less_value(records: Sequence[Record], given: Fitted) -> floa
     structure = replace(given.data.structure, integrators=k - 1)
     data = replace(prepare(records, structure), polynomials=given.data.polynomials)
     search = PoleSearch(data, given.search.options.model_copy(update={"integrators": k - 1}))
-    poles = given.end.poles
-    if poles.order == 1:
+    others = Poles(given.end.poles.real[1:], given.end.poles.pairs)
+    if others.order == 0:
         return np.inf
-    less = search.descend(Poles(poles.real[1:], poles.pairs), "one integrator less")
-    return statistic(less.rss, given)
+    return statistic(search.descend(others, "one integrator less").rss, given)
+
+
+def _one_real_pole_less_value(given: Fitted) -> float:
+    """Statistic of the model with the integrators and the least needed searched real pole less.
+
+    Where that is as good, the pole too many was another one: it can take the place of an integrator.
+    """
+    poles, first = given.end.poles, given.search.fixed.real.size
+    values = [
+        statistic(given.search.descend(Poles(np.delete(poles.real, i), poles.pairs), "one less").rss, given)
+        for i in range(first, poles.real.size)
+    ]
+    return min(values, default=np.inf)
 
 
 def fixed_poles_test(given: Fitted) -> PriorTest:
@@ -242,12 +254,15 @@ def fixed_poles_test(given: Fitted) -> PriorTest:
     )
 
 
-def delay_test(records: Sequence[Record], given: Fitted) -> PriorTest:
+def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -> PriorTest:
     """The input delay against one sample less and one more, on the rows that all three explain.
 
+    Under the relative degree that the model keeps: without it the numerator can take over a sample of delay.
     The models are not nested; under a true delay the statistic is mostly negative (shown as 0), so one
     degree of freedom is on the safe side.
     """
+    if relative_degree > 1:
+        given = replace(given, end=best_under_relative_degree(given, relative_degree))
     structure = given.data.structure
     delay = structure.input_delay_samples
     best, chosen = 0.0, delay + 1
@@ -257,9 +272,16 @@ def delay_test(records: Sequence[Record], given: Fitted) -> PriorTest:
         data = prepare(records, replace(structure, input_delay_samples=other))
         search = PoleSearch(data, given.search.options.model_copy(update={"input_delay_samples": other}))
         shifted = Fitted(data, search.descend(given.end.poles, "other delay"), search)
+        if relative_degree > 1:
+            shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
+        residuals = [
+            structured_fit(item.data, item.end.poles, relative_degree).residual for item in (given, shifted)
+        ]
         common = max(delay, other)
-        ours, theirs = (_rows_from(item, common - d) for item, d in ((given, delay), (shifted, other)))
-        value = shifted.worth() * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
+        ours = _power_from(residuals[0], given.data, common - delay)
+        theirs = _power_from(residuals[1], data, common - other)
+        worth = effective_samples(residuals[1], data.starts)
+        value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
         if ours <= 1e-18 * float(given.data.y @ given.data.y):
             value = 0.0
         if value > best:
@@ -274,9 +296,8 @@ def delay_test(records: Sequence[Record], given: Fitted) -> PriorTest:
     )
 
 
-def _rows_from(fitted: Fitted, skip: int) -> float:
-    residual = fitted.residual
-    parts = [residual[fitted.data.segment(i)][skip:] for i in range(fitted.data.n_records)]
+def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
+    parts = [residual[data.segment(i)][skip:] for i in range(data.n_records)]
     return float(sum(part @ part for part in parts))
 
 
@@ -311,7 +332,7 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
         statistic(constrained.rss, free),
         relative_degree - 1,
         "a numerator without that limit",
-        f"set relative_degree = {relative_degree - 1} or leave it out (an input that is not held constant "
+        f"set relative_degree = {relative_degree - 1} or leave it out (a sample of delay, an input that is not held constant "
         "between samples, or a filter in the sensor, blurs it)",
     )
     return test, constrained

@@ -77,6 +77,8 @@ def _functionals(
 ) -> tuple[RealArray, RealArray]:
     if not relative_degree >= 1:
         raise ValueError(f"relative_degree must be at least 1; got {relative_degree}")
+    if relative_degree == 1:
+        return np.zeros((0, poles.order)), np.zeros((0, sum(block.order for block in blocks)))
     refuse_without_counterpart(poles, integrators)
     if np.any(poles.real[:integrators] != 0):
         raise ValueError("the first real poles must be the zeros that the integrators bring")

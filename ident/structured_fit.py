@@ -27,6 +27,8 @@ from ident.relative_degree import conditions, conditions_with_sensitivities, nul
 _RANK_TOLERANCE = 1e-12
 # Fastest real pole: decayed to this part within a sample. One at 0 or below has no continuous counterpart.
 _FASTEST = 0.01
+# Angle of a pair per sample: beyond pi a mode is folded back.
+_HIGHEST = 0.995 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +150,7 @@ def _chain_rule(blocks: tuple[Poles, ...]) -> RealArray:
 
 @dataclass(frozen=True, eq=False)
 class _Unknowns:
-    """The free numbers of a descent (see `structured_sensitivities`) and the sides they keep."""
+    """The free numbers of a descent (see `structured_sensitivities`) and the bounds they keep."""
 
     poles: Poles
     bounds: Bounds
@@ -165,8 +167,16 @@ class _Unknowns:
         return self.clipped(np.concatenate([1 - self.poles.real[self.n_fixed_real :], pairs]))
 
     def clipped(self, x: RealArray) -> RealArray:
-        x = self.bounds.clip_parameters(x, self.n_real)
-        x[: self.n_real] = np.minimum(x[: self.n_real], 1 - _FASTEST)
+        """The nearest unknowns within the bounds: decay of real poles, frequency and damping of pairs."""
+        bounds, x = self.bounds, x.copy()
+        real, s, f = x[: self.n_real], x[self.n_real :: 2], x[self.n_real + 1 :: 2]
+        real[:] = np.clip(real, bounds.distance_min, min(bounds.distance_max, 1 - _FASTEST))
+        s[:], f[:] = np.maximum(s, bounds.s_min), np.maximum(f, 1e-12)
+        omega = np.hypot(s, f)
+        zeta = np.clip(s / omega, bounds.zeta_min, bounds.zeta_max)
+        omega = np.clip(omega, bounds.omega_min, bounds.omega_max)
+        s[:] = np.maximum(zeta * omega, bounds.s_min)
+        f[:] = np.minimum(omega * np.sqrt(1 - zeta**2), _HIGHEST)
         return x
 
     def poles_at(self, x: RealArray) -> Poles:
