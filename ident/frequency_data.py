@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -11,7 +12,8 @@ from scipy.stats import f as f_distribution
 from ident.arrays import ComplexArray, RealArray
 from ident.ellipses import chi2_radius
 
-_FREQUENCY = {"omega_rad_s": 1.0, "frequency_Hz": 2 * np.pi}
+FREQUENCY_COLUMNS = {"omega_rad_s": 1.0, "omega_rad_per_s": 1.0, "frequency_Hz": 2 * np.pi}
+"""Names a frequency column may have, and the factor to rad/s."""
 _COLUMNS = ("real", "imag", "variance_real", "variance_imag")
 _CROSS = "covariance_real_imag"
 
@@ -26,10 +28,10 @@ def read_frequency_table(path: Path) -> tuple[RealArray, ComplexArray, RealArray
         raise ValueError(f"{path}: cannot be read as text ({error})") from error
     rows = csv.reader(text.splitlines())
     header = [name.strip() for name in next(rows, [])]
-    frequency = [name for name in _FREQUENCY if name in header]
+    frequency = [name for name in FREQUENCY_COLUMNS if name in header]
     if len(frequency) != 1:
         raise ValueError(
-            f"{path}, line 1: need exactly one of the columns {', '.join(_FREQUENCY)}; found {header}"
+            f"{path}, line 1: need exactly one of the columns {', '.join(FREQUENCY_COLUMNS)}; found {header}"
         )
     missing = [name for name in _COLUMNS if name not in header]
     if missing:
@@ -43,7 +45,7 @@ def read_frequency_table(path: Path) -> tuple[RealArray, ComplexArray, RealArray
             raise ValueError(
                 f"{path}, line {rows.line_num}: {len(row)} cells where the header has {len(header)}"
             )
-        values.append([_number(row[header.index(name)], path, rows.line_num, name) for name in wanted])
+        values.append([number_of_cell(row[header.index(name)], path, rows.line_num, name) for name in wanted])
         if values[-1][3] < 0 or values[-1][4] < 0:
             raise ValueError(f"{path}, line {rows.line_num}: a variance is negative")
     if not values:
@@ -51,7 +53,7 @@ def read_frequency_table(path: Path) -> tuple[RealArray, ComplexArray, RealArray
     table = np.array(values)
     cross = table[:, 5] if table.shape[1] > 5 else np.zeros(len(table))
     covariance = np.stack([np.stack([table[:, 3], cross], -1), np.stack([cross, table[:, 4]], -1)], -2)
-    return table[:, 0] * _FREQUENCY[frequency[0]], table[:, 1] + 1j * table[:, 2], covariance
+    return table[:, 0] * FREQUENCY_COLUMNS[frequency[0]], table[:, 1] + 1j * table[:, 2], covariance
 
 
 def write_frequency_table(
@@ -72,10 +74,12 @@ def mean_of_repeats(
     level: float,
     pool_neighbours: int = 0,
     outlier_threshold: float | None = None,
+    of: Literal["mean", "next run"] = "mean",
 ) -> tuple[RealArray, ComplexArray, RealArray]:
-    """Frequencies (F,), means (F,), widened covariances of the mean (F,2,2) of points grouped by frequency.
+    """Frequencies (F,), means (F,), widened covariances (F,2,2) of points grouped by frequency.
 
-    Contract as `FrequencyUncertainty.from_frf_repeats`.
+    Covariances are those of the mean, or of one more run around it. Contract as
+    `FrequencyUncertainty.from_frf_repeats`.
     """
     if omega_rad_s.ndim != 1 or response.shape != omega_rad_s.shape or omega_rad_s.size == 0:
         raise ValueError(f"need omega (K,) and response (K,); got {omega_rad_s.shape} and {response.shape}")
@@ -92,7 +96,7 @@ def mean_of_repeats(
     for index in range(grid.size):
         points = response[group == index]
         if outlier_threshold is not None:
-            points = points[_inliers(points, outlier_threshold)]
+            points = _inliers(points, outlier_threshold)
         centre[index] = points.mean()
         deviation = points - centre[index]
         pair = np.stack([deviation.real, deviation.imag])
@@ -110,10 +114,11 @@ def mean_of_repeats(
     # Hotelling: n (mean - G)^T S^-1 (mean - G) ~ 2 f / (f - 1) F(2, f - 1) with f degrees of freedom in S.
     hotelling = 2 * freedom / (freedom - 1) * f_distribution.ppf(level, 2, freedom - 1)
     widening = hotelling / chi2_radius(level) ** 2
-    return grid, centre, scatter * (widening / (freedom * count))[:, None, None]
+    share = 1 / count if of == "mean" else 1 + 1 / count
+    return grid, centre, scatter * (widening * share / freedom)[:, None, None]
 
 
-def _number(cell: str, path: Path, line: int, column: str) -> float:
+def number_of_cell(cell: str, path: Path, line: int, column: str) -> float:
     try:
         value = float(cell)
     except ValueError as error:
@@ -125,11 +130,15 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     return value
 
 
-def _inliers(points: ComplexArray, threshold: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _inliers(points: ComplexArray, threshold: float) -> ComplexArray:
+    """Points within `threshold` robust standard deviations of the median.
+
+    In one pass: repeated on ten points or so, the spread shrinks by chance until good points fall.
+    """
     distance = np.abs(points - (np.median(points.real) + 1j * np.median(points.imag)))
     # The median distance of a circular Gaussian cloud (Rayleigh) is 1.1774 standard deviations.
     spread = float(np.median(distance)) / 1.1774
-    return np.asarray(distance <= threshold * spread) if spread > 0 else np.ones(points.size, dtype=np.bool_)
+    return points[distance <= threshold * spread] if spread > 0 else points
 
 
 def _pooled(

@@ -156,6 +156,8 @@ def identify_frf(
     response: FrequencyUncertainty,
     options: IdentOptions | None = None,
     embedding: EmbeddingOptions | None = None,
+    *,
+    shared_gain_std: float = 0.0,
 ) -> FrfIdentification:
     """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
@@ -163,13 +165,16 @@ def identify_frf(
     ----------
     response : FrequencyUncertainty
         Measurement with a covariance at every frequency (`from_csv`, `from_frf_repeats`, `empirical_frf`).
-        Errors of different frequencies are taken as independent: one that all of them share (the amplitude
-        of a run, the gain of an amplifier) is not seen in the residual and not in the posterior.
+        Errors of different frequencies are taken as independent. One that all of them share (the amplitude
+        of a run, the gain of an amplifier) does not show in the residual and is not averaged away by the fit:
+        state it as shared_gain_std.
     options : IdentOptions
         Numbers of poles, integrators, feedthrough, delay and bounds as for records. What only records have
         (offset, initial state) must be left at "auto" or False.
     embedding : EmbeddingOptions
         fir_length, hyperparameters and prior_no_remainder are used.
+    shared_gain_std : float
+        Relative standard deviation of a real factor common to all frequencies; widens the posterior.
 
     Raises
     ------
@@ -179,9 +184,10 @@ def identify_frf(
 
     Notes
     -----
-    Poles by DIRECT in log coordinates and Levenberg-Marquardt, pair by pair, the number of poles by the
-    criterion of the time domain with the measured real numbers (two per frequency) in place of samples. The
-    result is deterministic.
+    Poles by DIRECT in log coordinates and Levenberg-Marquardt, pair by pair; a pole is kept if chi-square
+    falls by more than 2 ln Ne, Ne the measured real numbers (two per frequency) as far as the residual is
+    white over frequency, and chi-square divided by its excess over what the covariances explain. The result
+    is deterministic.
     """
     options = options or IdentOptions()
     if options.estimate_offset is True or options.estimate_initial_state is True:
@@ -221,6 +227,7 @@ def identify_frf(
         integrators=options.integrators,
         input_delay_samples=options.input_delay_samples,
         options=embedding,
+        shared_gain_std=shared_gain_std,
     )
     return FrfIdentification(
         model=model,

@@ -35,14 +35,19 @@ def embed_response(
     integrators: int,
     input_delay_samples: int,
     options: EmbeddingOptions | None = None,
+    shared_gain_std: float = 0.0,
 ) -> ResponsePosterior:
     """Posterior around poles chosen from this response; `fixed` (first among `poles`) are not doubled.
 
     The covariances of the measurement are taken as they are if the rest of the fit is no larger than they
     explain, and multiplied by the estimated noise variance (in their units, Birge's ratio) if it is: the
-    posterior never claims more than the measurement. Raises ValueError if the frequencies do not outnumber
-    the unknowns.
+    posterior never claims more than the measurement. shared_gain_std is the relative standard deviation of a
+    real factor common to all frequencies; the fit is proportional to the measurement, so it adds exactly one
+    direction, that of the mean itself. Raises ValueError if the frequencies do not outnumber the unknowns, or
+    shared_gain_std is negative.
     """
+    if not 0 <= shared_gain_std < np.inf:
+        raise ValueError(f"shared_gain_std must not be negative; got {shared_gain_std}")
     options = options or EmbeddingOptions()
     basis = _free_doubled(poles, fixed)
     regressors = data.columns(basis)
@@ -76,7 +81,7 @@ def embed_response(
     return ResponsePosterior(
         poles=basis,
         mean=mean,
-        covariance_factor=widening * factor,
+        covariance_factor=np.column_stack([widening * factor, shared_gain_std * mean]),
         dt_s=data.dt_s,
         fir_length=length,
         has_feedthrough=data.feedthrough,

@@ -14,8 +14,6 @@ from ident.frf_regression import FrfRegression, fit_response, pole_directions
 from ident.poles import Poles
 from ident.polish import Bounds, Polished
 
-_ITERATIONS = 80
-
 
 def to_log(poles: Poles, n_fixed_real: int, n_fixed_pairs: int) -> RealArray:
     """(P,) unknowns of the poles that are free."""
@@ -55,6 +53,7 @@ def polish_response(
     n_fixed_real: int = 0,
     n_fixed_pairs: int = 0,
     tolerance: float = 1e-9,
+    max_iterations: int = 80,
 ) -> Polished:
     """Descend from the given poles; the first n_fixed ones of each type stay where they are.
 
@@ -66,7 +65,7 @@ def polish_response(
     here = fit_response(data, current)
     floor = 1e-26 * float(data.y @ data.y)
     damping, growth = 1e-3, 2.0
-    for iteration in range(_ITERATIONS):
+    for iteration in range(max_iterations):
         directions = pole_directions(data, current, here, n_fixed_real, n_fixed_pairs)
         slope = directions.T @ here.residual
         free = np.flatnonzero(~(((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0))))
@@ -96,4 +95,4 @@ def polish_response(
         x, current, here = trial_x, trial_poles, trial
         damping *= max(1 / 5, 1 - (2 * ratio - 1) ** 3)
         growth = 2.0
-    return Polished(current, here.rss, _ITERATIONS, False)
+    return Polished(current, here.rss, max_iterations, False)

@@ -68,12 +68,16 @@ class FrfRegression:
             axis=-2,
         )
 
-    def columns(self, poles: Poles) -> RealArray:
-        """Whitened basis functions, and the direct term if there is one, (2 F, B or B + 1)."""
+    def responses(self, poles: Poles) -> ComplexArray:
+        """Basis functions, and the direct term if there is one, times the known factor, (F, B or B + 1)."""
         parts = [basis_response(poles, self.z)]
         if self.feedthrough:
             parts.append(np.ones((self.z.size, 1), dtype=np.complex128))
-        return self.whiten(self.common[:, np.newaxis] * np.hstack(parts))
+        return np.asarray(self.common[:, np.newaxis] * np.hstack(parts))
+
+    def columns(self, poles: Poles) -> RealArray:
+        """The same whitened, (2 F, B or B + 1)."""
+        return self.whiten(self.responses(poles))
 
 
 def prepare_response(
@@ -141,16 +145,15 @@ class FrfFit:
 
 def fit_response(data: FrfRegression, poles: Poles) -> FrfFit:
     """theta = R^-1 Q^T y by thin QR (27), on the whitened rows."""
-    q, triangle = np.linalg.qr(data.columns(poles))
+    responses = data.responses(poles)
+    q, triangle = np.linalg.qr(data.whiten(responses))
     projected = q.T @ data.y
     residual = data.y - q @ projected
     theta = np.linalg.lstsq(triangle, projected, rcond=_RANK_TOLERANCE)[0]
-    inner = basis_response(poles, data.z) @ theta[: poles.order]
-    direct = float(theta[-1]) if data.feedthrough else 0.0
     return FrfFit(
         coefficients=np.asarray(theta[: poles.order], dtype=np.float64),
-        feedthrough=direct,
-        response=np.asarray(data.common * (inner + direct)),
+        feedthrough=float(theta[-1]) if data.feedthrough else 0.0,
+        response=np.asarray(responses @ theta),
         residual=residual,
         rss=float(residual @ residual),
         q=q,

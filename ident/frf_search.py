@@ -1,10 +1,12 @@
 """Search for the poles of a measured frequency response: the recipe of the time domain (design 4.3).
 
 DIRECT on log J in log coordinates, the best points polished, pair by pair on what the tangent space of the
-poles so far leaves, each block rescanned on a grid, and the order by the same criterion.
+poles so far leaves, each block rescanned on a grid, and the order step by step.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,6 +24,8 @@ from ident.search_trace import PolishedMinimum, SearchStage
 
 _GAIN = 1e-6
 _ROUGH = 1e-4
+# Two poles that meet make a descent crawl; one that only compares starts is stopped then.
+_ITERATIONS, _ROUGH_ITERATIONS = 80, 20
 _PAIR_EVALUATIONS = 240
 _PAIR_GRID = (60, 4)
 _REAL_GRID = 18
@@ -65,8 +69,24 @@ class ResponseCost:
             self._residual @ self._residual - np.sum(np.einsum("enk,n->ek", q, self._residual) ** 2, axis=1)
         )
 
-    def __call__(self, unit: RealArray) -> float:
-        return float(np.log(max(float(self.rss(unit[np.newaxis])[0]), self._floor)))
+    def log(self, units: RealArray) -> RealArray:
+        """log J (E,) at points (E, D), as DIRECT sees it."""
+        return np.log(np.maximum(self.rss(units), self._floor))
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Reading of J: share of the rows that count as independent, their number, and the noise variance.
+
+    J is a chi-square because the covariances are known: one more pole, of two numbers, is kept if J falls by
+    more than 2 ln Ne (a pair: 4 ln Ne, design 4.3), and a fall within the covariances is no reason for one,
+    however small the residual became. Where J stays larger than the covariances explain they are multiplied
+    by its excess. Neighbouring frequencies may share their errors, hence Ne instead of the number of rows.
+    """
+
+    share: float
+    worth: float
+    scale: float
 
 
 class FrfSearch:
@@ -104,6 +124,8 @@ class FrfSearch:
             best = self._grow_pairs(best, most_pairs)
             if options.n_real is None:
                 best = self._grow_real(best)
+                if options.n_pairs is None:
+                    best = self._split_overdamped(best)
             best = self._prune(best)
             if best.poles.order == order:
                 break
@@ -111,9 +133,9 @@ class FrfSearch:
 
     def table(self, best: Polished) -> tuple[OrderStep, ...]:
         """Every structure that was tried, by order, judged by the residual of the chosen model."""
-        worth = self._worth(best)
+        judge = self._judge(best)
         steps = [
-            OrderStep(n_real, n_pairs, rss, self._criterion(rss, n_real + 2 * n_pairs, worth))
+            OrderStep(n_real, n_pairs, rss, self._criterion(rss, n_real + 2 * n_pairs, judge))
             for (n_real, n_pairs), rss in self._tried.items()
         ]
         return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
@@ -175,6 +197,7 @@ class FrfSearch:
             n_fixed_real=self.fixed.real.size,
             n_fixed_pairs=self.fixed.pairs.size,
             tolerance=tolerance,
+            max_iterations=_ITERATIONS if tolerance < _ROUGH else _ROUGH_ITERATIONS,
         )
         self.evaluations += end.iterations + 1
         self.minima.append(PolishedMinimum(stage, end.poles, end.rss))
@@ -184,7 +207,7 @@ class FrfSearch:
         return search_space(n_real, n_pairs, self._length, self.data.dt_s, self._box)
 
     def _searched(self, title: str, cost: ResponseCost, kept: Poles, evaluations: int) -> Polished:
-        points, costs = minimise(cost, cost.space.dimension, self.options.algorithm, evaluations)
+        points, costs = minimise(cost.log, cost.space.dimension, self.options.algorithm, evaluations)
         self.evaluations += cost.evaluations
         self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
         chosen = best_apart(points, costs, self.options.starts)
@@ -204,7 +227,7 @@ class FrfSearch:
     def _grow_pairs(self, best: Polished, most_pairs: int) -> Polished:
         while (self._counts(best.poles)[1] < most_pairs) and self._visible(best):
             trial = self._noted(self.rescan(self.add_pair(best.poles)))
-            if self.options.n_pairs is None and not self._better(trial, best, self._worth(trial)):
+            if self.options.n_pairs is None and not self._better(trial, best, self._judge(trial)):
                 break
             best = trial
         return best
@@ -212,9 +235,22 @@ class FrfSearch:
     def _grow_real(self, best: Polished) -> Polished:
         while self._counts(best.poles)[0] < self.options.max_real and self._visible(best):
             trial = self._noted(self.rescan(self.add_real(best.poles)))
-            if not self._better(trial, best, self._worth(trial)):
+            if not self._better(trial, best, self._judge(trial)):
                 break
             best = trial
+        return best
+
+    def _split_overdamped(self, best: Polished) -> Polished:
+        """A pair that went to its largest damping wants to be two real poles; it may."""
+        zeta = best.poles.zeta()
+        for i in reversed(range(self.fixed.pairs.size, zeta.size)):
+            if zeta[i] < self.bounds.zeta_max * (1 - 1e-6):
+                continue
+            omega = abs(np.log(best.poles.pairs[i]))
+            real = np.concatenate([best.poles.real, np.exp(-omega * np.array([0.7, 1.4]))])
+            trial = self._noted(self.descend(Poles(real, np.delete(best.poles.pairs, i)), "two real poles"))
+            if trial.rss < best.rss and self._counts(trial.poles)[0] <= self.options.max_real:
+                best = trial
         return best
 
     def _prune(self, best: Polished) -> Polished:
@@ -227,30 +263,30 @@ class FrfSearch:
             if self.options.n_pairs is None:
                 for i in range(self.fixed.pairs.size, best.poles.pairs.size):
                     trials.append(Poles(best.poles.real, np.delete(best.poles.pairs, i)))
-            worth = self._worth(best) if trials else 0.0
+            judge = self._judge(best)
             ends = [self._noted(self.descend(poles, "pruning")) for poles in trials]
-            ends = [end for end in ends if self._better(end, best, worth)]
+            ends = [end for end in ends if self._better(end, best, judge)]
             if not ends:
                 return best
-            best = min(ends, key=lambda end: self._criterion(end.rss, end.poles.order, worth))
+            best = min(ends, key=lambda end: self._criterion(end.rss, end.poles.order, judge))
 
-    def _better(self, trial: Polished, best: Polished, worth: float) -> bool:
-        """For one more pair: Ne ln(J0/J1) > 4 ln Ne (design 4.3), Ne the rows the residual is worth."""
-        return self._criterion(trial.rss, trial.poles.order, worth) < self._criterion(
-            best.rss, best.poles.order, worth
+    def _better(self, trial: Polished, best: Polished, judge: _Judge) -> bool:
+        return self._criterion(trial.rss, trial.poles.order, judge) < self._criterion(
+            best.rss, best.poles.order, judge
         )
 
-    def _criterion(self, rss: float, order: int, worth: float) -> float:
-        floor = max(rss, _EXPLAINED * float(self.data.y @ self.data.y), np.finfo(np.float64).tiny)
-        rows = self.data.n_rows
-        return float(worth * np.log(floor / rows) + self.data.n_parameters(order) * np.log(worth))
+    def _criterion(self, rss: float, order: int, judge: _Judge) -> float:
+        return judge.share * rss / judge.scale + self.data.n_parameters(order) * float(np.log(judge.worth))
 
-    def _worth(self, end: Polished) -> float:
-        """Independent rows the residual is worth: neighbouring frequencies may share their errors."""
-        residual = fit_response(self.data, end.poles).residual
-        count = self.data.z.size
+    def _judge(self, end: Polished) -> _Judge:
+        """How J is to be read, from the residual of the larger of two models."""
+        data = self.data
+        residual = fit_response(data, end.poles).residual
+        count = data.z.size
         starts = np.array([0, count, 2 * count], dtype=np.int64)
-        return max(effective_samples(residual, starts) * self.data.n_rows / residual.size, 3.0)
+        share = effective_samples(residual, starts) / residual.size
+        freedom = max(data.n_rows - data.n_parameters(end.poles.order, self.fixed.order), 1)
+        return _Judge(share, max(share * data.n_rows, 3.0), max(1.0, end.rss / freedom))
 
     def _visible(self, best: Polished) -> bool:
         enough = self.data.n_rows > 2 * self.data.n_parameters(best.poles.order + 2)
