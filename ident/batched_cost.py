@@ -1,9 +1,9 @@
 """The cost of many candidate poles, eight at a time: one pass over the samples, nothing of length N kept.
 
-J = |r|^2 - |P r|^2, P the projection on what the columns x_1 .. x_m of the candidate poles add to the frozen columns
-Q (orthonormal rows): with G = X X^T - (X Q^T)(X Q^T)^T and b = X r, |P r|^2 = b^T G^-1 b. Only the products X X^T,
-X Q^T and X r are needed, and they are summed over pieces of `_PIECE` samples while the states are still in the
-processor's first cache. Memory does not grow with the number of samples.
+J = |r|^2 - |P r|^2, P the projection on what the columns x_1 .. x_m of the candidate poles add to the frozen
+columns Q (orthonormal rows): with G = X X^T - (X Q^T)(X Q^T)^T and b = X r, |P r|^2 = b^T G^-1 b. Only the
+products X X^T, X Q^T and X r are needed, and they are summed over pieces of `_PIECE` samples while the states
+are still in the processor's first cache. Memory does not grow with the number of samples.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def batched_rss(
 ) -> Any:
     """Residual sums of squares (E,) at points (E, D) of the unit cube of a search space.
 
-    drive (N,) is the input of the candidate blocks; against (N, Q) holds the residual of the frozen columns, then
-    n_shared columns orthonormal over all records, then columns orthonormal within each record, then zeros up to a
-    multiple of `COLUMNS`.
+    drive (N,) is the input of the candidate blocks; against (N, Q) holds the residual of the frozen columns,
+    then n_shared columns orthonormal over all records, then columns orthonormal within each record, then
+    zeros up to a multiple of `COLUMNS`.
     """
     n_points = units.shape[0]
     n_blocks = n_real + (units.shape[1] - n_real) // 2
@@ -103,8 +103,11 @@ def batched_rss(
 
 
 @numba.njit(cache=True)
-def _advance(blocks: Any, n_real: int, n_blocks: int, state: Any, signal: Any, rows: Any, length: int) -> None:
-    """`ident.basis.run_cascade` for eight cascades over one piece: states into rows, all-pass output into signal."""
+def _advance(
+    blocks: Any, n_real: int, n_blocks: int, state: Any, signal: Any, rows: Any, length: int
+) -> None:
+    """`ident.basis.run_cascade` for eight cascades over one piece: states into rows, all-pass output into
+    signal."""
     row = 0
     for i in range(n_blocks):
         p = i * 4 * WIDTH

@@ -1,15 +1,15 @@
 """DIRECT-L that hands out all points of an iteration at once: NLopt's GN_DIRECT_L, point for point the same.
 
-NLopt calls the cost back for one point after the other; with a compiled cost that takes eight points together these
-calls would be most of a search (measured by `benchmarks.fit_time`). NLopt's variants stay selectable, and the tests
-compare every point with GN_DIRECT_L.
+NLopt calls the cost back for one point after the other; with a compiled cost that takes eight points together
+these calls would be most of a search (measured by `benchmarks.fit_time`). NLopt's variants stay selectable,
+and the tests compare every point with GN_DIRECT_L.
 
-The method (Gablonsky, Kelley: A locally-biased form of the DIRECT algorithm, J. Global Optim. 21, 2001): boxes that
-tile the unit cube are judged by the cost f at their centre and by d, half their longest side. Of the boxes on the
-lower right convex hull of (d, f), one for each d, those are divided whose next edge of the hull, prolonged to d = 0,
-reaches the lowest cost found so far; dividing means trisecting along all longest sides, the best side first. As in
-NLopt the lowest cost is followed within an iteration, so a box may fail after its points were evaluated; they are kept
-until its turn comes.
+The method (Gablonsky, Kelley: A locally-biased form of the DIRECT algorithm, J. Global Optim. 21, 2001):
+boxes that tile the unit cube are judged by the cost f at their centre and by d, half their longest side. Of
+the boxes on the lower right convex hull of (d, f), one for each d, those are divided whose next edge of the
+hull, prolonged to d = 0, reaches the lowest cost found so far; dividing means trisecting along all longest
+sides, the best side first. As in NLopt the lowest cost is followed within an iteration, so a box may fail
+after its points were evaluated; they are kept until its turn comes.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import numpy as np
 from ident.arrays import RealArray
 
 _THIRD = 1 / 3
-# Columns of a box: trisections of its longest side, cost, age, whether its side costs are known; then centre (D),
-# widths (D), side costs (2 D).
+# Columns of a box: trisections of its longest side, cost, age, whether its side costs are known; then centre
+# (D), widths (D), side costs (2 D).
 _LEVEL, _COST, _AGE, _KNOWN, _CENTRE = range(5)
 _ASKED = 2  # the side costs were asked for just now
 # After 32 trisections a box is as small as rounding; it is not divided again.
@@ -36,8 +36,8 @@ def minimise_in_batches(
 ) -> tuple[RealArray, RealArray]:
     """Points (E, D) of the unit cube in NLopt's order and their costs (E,); cost maps points (K, D) to (K,).
 
-    E = evaluations; the cost may be asked for a few points more. The time for bookkeeping grows with E^2 (about 1 s
-    at 100 000).
+    E = evaluations; the cost may be asked for a few points more. The time for bookkeeping grows with E^2
+    (about 1 s at 100 000).
     """
     points, costs = np.empty((evaluations, dimension)), np.empty(evaluations)
     boxes = np.zeros((evaluations + 2 * dimension + 1, _CENTRE + 4 * dimension))
@@ -53,9 +53,7 @@ def minimise_in_batches(
         if n_hull == 0:  # every box is as small as rounding
             return points[:n_points], costs[:n_points]
         values = cost(proposed[:n_proposed]) if n_proposed else proposed[0, :0]
-        n_boxes, n_points, age = _divide(
-            boxes, n_boxes, age, hull[:n_hull], values, points, costs, n_points
-        )
+        n_boxes, n_points, age = _divide(boxes, n_boxes, age, hull[:n_hull], values, points, costs, n_points)
     return points, costs
 
 
@@ -140,7 +138,10 @@ def _choose(boxes: Any, n_boxes: int, hull: Any, proposed: Any) -> tuple[int, in
         box = hull[i]
         d_before = _half_side(boxes, hull[i - 1]) if i > 0 else 0.0
         # The box before may have been divided by the time it is this one's turn.
-        as_is, divided = _intercept(boxes, hull[:n_hull], i, d_before), _intercept(boxes, hull[:n_hull], i, d_before / 3)
+        as_is, divided = (
+            _intercept(boxes, hull[:n_hull], i, d_before),
+            _intercept(boxes, hull[:n_hull], i, d_before / 3),
+        )
         if min(as_is, divided) <= lowest and boxes[box, _KNOWN] == 0:
             boxes[box, _KNOWN] = _ASKED
             for side in range(dimension):
@@ -158,7 +159,8 @@ def _choose(boxes: Any, n_boxes: int, hull: Any, proposed: Any) -> tuple[int, in
 def _divide(
     boxes: Any, n_boxes: int, age: int, hull: Any, values: Any, points: Any, costs: Any, n_points: int
 ) -> tuple[int, int, int]:
-    """Divide boxes of the hull one after the other, noting points and costs until there is no room for more."""
+    """Divide boxes of the hull one after the other, noting points and costs until there is no room for
+    more."""
     dimension = (boxes.shape[1] - _CENTRE) // 4
     widths, side_costs = _CENTRE + dimension, _CENTRE + 2 * dimension
     used = 0

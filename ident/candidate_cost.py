@@ -26,8 +26,9 @@ class CandidateCost:
     """Residual sum of squares over the unit cube of a search space, with other poles frozen.
 
     `shared` are the frozen poles driven by the input, `local` those of the free responses; their columns
-    are taken out of the output once, here. From `_FEWEST_IN_A_BATCH` points on, and as long as no free responses are
-    estimated, points are evaluated eight at a time (`ident.batched_cost`); the two ways agree to rounding.
+    are taken out of the output once, here. From `_FEWEST_IN_A_BATCH` points on, and as long as no free
+    responses are estimated, points are evaluated eight at a time (`ident.batched_cost`); the two ways agree
+    to rounding.
     """
 
     def __init__(self, data: Regression, space: SearchSpace, shared: Poles, local: Poles) -> None:

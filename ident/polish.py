@@ -11,14 +11,14 @@ The unknowns are decay rates and angles, linear, so that a pole can reach the ci
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from ident.arrays import RealArray
-from ident.basis import block_parameters
 from ident.coordinates import ZETA_LEAST, ZETA_LIMIT
-from ident.least_squares import Linearisation, linearisation
+from ident.descent import blocked, chain_rule, clip_parameters, descend, free_parameters
+from ident.least_squares import Linearisation
 from ident.options import IdentOptions
 from ident.poles import Poles
 from ident.regression import Regression
@@ -64,23 +64,22 @@ class Bounds:
 
     def clip(self, poles: Poles, n_fixed_real: int = 0, n_fixed_pairs: int = 0) -> Poles:
         """The nearest poles inside the bounds; the first n_fixed ones of each type are left alone."""
-        x = _free_parameters(poles, n_fixed_real, n_fixed_pairs)
-        return _poles_of(
-            poles, n_fixed_real, n_fixed_pairs, self.clip_parameters(x, poles.real.size - n_fixed_real)
+        x = free_parameters(poles.real, poles.pairs, n_fixed_real, n_fixed_pairs)
+        n_free_real = poles.real.size - n_fixed_real
+        x = self.clip_parameters(x, n_free_real)
+        pairs = np.exp(-x[n_free_real::2] + 1j * x[n_free_real + 1 :: 2])
+        return Poles(
+            np.concatenate([poles.real[:n_fixed_real], 1 - x[:n_free_real]]),
+            np.concatenate([poles.pairs[:n_fixed_pairs], pairs]),
         )
 
     def clip_parameters(self, x: RealArray, n_free_real: int) -> RealArray:
-        x = x.copy()
-        x[:n_free_real] = np.clip(x[:n_free_real], self.distance_min, self.distance_max)
-        s = np.maximum(x[n_free_real::2], self.s_min)
-        f = np.maximum(x[n_free_real + 1 :: 2], 1e-12)
-        omega = np.hypot(s, f)
-        zeta = np.clip(s / omega, self.zeta_min, self.zeta_max)
-        omega = np.clip(omega, self.omega_min, self.omega_max)
-        s = np.maximum(zeta * omega, self.s_min)
-        x[n_free_real::2] = s
-        x[n_free_real + 1 :: 2] = np.minimum(omega * np.sqrt(1 - zeta**2), 0.995 * np.pi)
-        return x
+        """Unknowns (1 - a; s, f) inside the bounds."""
+        return np.asarray(clip_parameters(x, n_free_real, self.as_array()))
+
+    def as_array(self) -> RealArray:
+        """In the order of the fields, as `ident.descent` takes them."""
+        return np.array([getattr(self, field.name) for field in fields(self)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,47 +107,25 @@ def polish(
 
     Stops when the decrease that the linearisation still promises is below `tolerance` of J.
     """
-    n_free_real = poles.real.size - n_fixed_real
-    x = bounds.clip_parameters(_free_parameters(poles, n_fixed_real, n_fixed_pairs), n_free_real)
-    current = _poles_of(poles, n_fixed_real, n_fixed_pairs, x)
-    here = linearisation(data, current)
-    if x.size == 0:
-        return Polished(current, here.rss, 0, True)
-    # Residuals at rounding level relative to the output: nothing left to gain.
-    floor = 1e-26 * float(data.y @ data.y)
-    damping, growth = 1e-3, 2.0
-    for iteration in range(max_iterations):
-        normal, gradient = pole_system(here, current, n_fixed_real, n_fixed_pairs)
-        active = _blocked(x, gradient, bounds, n_free_real)
-        free = np.flatnonzero(~active)
-        if here.rss <= floor or free.size == 0:
-            return Polished(current, here.rss, iteration, True)
-        scale = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
-        scaled = normal[np.ix_(free, free)] / np.outer(scale, scale)
-        slope = gradient[free] / scale
-        newton = np.linalg.lstsq(scaled, slope, rcond=1e-12)[0]
-        if slope @ newton <= tolerance * here.rss:
-            return Polished(current, here.rss, iteration, True)
-        while True:
-            step = np.linalg.solve(scaled + damping * np.eye(free.size), slope)
-            trial_x = x.copy()
-            trial_x[free] += step / scale
-            trial_x = bounds.clip_parameters(trial_x, n_free_real)
-            trial_poles = _poles_of(poles, n_fixed_real, n_fixed_pairs, trial_x)
-            trial = linearisation(data, trial_poles)
-            promised = step @ (2 * slope - scaled @ step)
-            ratio = (here.rss - trial.rss) / promised if promised > 0 else 0.0
-            if ratio > 1e-4:
-                break
-            damping *= growth
-            growth *= 2
-            if damping > 1e12:
-                # No step of any length gains: the linearisation's promise is rounding, or a bound's corner.
-                return Polished(current, here.rss, iteration, False)
-        x, current, here = trial_x, trial_poles, trial
-        damping *= max(1 / 5, 1 - (2 * ratio - 1) ** 3)
-        growth = 2.0
-    return Polished(current, here.rss, max_iterations, False)
+    real, pairs = poles.real.copy(), poles.pairs.copy()
+    rss, iterations, converged = descend(
+        real,
+        pairs,
+        n_fixed_real,
+        n_fixed_pairs,
+        bounds.as_array(),
+        data.u,
+        data.y,
+        data.y_clear,
+        data.starts,
+        data.polynomials,
+        data.polynomials_q,
+        data.structure.feedthrough,
+        data.structure.estimate_initial_state,
+        tolerance,
+        max_iterations,
+    )
+    return Polished(Poles(real, pairs), rss, iterations, converged)
 
 
 def pole_system(
@@ -156,7 +133,7 @@ def pole_system(
 ) -> tuple[RealArray, RealArray]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T
     r."""
-    chain = _chain_rule(poles, n_fixed_real, n_fixed_pairs)
+    chain = chain_rule(poles.real, poles.pairs, n_fixed_real, n_fixed_pairs)
     return chain.T @ here.normal @ chain, chain.T @ here.gradient
 
 
@@ -168,74 +145,14 @@ def free_optimality(
     0 at an optimum. With records from rest, nothing fixed and no bound active this is |Phi2^T r|/|r| with
     orthonormal Phi2 (the basis with every pole doubled), by the tangent identity of design 4.2.
     """
-    x = _free_parameters(poles, n_fixed_real, n_fixed_pairs)
+    x = free_parameters(poles.real, poles.pairs, n_fixed_real, n_fixed_pairs)
     if x.size == 0 or here.rss <= 0:
         return 0.0
     normal, gradient = pole_system(here, poles, n_fixed_real, n_fixed_pairs)
-    free = np.flatnonzero(~_blocked(x, gradient, bounds, poles.real.size - n_fixed_real))
+    free = np.flatnonzero(~blocked(x, gradient, poles.real.size - n_fixed_real, bounds.as_array()))
     scale = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
     slope = gradient[free] / scale
     share = (
         slope @ np.linalg.lstsq(normal[np.ix_(free, free)] / np.outer(scale, scale), slope, rcond=1e-12)[0]
     )
     return float(np.sqrt(max(share, 0.0) / here.rss))
-
-
-def _chain_rule(poles: Poles, n_fixed_real: int, n_fixed_pairs: int) -> RealArray:
-    """(B, P): sensitivity to each free unknown as a combination of the block states driven by the fitted
-    output.
-
-    States of a real block: b/(z - a) y_hat; of a pair: sg (z - beta)/D y_hat and sg sb/D y_hat, with
-    D = z^2 - t z + g, t = 2 exp(-s) cos f, g = exp(-2 s).
-    """
-    blocks = block_parameters(poles)
-    n_real = poles.real.size
-    n_free_real = n_real - n_fixed_real
-    chain = np.zeros((poles.order, n_free_real + 2 * (poles.pairs.size - n_fixed_pairs)))
-    for i in range(n_fixed_real, n_real):
-        chain[i, i - n_fixed_real] = -1 / blocks[i, 1]  # minus: the unknown is 1 - a
-    for j in range(n_fixed_pairs, poles.pairs.size):
-        gamma, beta, sg, sb = blocks[n_real + j]
-        pole = poles.pairs[j]
-        dt, dg = np.array([-2 * pole.real, -2 * pole.imag]), np.array([-2 * gamma, 0.0])  # by s, by f
-        row, column = n_real + 2 * j, n_free_real + 2 * (j - n_fixed_pairs)
-        chain[row, column : column + 2] = dt / sg
-        chain[row + 1, column : column + 2] = (dt * beta - dg) / (sg * sb)
-    return chain
-
-
-def _free_parameters(poles: Poles, n_fixed_real: int, n_fixed_pairs: int) -> RealArray:
-    log = np.log(poles.pairs[n_fixed_pairs:])
-    pairs = np.column_stack([-log.real, log.imag]).ravel()
-    return np.concatenate([1 - poles.real[n_fixed_real:], pairs])
-
-
-def _poles_of(poles: Poles, n_fixed_real: int, n_fixed_pairs: int, x: RealArray) -> Poles:
-    n_free_real = poles.real.size - n_fixed_real
-    pairs = np.exp(-x[n_free_real::2] + 1j * x[n_free_real + 1 :: 2])
-    return Poles(
-        np.concatenate([poles.real[:n_fixed_real], 1 - x[:n_free_real]]),
-        np.concatenate([poles.pairs[:n_fixed_pairs], pairs]),
-    )
-
-
-def _blocked(
-    x: RealArray, gradient: RealArray, bounds: Bounds, n_free_real: int
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Unknowns that sit on a bound and would be driven out of it (a step goes along +gradient = S^T r)."""
-    blocked = np.zeros(x.size, dtype=np.bool_)
-    close = 1e-7  # poles pass through exp and log on the way here
-    real, down = x[:n_free_real], gradient[:n_free_real] < 0
-    blocked[:n_free_real] = (down & (real <= bounds.distance_min * (1 + close))) | (
-        ~down & (real >= bounds.distance_max * (1 - close))
-    )
-    s, f = x[n_free_real::2], x[n_free_real + 1 :: 2]
-    by_s, by_f = gradient[n_free_real::2], gradient[n_free_real + 1 :: 2]
-    omega = np.hypot(s, f)
-    zeta = s / omega
-    least = (s <= bounds.s_min * (1 + close)) | (zeta <= bounds.zeta_min * (1 + close))
-    blocked[n_free_real::2] = (least & (by_s < 0)) | ((zeta >= bounds.zeta_max * (1 - close)) & (by_s > 0))
-    blocked[n_free_real + 1 :: 2] = ((omega <= bounds.omega_min * (1 + close)) & (by_f < 0)) | (
-        (omega >= bounds.omega_max * (1 - close)) & (by_f > 0)
-    )
-    return blocked

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,23 @@ class Regression:
     polynomials: RealArray
     structure: Structure
     dt_s: float
+
+    @cached_property
+    def polynomials_q(self) -> RealArray:
+        """The polynomial columns made orthonormal within each record, (Q, N)."""
+        rows = np.zeros_like(self.polynomials)
+        for here in map(self.segment, range(self.n_records)):
+            q, _ = np.linalg.qr(self.polynomials[:, here].T)
+            rows[: q.shape[1], here] = q.T
+        return rows
+
+    @cached_property
+    def y_clear(self) -> RealArray:
+        """The outputs without their part in the polynomial columns, (N,)."""
+        y, rows = self.y.copy(), self.polynomials_q
+        for here in map(self.segment, range(self.n_records)):
+            y[here] -= rows[:, here].T @ (rows[:, here] @ y[here])
+        return y
 
     @property
     def n_samples(self) -> int:

@@ -1,0 +1,416 @@
+"""The descent of `ident.polish`, compiled: Levenberg-Marquardt steps on a linearisation from inner products.
+
+The linearisation is that of `ident.kernels.linearise` by another road. With the columns Phi (basis driven by
+the input) as rows, G = Phi Phi^T and e = y - Phi^T G^-1 Phi y, all that is needed of the projection P off the
+columns are products: r^T r = e^T e - (Phi e)^T G^-1 (Phi e), and for the states S of the blocks driven by
+Phi^T theta
+
+    S P S^T = S S^T - (S Phi^T) G^-1 (Phi S^T),   S r = S e - (S Phi^T) G^-1 (Phi e).
+
+The terms in Phi e, zero but for rounding, are a step of iterative refinement: with the condition of G bounded
+(`_LEAST_PIVOT`) they bring J and its gradient to the precision of an orthogonal factorisation. Where the
+columns are nearer to dependence, and where free responses are among them, the orthogonal factorisation itself
+is used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from ident.basis import _blocks
+from ident.kernels import _dot, _schur_drop, linearise
+from ident.lane_signals import cascade_states, pitch_of, products, single_states
+
+# Least square of a column's part outside the columns before it, relative to its own: the error of G^-1 is
+# about 1e-16 over this, before refinement.
+_LEAST_PIVOT = 1e-8
+# Order of the numbers in an array of bounds (see `ident.polish.Bounds`).
+_DISTANCE_MIN, _DISTANCE_MAX, _OMEGA_MIN, _OMEGA_MAX, _ZETA_MIN, _ZETA_MAX, _S_MIN = range(7)
+_CLOSE = 1e-7  # poles pass through exp and log on their way to a bound
+
+
+@numba.njit(cache=True)
+def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
+    """The unknowns (1 - a; s, f) inside the bounds; frequency and damping are clipped, then s and f
+    formed."""
+    inside = np.empty_like(x)
+    for i in range(n_free_real):
+        inside[i] = min(max(x[i], bounds[_DISTANCE_MIN]), bounds[_DISTANCE_MAX])
+    for i in range(n_free_real, x.size, 2):
+        s, f = max(x[i], bounds[_S_MIN]), max(x[i + 1], 1e-12)
+        omega = np.hypot(s, f)
+        zeta = min(max(s / omega, bounds[_ZETA_MIN]), bounds[_ZETA_MAX])
+        omega = min(max(omega, bounds[_OMEGA_MIN]), bounds[_OMEGA_MAX])
+        inside[i] = max(zeta * omega, bounds[_S_MIN])
+        inside[i + 1] = min(omega * np.sqrt(1 - zeta * zeta), 0.995 * np.pi)
+    return inside
+
+
+@numba.njit(cache=True)
+def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
+    """Unknowns on a bound that would be driven out of it (a step goes along +gradient = S^T r)."""
+    held = np.zeros(x.size, dtype=np.bool_)
+    low, high = 1 + _CLOSE, 1 - _CLOSE
+    for i in range(n_free_real):
+        if gradient[i] < 0:
+            held[i] = x[i] <= bounds[_DISTANCE_MIN] * low
+        else:
+            held[i] = x[i] >= bounds[_DISTANCE_MAX] * high
+    for i in range(n_free_real, x.size, 2):
+        omega = np.hypot(x[i], x[i + 1])
+        zeta = x[i] / omega
+        if gradient[i] < 0:
+            held[i] = x[i] <= bounds[_S_MIN] * low or zeta <= bounds[_ZETA_MIN] * low
+        elif gradient[i] > 0:
+            held[i] = zeta >= bounds[_ZETA_MAX] * high
+        if gradient[i + 1] < 0:
+            held[i + 1] = omega <= bounds[_OMEGA_MIN] * low
+        elif gradient[i + 1] > 0:
+            held[i + 1] = omega >= bounds[_OMEGA_MAX] * high
+    return held
+
+
+@numba.njit(cache=True)
+def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
+    """(B, P): sensitivity to each free unknown as a combination of the block states driven by the fitted
+    output.
+
+    States of a real block: b/(z - a) y_hat; of a pair: sg (z - beta)/D y_hat and sg sb/D y_hat, with
+    D = z^2 - t z + g, t = 2 exp(-s) cos f, g = exp(-2 s).
+    """
+    blocks = _blocks(real, pairs)
+    n_real, n_free_real = real.size, real.size - n_fixed_real
+    chain = np.zeros((n_real + 2 * pairs.size, n_free_real + 2 * (pairs.size - n_fixed_pairs)))
+    for i in range(n_fixed_real, n_real):
+        chain[i, i - n_fixed_real] = -1 / blocks[i, 1]  # minus: the unknown is 1 - a
+    for j in range(n_fixed_pairs, pairs.size):
+        block = blocks[n_real + j]
+        gamma, beta, sg, sb = block[0], block[1], block[2], block[3]
+        row, column = n_real + 2 * j, n_free_real + 2 * (j - n_fixed_pairs)
+        dt_ds, dt_df, dg_ds = -2 * pairs[j].real, -2 * pairs[j].imag, -2 * gamma
+        chain[row, column] = dt_ds / sg
+        chain[row, column + 1] = dt_df / sg
+        chain[row + 1, column] = (dt_ds * beta - dg_ds) / (sg * sb)
+        chain[row + 1, column + 1] = dt_df * beta / (sg * sb)
+    return chain
+
+
+@numba.njit(cache=True)
+def by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
+    """Normal matrix (P, P) and S^T r (P,) of the free unknowns."""
+    n, m = chain.shape
+    system, slope = np.zeros((m, m)), np.zeros(m)
+    turned = np.zeros((n, m))
+    for p in range(m):
+        for i in range(n):
+            if chain[i, p] != 0:
+                slope[p] += chain[i, p] * gradient[i]
+                for j in range(n):
+                    turned[j, p] += normal[j, i] * chain[i, p]
+    for p in range(m):
+        for i in range(n):
+            if chain[i, p] != 0:
+                for q in range(m):
+                    system[p, q] += chain[i, p] * turned[i, q]
+    return system, slope
+
+
+@numba.njit(cache=True)
+def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
+    """1 - a of the free real poles, then s, f of each free pair."""
+    n_free_real = real.size - n_fixed_real
+    x = np.empty(n_free_real + 2 * (pairs.size - n_fixed_pairs))
+    for i in range(n_free_real):
+        x[i] = 1 - real[n_fixed_real + i]
+    for j in range(n_fixed_pairs, pairs.size):
+        log = np.log(pairs[j])
+        x[n_free_real + 2 * (j - n_fixed_pairs)] = -log.real
+        x[n_free_real + 2 * (j - n_fixed_pairs) + 1] = log.imag
+    return x
+
+
+@numba.njit(cache=True)
+def _set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> None:
+    n_free_real = real.size - n_fixed_real
+    for i in range(n_free_real):
+        real[n_fixed_real + i] = 1 - x[i]
+    for j in range(n_fixed_pairs, pairs.size):
+        s = x[n_free_real + 2 * (j - n_fixed_pairs)]
+        f = x[n_free_real + 2 * (j - n_fixed_pairs) + 1]
+        pairs[j] = np.exp(-s) * complex(np.cos(f), np.sin(f))
+
+
+@numba.njit(cache=True)
+def _factorise(gram: Any, n: int, least_pivot: float) -> bool:
+    """Cholesky factor into the lower triangle of gram[:n, :n]; False if a pivot is below its least share."""
+    for j in range(n):
+        diagonal = gram[j, j]
+        pivot = diagonal
+        for i in range(j):
+            pivot -= gram[j, i] ** 2
+        if not pivot > least_pivot * diagonal:
+            return False
+        gram[j, j] = np.sqrt(pivot)
+        for row in range(j + 1, n):
+            entry = gram[row, j]
+            for i in range(j):
+                entry -= gram[row, i] * gram[j, i]
+            gram[row, j] = entry / gram[j, j]
+    return True
+
+
+@numba.njit(cache=True)
+def _forward(factor: Any, n: int, b: Any) -> None:
+    for i in range(n):
+        for j in range(i):
+            b[i] -= factor[i, j] * b[j]
+        b[i] /= factor[i, i]
+
+
+@numba.njit(cache=True)
+def _backward(factor: Any, n: int, b: Any) -> None:
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            b[i] -= factor[j, i] * b[j]
+        b[i] /= factor[i, i]
+
+
+@numba.njit(cache=True)
+def linearise_by_products(
+    blocks: Any,
+    n_real: int,
+    u: Any,
+    y: Any,
+    starts: Any,
+    local_q: Any,
+    feedthrough: bool,
+    rows: Any,
+    normal: Any,
+    gradient: Any,
+) -> float:
+    """J with its Kaufman linearisation as in `ident.kernels.linearise`, or -1 if the columns are too
+    dependent.
+
+    y (N,) without its part in local_q (Q, N), the polynomial nuisance columns made orthonormal within each
+    record; rows is room for 2 n + 2 rows, rounded up to fours, of the pitch of N.
+    """
+    n_total, n = y.size, normal.shape[0]
+    n_columns, n_local = n + (1 if feedthrough else 0), local_q.shape[0]
+    n_rows = n_columns + n + 1
+    pitch = pitch_of(n_total)
+    for r in range(starts.size - 1):
+        cascade_states(blocks, n_real, u, starts[r], starts[r + 1], rows, 0, pitch)
+    if feedthrough:
+        _put(rows, n * pitch, u)
+    _put(rows, n_columns * pitch, y)
+    gram = np.empty((n_rows, n_rows))
+    products(rows, pitch, 0, n_columns + 1, gram)
+    on_local = np.empty((n_rows, n_local * (starts.size - 1)))
+    _project_products(rows, pitch, 0, n_columns, local_q, starts, on_local, gram)
+    theta = np.empty(n_columns)
+    for i in range(n_columns):
+        theta[i] = gram[n_columns, i]
+    if not _factorise(gram, n_columns, _LEAST_PIVOT):
+        return -1.0
+    _forward(gram, n_columns, theta)
+    _backward(gram, n_columns, theta)
+    # The last row becomes the fitted output, then the residual before refinement.
+    last = (n_rows - 1) * pitch
+    fitted = rows[last : last + n_total]
+    for k in range(n_total):
+        fitted[k] = 0.0
+    for i in range(n_columns):
+        row, factor = rows[i * pitch : i * pitch + n_total], theta[i]
+        for k in range(n_total):
+            fitted[k] += factor * row[k]
+    for r in range(starts.size - 1):
+        single_states(blocks, n_real, fitted, starts[r], starts[r + 1], rows, n_columns, pitch)
+    for k in range(n_total):
+        fitted[k] = y[k] - fitted[k]
+    for r in range(starts.size - 1):
+        lo, hi = starts[r], starts[r + 1]
+        for i in range(n_local):
+            row, part = local_q[i, lo:hi], fitted[lo:hi]
+            factor = _dot(local_q[i], fitted, lo, hi)
+            for k in range(hi - lo):
+                part[k] -= factor * row[k]
+    products(rows, pitch, n_columns, n_rows, gram)
+    _project_products(rows, pitch, n_columns, n_columns + n, local_q, starts, on_local, gram)
+    # Rows of S and e, multiplied with L^-1 on the side of the columns: what lies in the columns.
+    for i in range(n_columns, n_rows):
+        _forward(gram, n_columns, gram[i])
+    for i in range(n):
+        at = n_columns + i
+        for j in range(i + 1):
+            total = gram[at, n_columns + j]
+            for q in range(n_columns):
+                total -= gram[at, q] * gram[n_columns + j, q]
+            normal[i, j] = total
+            normal[j, i] = total
+        total = gram[n_rows - 1, at]
+        for q in range(n_columns):
+            total -= gram[at, q] * gram[n_rows - 1, q]
+        gradient[i] = total
+    rss = gram[n_rows - 1, n_rows - 1]
+    for q in range(n_columns):
+        rss -= gram[n_rows - 1, q] ** 2
+    return float(rss)
+
+
+@numba.njit(cache=True)
+def _put(rows: Any, at: int, values: Any) -> None:
+    target = rows[at : at + values.size]
+    for k in range(values.size):
+        target[k] = values[k]
+
+
+@numba.njit(cache=True)
+def _project_products(
+    rows: Any, pitch: int, first: int, last: int, local_q: Any, starts: Any, on_local: Any, gram: Any
+) -> None:
+    """Take the nuisance columns out of the products of rows first .. last - 1 with all rows before them."""
+    n_local = local_q.shape[0]
+    for i in range(first, last):
+        row = rows[i * pitch : (i + 1) * pitch]
+        for r in range(starts.size - 1):
+            for q in range(n_local):
+                on_local[i, r * n_local + q] = _dot(row, local_q[q], starts[r], starts[r + 1])
+        for j in range(i + 1):
+            for q in range(on_local.shape[1]):
+                gram[i, j] -= on_local[i, q] * on_local[j, q]
+
+
+@numba.njit(cache=True)
+def descend(
+    real: Any,
+    pairs: Any,
+    n_fixed_real: int,
+    n_fixed_pairs: int,
+    bounds: Any,
+    u: Any,
+    y: Any,
+    y_clear: Any,
+    starts: Any,
+    polynomials: Any,
+    local_q: Any,
+    feedthrough: bool,
+    free: bool,
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[float, int, bool]:
+    """Levenberg-Marquardt from the poles given in real and pairs, which receive the end; see
+    `ident.polish.polish`.
+
+    y_clear is y without its part in local_q. Returns J, the number of iterations and whether the end is
+    stationary.
+    """
+    n, n_free_real = real.size + 2 * pairs.size, real.size - n_fixed_real
+    n_rows = 2 * n + 1 + (1 if feedthrough else 0)
+    rows = np.zeros(0 if free else pitch_of(y.size) * (4 * ((n_rows + 3) // 4)))
+    residual = np.empty(y.size)
+    x = clip_parameters(free_parameters(real, pairs, n_fixed_real, n_fixed_pairs), n_free_real, bounds)
+    _set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
+    normal, gradient = np.empty((n, n)), np.empty(n)
+    trial_normal, trial_gradient = np.empty((n, n)), np.empty(n)
+    trial_real, trial_pairs = real.copy(), pairs.copy()
+    here = _linearised(
+        _blocks(real, pairs), real.size, u, y, y_clear, starts, polynomials, local_q, feedthrough, free, rows,
+        residual, normal, gradient,
+    )  # fmt: skip
+    if x.size == 0:
+        return here, 0, True
+    # Residuals at rounding level relative to the output: nothing left to gain.
+    floor = 1e-26 * _dot(y, y, 0, y.size)
+    damping, growth = 1e-3, 2.0
+    system, factor = np.empty((x.size, x.size)), np.empty((x.size, x.size))
+    for iteration in range(max_iterations):
+        if here <= floor:
+            return here, iteration, True
+        chain = chain_rule(real, pairs, n_fixed_real, n_fixed_pairs)
+        full_system, full_slope = by_unknowns(chain, normal, gradient)
+        free_ones = np.flatnonzero(~blocked(x, full_slope, n_free_real, bounds))
+        m = free_ones.size
+        if m == 0:
+            return here, iteration, True
+        scale, slope = np.empty(m), np.empty(m)
+        for i in range(m):
+            scale[i] = np.sqrt(max(full_system[free_ones[i], free_ones[i]], 1e-300))
+            slope[i] = full_slope[free_ones[i]] / scale[i]
+            for j in range(i + 1):
+                system[i, j] = full_system[free_ones[i], free_ones[j]] / (scale[i] * scale[j])
+                system[j, i] = system[i, j]
+                factor[i, j] = system[i, j]
+        if _schur_drop(factor[:m, :m], slope.copy()) <= tolerance * here:
+            return here, iteration, True
+        while True:
+            for i in range(m):
+                for j in range(i + 1):
+                    factor[i, j] = system[i, j]
+                factor[i, i] += damping
+            ratio = 0.0
+            if _factorise(factor, m, 1e-14):
+                step = slope.copy()
+                _forward(factor, m, step)
+                _backward(factor, m, step)
+                trial_x = x.copy()
+                for i in range(m):
+                    trial_x[free_ones[i]] += step[i] / scale[i]
+                trial_x = clip_parameters(trial_x, n_free_real, bounds)
+                _set_poles(trial_x, trial_real, trial_pairs, n_fixed_real, n_fixed_pairs)
+                there = _linearised(
+                    _blocks(trial_real, trial_pairs), real.size, u, y, y_clear, starts, polynomials, local_q,
+                    feedthrough, free, rows, residual, trial_normal, trial_gradient,
+                )  # fmt: skip
+                promised = 0.0
+                for i in range(m):
+                    along = 2 * slope[i]
+                    for j in range(m):
+                        along -= system[i, j] * step[j]
+                    promised += step[i] * along
+                if promised > 0:
+                    ratio = (here - there) / promised
+                if ratio > 1e-4:
+                    break
+            damping *= growth
+            growth *= 2
+            if damping > 1e12:
+                # No step of any length gains: the linearisation's promise is rounding, or a bound's corner.
+                return here, iteration, False
+        x, here = trial_x, there
+        _set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
+        normal, trial_normal = trial_normal, normal
+        gradient, trial_gradient = trial_gradient, gradient
+        damping *= max(1 / 5, 1 - (2 * ratio - 1) ** 3)
+        growth = 2.0
+    return here, max_iterations, False
+
+
+@numba.njit(cache=True)
+def _linearised(
+    blocks: Any,
+    n_real: int,
+    u: Any,
+    y: Any,
+    y_clear: Any,
+    starts: Any,
+    polynomials: Any,
+    local_q: Any,
+    feedthrough: bool,
+    free: bool,
+    rows: Any,
+    residual: Any,
+    normal: Any,
+    gradient: Any,
+) -> float:
+    if not free:
+        rss = linearise_by_products(
+            blocks, n_real, u, y_clear, starts, local_q, feedthrough, rows, normal, gradient
+        )
+        if rss >= 0:
+            return float(rss)
+    return float(
+        linearise(blocks, n_real, u, y, starts, polynomials, feedthrough, free, residual, normal, gradient)
+    )
