@@ -63,12 +63,27 @@ def max_length_sequence(seed, n_samples):
 
 def p1(seed, n_samples=1000, snr_db=30):
     """One mode at 15 rad/s, zeta 0.015, double integrator, non-minimum-phase zero."""
+    system = _p1_system([1, 0, 0])
+    return _scaled_truth(system, max_length_sequence(1, n_samples), snr_db, seed, f"P1 {seed}")
+
+
+def p1_friction(seed, n_samples=1000, snr_db=30):
+    """P1 with s (s + 0.3) in place of the double integrator and the input held 4 samples."""
+    u = np.repeat(max_length_sequence(1, -(-n_samples // 4)), 4)[:n_samples]
+    return _scaled_truth(_p1_system([1, 0.3, 0]), u, snr_db, seed, f"P1 with friction {seed}")
+
+
+def _p1_system(slow_poles):
     numerator = 15.0**2 * np.polymul([-1 / 10.8, 1], [1 / 10.5, 1])
-    denominator = np.polymul([1, 0, 0], [1, 2 * 0.015 * 15.0, 15.0**2])
-    A, B, C, D, _ = scipy.signal.cont2discrete(scipy.signal.tf2ss(numerator, denominator), DT_S)
-    u = max_length_sequence(1, n_samples)
-    scale = 0.1265 / np.std(run((A, B, C, D), u))
-    return _truth((A, B, scale * C, scale * D), u, snr_db, np.random.default_rng(seed), f"P1 {seed}")
+    denominator = np.polymul(slow_poles, [1, 2 * 0.015 * 15.0, 15.0**2])
+    return scipy.signal.cont2discrete(scipy.signal.tf2ss(numerator, denominator), DT_S)[:4]
+
+
+def _scaled_truth(system, u, snr_db, seed, name):
+    """The plant with its gain set so that the noise-free output has the standard deviation 0.1265."""
+    A, B, C, D = system
+    scale = 0.1265 / np.std(run(system, u))
+    return _truth((A, B, scale * C, scale * D), u, snr_db, np.random.default_rng(seed), name)
 
 
 P2_HZ = (2.5, 11.0, 27.0)
@@ -113,8 +128,6 @@ def p3(n_modes, seed, snr_db, n_samples=2000):
         C += [(-1) ** i * 1.2 / i, 0.0]
     drive, out = np.array(B)[:, None], np.array(C)[None, :]
     continuous = (scipy.linalg.block_diag(*blocks), drive, out, np.zeros((1, 1)))
-    A, B, C, D = scipy.signal.cont2discrete(continuous, DT_S)[:4]
-    u = max_length_sequence(1, n_samples)
-    scale = 0.1265 / np.std(run((A, B, C, D), u))
+    system = scipy.signal.cont2discrete(continuous, DT_S)[:4]
     name = f"P3 {n_modes} modes {snr_db} dB {seed}"
-    return _truth((A, B, scale * C, scale * D), u, snr_db, np.random.default_rng(seed), name)
+    return _scaled_truth(system, max_length_sequence(1, n_samples), snr_db, seed, name)
