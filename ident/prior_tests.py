@@ -332,8 +332,8 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
         statistic(constrained.rss, free),
         relative_degree - 1,
         "a numerator without that limit",
-        f"set relative_degree = {relative_degree - 1} or leave it out (a sample of delay, an input that is not held constant "
-        "between samples, or a filter in the sensor, blurs it)",
+        f"set relative_degree = {relative_degree - 1} or leave it out (a sample of delay, a filter in the "
+        "sensor or an input that is not held constant between samples blurs it)",
     )
     return test, constrained
 
