@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from control_design.between_grid_points import AllFrequencies, bound_all_frequencies
 from control_design.biquads import SOLVER_SLACK
 from control_design.controller import Controller
 from control_design.ellipses import Complex, Real
@@ -18,10 +19,16 @@ from control_design.specification import Specification
 from control_design.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
 from control_design.worst_case import WorstCase, worst_case
 
+_PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
+_NOT_LOOKED_AT = AllFrequencies.nothing("not looked at")
+
 
 @dataclass(frozen=True)
 class SpecificationItem:
-    """One requirement on one plant: met or not, with the number that decides it and where."""
+    """One requirement on one plant: met or not, with the number that decides it and where.
+
+    bound: what was proved of `achieved` for all frequencies, where that was possible.
+    """
 
     requirement: str
     plant: str
@@ -30,6 +37,7 @@ class SpecificationItem:
     unit: str
     met: bool
     omega_rad_s: float | None = None
+    bound: float | None = None
 
     def sentence(self) -> str:
         """One line for a report."""
@@ -37,7 +45,8 @@ class SpecificationItem:
         verdict = "met" if self.met else "NOT met"
         unit = f" {self.unit}" if self.unit else ""
         numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
-        return f"{self.plant}: {self.requirement}: {numbers}: {verdict}"
+        proved = "" if self.bound is None else f" ({self.bound:.4g} proved for all frequencies)"
+        return f"{self.plant}: {self.requirement}: {numbers}{proved}: {verdict}"
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class PlantVerdict:
     closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted
     value over the ellipses (<= 1 met, 0 = not asked), frequency of the largest. bandwidth_rad_s: up to here
     every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
-    uncertainty is known everywhere.
+    uncertainty is known everywhere. all_frequencies: what was proved between the grid points.
     """
 
     plant: str
@@ -65,6 +74,7 @@ class PlantVerdict:
     bandwidth_rad_s: float
     frequencies: int
     own_grid_rad_s: tuple[float, float] | None = None
+    all_frequencies: AllFrequencies = _NOT_LOOKED_AT
 
 
 @dataclass(frozen=True)
@@ -72,8 +82,10 @@ class Certificate:
     """Verdict on a controller for a set of uncertain plants.
 
     certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches
-    -1, and every item of the specification is met, all on the grids named in `checked`. gamma: largest
-    weighted worst case (<= 1 met).
+    -1, and every item of the specification is met: for all frequencies on plants where
+    `PlantVerdict.all_frequencies` is possible, else on the grids named in `checked`. gamma: largest weighted
+    worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or None where
+    some plant allows no proof.
     """
 
     certified: bool
@@ -82,6 +94,7 @@ class Certificate:
     items: tuple[SpecificationItem, ...]
     checked: tuple[str, ...]
     not_checked: tuple[str, ...]
+    gamma_bound: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinities become None inside margins and the string "inf" elsewhere."""
@@ -104,6 +117,11 @@ class Certificate:
             values["worst_margins"] = Margins.from_dict(plain["worst_margins"])
             own = plain["own_grid_rad_s"]
             values["own_grid_rad_s"] = None if own is None else tuple(own)
+            proof = plain.get("all_frequencies")
+            if proof is not None:
+                bounds = {kind: _number(bound) for kind, bound in proof["bounds"].items()}
+                numbers = {key: _number(value) for key, value in proof.items()}
+                values["all_frequencies"] = AllFrequencies(**(numbers | {"bounds": bounds}))
             plants.append(PlantVerdict(**values))
         items = [
             SpecificationItem(**{key: _number(value) for key, value in item.items()})
@@ -116,6 +134,7 @@ class Certificate:
             items=tuple(items),
             checked=tuple(data["checked"]),
             not_checked=tuple(data["not_checked"]),
+            gamma_bound=_number(data.get("gamma_bound")),
         )
 
 
@@ -130,7 +149,7 @@ def _plain(value: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    return float(value) if value in ("inf", "-inf", "nan") else value
+    return float(value) if isinstance(value, str) and value in ("inf", "-inf", "nan") else value
 
 
 def certify(
@@ -140,11 +159,17 @@ def certify(
     *,
     omega_min_rad_s: float = 1e-4,
     n_dense: int = 6000,
+    between_own_points: Literal["nothing", "linear"] = "nothing",
 ) -> Certificate:
     """Check a controller from any source against plants and specification.
 
     The grid is built here from the poles of plants, controller and closed loop and refined where the checks
-    are worst; the optimiser's grid plays no part.
+    are worst; the optimiser's grid plays no part. Between its points the worst cases are bounded
+    (`between_grid_points`), for plants whose uncertainty can be evaluated with its derivatives: posteriors of
+    coefficients, plants without uncertainty, and uncertainties that offer `first_order`.
+
+    between_own_points: what may be assumed of a response known on its own frequencies only. "nothing": no
+    statement between them. "linear": at fraction x between two neighbours it lies in (1 - x) E_k + x E_{k+1}.
 
     Raises
     ------
@@ -161,7 +186,9 @@ def certify(
     verdicts: list[PlantVerdict] = []
     items: list[SpecificationItem] = []
     for plant in plants:
-        verdict, found = _check_plant(controller, plant, specification, omega_min_rad_s, n_dense)
+        verdict, found = _check_plant(
+            controller, plant, specification, omega_min_rad_s, n_dense, between_own_points
+        )
         verdicts.append(verdict)
         items += found
     if specification.controller_damping is not None:
@@ -169,13 +196,16 @@ def certify(
     if specification.integrator:
         items.append(_integrator_item(controller, plants[0]))
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
+    proofs = [v.all_frequencies for v in verdicts]
+    robust = robust and all(proof.proved or not proof.possible for proof in proofs)
     return Certificate(
         certified=bool(robust and all(item.met for item in items)),
         gamma=max(v.worst_weighted for v in verdicts),
         plants=tuple(verdicts),
         items=tuple(items),
-        checked=_checked_words(verdicts, specification),
-        not_checked=_not_checked_words(plants, verdicts),
+        checked=_checked_words(verdicts, specification, between_own_points),
+        not_checked=_not_checked_words(plants, verdicts, between_own_points),
+        gamma_bound=max(proof.gamma for proof in proofs) if all(p.possible for p in proofs) else None,
     )
 
 
@@ -185,6 +215,7 @@ def _check_plant(
     specification: Specification,
     omega_min_rad_s: float,
     n_dense: int,
+    between_own_points: str,
 ) -> tuple[PlantVerdict, list[SpecificationItem]]:
     poles = closed_loop_poles(controller, plant)
     radius = float(np.max(np.abs(poles))) if poles.size else 0.0
@@ -223,6 +254,18 @@ def _check_plant(
     stable = bool(radius < 1.0)
     below = np.flatnonzero(distance < np.sqrt(2.0))
     bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
+    if stable and count.matches and margins.modulus > 0:
+        proof = bound_all_frequencies(
+            controller,
+            plant,
+            specification,
+            worst,
+            modes=tuple(light),
+            omega_min_rad_s=omega_min_rad_s,
+            between_own_points=between_own_points,
+        )
+    else:
+        proof = AllFrequencies.refuted("the loop is not robustly stable on the dense grid")
     verdict = PlantVerdict(
         plant=plant.name,
         stable=stable,
@@ -241,8 +284,9 @@ def _check_plant(
         own_grid_rad_s=None
         if plant.own_grid is None
         else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
+        all_frequencies=proof,
     )
-    items = _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]))
+    items = _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]), proof)
     if specification.mode_damping is not None:
         items.append(_mode_damping_item(plant.name, loop_modes, specification))
     return verdict, items
@@ -258,17 +302,24 @@ def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
 
 
 def _items(
-    plant: UncertainPlant, specification: Specification, worst: WorstCase, margins: Margins, omega: float
+    plant: UncertainPlant,
+    specification: Specification,
+    worst: WorstCase,
+    margins: Margins,
+    omega: float,
+    proof: AllFrequencies,
 ) -> list[SpecificationItem]:
+    wanted = specification.modulus_margin
     items = [
         SpecificationItem(
             "modulus margin, worst case",
             plant.name,
-            specification.modulus_margin,
+            wanted,
             margins.modulus,
             "",
-            bool(margins.modulus >= specification.modulus_margin),
+            bool(margins.modulus >= wanted) and _proved(proof, "modulus"),
             omega,
+            wanted / proof.bounds["modulus"] if proof.possible else None,
         )
     ]
     asked = {
@@ -281,12 +332,12 @@ def _items(
         "effort": "effort, largest |W3 K S|",
         "mode damping": "damping of the mode, largest |W4 Gp S|",
     }
-    for kind, wanted in asked.items():
-        if wanted:
+    for kind in asked:
+        if asked[kind]:
             value, place = worst.peak(kind)
-            items.append(
-                SpecificationItem(words[kind], plant.name, 1.0, value, "", bool(value <= 1.0), place)
-            )
+            met = bool(value <= 1.0) and _proved(proof, kind)
+            bound = proof.bounds[kind] if proof.possible else None
+            items.append(SpecificationItem(words[kind], plant.name, 1.0, value, "", met, place, bound))
     if specification.delay_margin_s is not None:
         items.append(
             SpecificationItem(
@@ -299,6 +350,11 @@ def _items(
             )
         )
     return items
+
+
+def _proved(proof: AllFrequencies, kind: str) -> bool:
+    """Whether a kind is shown to meet its limit for all frequencies, where that can be shown at all."""
+    return not proof.possible or proof.bounds[kind] <= 1.0 + _PROOF_SLACK
 
 
 def _mode_damping_item(plant: str, modes: Sequence[Mode], specification: Specification) -> SpecificationItem:
@@ -344,7 +400,9 @@ def _integrator_item(controller: Controller, plant: UncertainPlant) -> Specifica
     )
 
 
-def _checked_words(verdicts: Sequence[PlantVerdict], specification: Specification) -> tuple[str, ...]:
+def _checked_words(
+    verdicts: Sequence[PlantVerdict], specification: Specification, between_own_points: str
+) -> tuple[str, ...]:
     words = [
         "nominal closed-loop poles of the full state space (plant, controller, computational delay)",
         "Nyquist count of the uncertainty centre against the count a stable loop needs",
@@ -354,6 +412,21 @@ def _checked_words(verdicts: Sequence[PlantVerdict], specification: Specificatio
         + ", refined around the maxima",
         "gain, phase, delay and modulus margins, nominal and worst case over the ellipses on that grid",
     ]
+    for verdict in verdicts:
+        proof = verdict.all_frequencies
+        if proof.proved:
+            assumed = (
+                ", assuming that between its own frequencies the response lies on a straight line between "
+                "members of neighbouring ellipses"
+                if verdict.own_grid_rad_s is not None and between_own_points == "linear"
+                else ""
+            )
+            words.append(
+                f"{verdict.plant}: for all frequencies from 0 to Nyquist (bounds on {proof.intervals} "
+                f"intervals): no ellipse comes nearer to -1 than {proof.distance:.4g}, the weighted worst "
+                f"case is at most {proof.gamma:.4g}, and the winding is that of a stable loop; so every plant "
+                f"in the ellipses with the nominal's unstable poles is stable{assumed}"
+            )
     if specification.mode_peak_ratio is not None:
         words.append("damping of the flexible mode as the peak of |Gp S| in its band")
     if specification.mode_damping is not None:
@@ -361,9 +434,20 @@ def _checked_words(verdicts: Sequence[PlantVerdict], specification: Specificatio
     return tuple(words)
 
 
-def _not_checked_words(plants: Sequence[UncertainPlant], verdicts: Sequence[PlantVerdict]) -> tuple[str, ...]:
-    words = [
-        "between grid points: not proved, a dense grid is a grid",
+def _not_checked_words(
+    plants: Sequence[UncertainPlant], verdicts: Sequence[PlantVerdict], between_own_points: str
+) -> tuple[str, ...]:
+    words = []
+    for verdict in verdicts:
+        proof = verdict.all_frequencies
+        if proof.proved:
+            words.append(
+                f"{verdict.plant}: rounding errors of double precision, and gain, phase and delay margins "
+                "between grid points"
+            )
+        else:
+            words.append(f"{verdict.plant}: between grid points: not proved ({proof.reason})")
+    words += [
         "joint level: the ellipses hold at their level at each frequency, not at all frequencies together",
         "nonlinear effects (friction, saturation, quantisation, backlash) and anything outside the ellipses",
         "that the true plant has as many unstable poles and integrators as the nominal",
@@ -371,9 +455,13 @@ def _not_checked_words(plants: Sequence[UncertainPlant], verdicts: Sequence[Plan
     for plant, verdict in zip(plants, verdicts, strict=True):
         if verdict.own_grid_rad_s is not None:
             low, high = verdict.own_grid_rad_s
+            between = (
+                "between its points a straight line between members is assumed"
+                if between_own_points == "linear"
+                else "between its points nothing is known"
+            )
             words.append(
-                f"{plant.name}: the uncertainty is known on its own grid only; between its points "
-                "nothing is known, and below "
+                f"{plant.name}: the uncertainty is known on its own grid only; {between}, and below "
                 f"{low:.4g} and above {high:.4g} rad/s the nominal alone was used, without uncertainty"
             )
         elif plant.uncertainty is None:

@@ -16,7 +16,10 @@ import control
 import numpy as np
 
 from control_design.ellipses import Complex, Real, readonly_complex, readonly_real
+from control_design.first_order import FirstOrder, Intervals, constant, pole_factor
 from control_design.plant_set import UncertainPlant, frequency_response
+from control_design.rational_response import RationalResponse
+from control_design.set_expansion import stacked
 from control_design.specification import RationalWeight, Specification
 
 Scenario = Literal["A", "B", "C"]
@@ -84,6 +87,35 @@ class LinkUncertainty:
         isotropic = np.abs(centre) * _ISOTROPIC[self.scenario] * np.sqrt(1 + (omega / 20) ** 4)
         covariance += isotropic[:, None, None] ** 2 * np.eye(2)
         return ResponseRecord(omega, centre, covariance, level)
+
+    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+        """Centre (F,) and generators (F, 9) of the covariance of `at`, for bounds between frequencies.
+
+        dG/dtheta = G (gain'/gain + sum p'/(z - p) - sum q'/(z - q)) with the roots' derivatives by the same
+        central differences as in `at`; the isotropic part is a disc, so its radius may carry a phase: G c (1
+        + j (omega/20)^2) and j times it.
+        """
+        poles, zeros, gain = _roots_and_gain(_NOMINAL)
+        inverse = {complex(root): pole_factor(complex(root - 1), intervals) for root in (*poles, *zeros[:2])}
+        centre = RationalResponse(gain, zeros - 1, poles - 1, 0, _DT_S).expand(intervals, cleared)
+        columns = []
+        for key, spread in _SPREAD[self.scenario].items():
+            step = 1e-5
+            up = _roots_and_gain(_NOMINAL | {key: _NOMINAL[key] * (1 + step)})
+            down = _roots_and_gain(_NOMINAL | {key: _NOMINAL[key] * (1 - step)})
+            factor = spread / (2 * step)
+            slope = constant((up[2] - down[2]) * factor / gain, intervals)
+            moved = ((up[0] - down[0], poles, factor), (up[1] - down[1], zeros, -factor))
+            for changes, roots, signed in moved:
+                for change, root in zip(changes, roots, strict=True):
+                    if change != 0:
+                        slope = slope + inverse[complex(root)].scaled(complex(signed * change))
+            columns.append(centre.times(slope))
+        omega, h = intervals.centre, intervals.half_width
+        one = np.ones(omega.size, dtype=np.complex128)
+        growth = FirstOrder(one + 1j * (omega / 20) ** 2, one * (2j * omega / 400), (h / 20) ** 2, h)
+        disc = centre.times(growth).scaled(_ISOTROPIC[self.scenario])
+        return centre, stacked([*columns, disc, disc.scaled(1j)])
 
 
 def _roots_and_gain(p: Mapping[str, float]) -> tuple[Complex, Complex, float]:

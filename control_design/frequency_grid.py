@@ -62,3 +62,16 @@ def local_maxima(value: Real) -> npt.NDArray[np.int64]:
     peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
     index = np.flatnonzero(peak)
     return np.asarray(index[np.argsort(-value[index], kind="stable")], dtype=np.int64)
+
+
+def starting_edges(
+    nyquist_rad_s: float, modes: Sequence[Mode], *, omega_min_rad_s: float, extra: npt.ArrayLike = ()
+) -> Real:
+    """Edges of a first partition of [0, Nyquist] for bounds on intervals: logarithmic, finer around modes."""
+    count = max(60, int(40 * np.log10(nyquist_rad_s / omega_min_rad_s)))
+    inner = frequency_grid(
+        nyquist_rad_s, modes, omega_min_rad_s=omega_min_rad_s, n_log=count, n_mode=40 * len(modes)
+    )
+    more = np.asarray(extra, dtype=np.float64)
+    more = more[(more > 0) & (more < nyquist_rad_s)]
+    return np.asarray(np.unique(np.concatenate([[0.0], inner, more])), dtype=np.float64)
