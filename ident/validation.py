@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import binom, chi2
 
 from ident.arrays import RealArray, readonly_real
@@ -14,6 +15,7 @@ from ident.basis import free_response
 from ident.ellipses import chi2_radius
 from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.poles import Poles
+from ident.posterior import ResponsePosterior
 from ident.record import Record
 from ident.residual_tests import ResidualTest, independence_test, whiteness_test
 
@@ -195,9 +197,11 @@ class ScatterRow:
     """One band of `repeat_scatter`; radii are RMS over the band, at one standard deviation, relative to |G|.
 
     predicted: of one repeat's own covariance; measured: scatter of the repeats around their mean, unbiased;
-    ratio = measured / predicted, about 1 if the bounds are honest about noise. between: distance of the
-    groups' means (RMS deviation, unbiased), between_ratio: the same over what noise alone would give; both
-    NaN with one group.
+    ratio = measured / predicted, about 1 if the bounds are honest about noise: then it lies between ratio_low
+    and ratio_high in 95 % of experiments like this one (chi-square with degrees_of_freedom, which a few
+    repeats and neighbouring frequencies that move together keep small). between: distance of the groups'
+    means (RMS deviation, unbiased), between_ratio: the same over what noise alone would give; both NaN with
+    one group.
     """
 
     omega_low_rad_s: float
@@ -208,6 +212,9 @@ class ScatterRow:
     ratio: float
     between: float
     between_ratio: float
+    degrees_of_freedom: float = float("nan")
+    ratio_low: float = float("nan")
+    ratio_high: float = float("nan")
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able (NaN where there is one group only)."""
@@ -215,13 +222,18 @@ class ScatterRow:
 
 
 def repeat_scatter(
-    groups: Sequence[Sequence[FrequencyUncertainty]], bands_rad_s: Sequence[tuple[float, float]]
+    groups: Sequence[Sequence[FrequencyUncertainty]],
+    bands_rad_s: Sequence[tuple[float, float]],
+    *,
+    posterior: ResponsePosterior | None = None,
 ) -> list[ScatterRow]:
     """Predicted noise ellipses against the scatter between repeats, band by band.
 
     groups: one sequence per condition (amplitude, day) with the estimate of each repeat, all on one grid;
-    e.g. `record_posteriors(...)` evaluated with `.at(omega)`. Bands without a grid frequency are left out.
-    Raises ValueError when a group has fewer than two repeats or the grids differ.
+    e.g. `record_posteriors(...)` evaluated with `.at(omega)`. posterior (of any one repeat) tells how the
+    errors of neighbouring frequencies move together, for the sampling interval of the ratio; without it they
+    count as independent. Bands without a grid frequency are left out. Raises ValueError when a group has
+    fewer than two repeats or the grids differ.
     """
     everything = [estimate for group in groups for estimate in group]
     if not everything or any(len(group) < 2 for group in groups):
@@ -252,10 +264,48 @@ def repeat_scatter(
         p, m, b, bn = (
             float(np.sqrt(np.mean(part[inside]))) for part in (predicted, measured, between, between_noise)
         )
+        relative = _relative_spread(everything[0], posterior, inside, size)
+        freedom = _independent(relative) * (len(everything) - len(groups))
+        interval = np.sqrt(chi2.ppf([0.025, 0.975], freedom) / freedom) if freedom > 0 else [np.nan, np.nan]
         rows.append(
-            ScatterRow(float(low), float(high), int(inside.sum()), p, m, _ratio(m, p), b, _ratio(b, bn))
+            ScatterRow(
+                float(low),
+                float(high),
+                int(inside.sum()),
+                p,
+                m,
+                _ratio(m, p),
+                b,
+                _ratio(b, bn),
+                freedom,
+                float(interval[0]),
+                float(interval[1]),
+            )
         )
     return rows
+
+
+def _relative_spread(
+    estimate: FrequencyUncertainty,
+    posterior: ResponsePosterior | None,
+    inside: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    size: RealArray,
+) -> RealArray:
+    """Factor M (2 F, K) of the covariance M M^T of the relative errors (Re, Im) of a band."""
+    if posterior is not None:
+        spread = posterior.frequency_rows(estimate.omega_rad_s[inside]) @ posterior.covariance_factor
+        spread = spread / size[inside, np.newaxis]
+        return np.concatenate([spread.real, spread.imag])
+    values, vectors = np.linalg.eigh(estimate.covariance[inside] / size[inside, None, None] ** 2)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    return np.asarray(block_diag(*roots))
+
+
+def _independent(spread: RealArray) -> float:
+    """Satterthwaite's degrees of freedom of |e|^2 for e ~ N(0, M M^T): tr(K)^2 / tr(K^2), K = M M^T."""
+    inner = spread.T @ spread if spread.shape[1] < spread.shape[0] else spread @ spread.T
+    total = float(np.trace(inner))
+    return total**2 / float(np.sum(inner**2)) if total > 0 else 0.0
 
 
 def _variance(estimate: FrequencyUncertainty) -> RealArray:

@@ -8,6 +8,7 @@ import pytest
 from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.model import GobfModel
 from ident.poles import Poles
+from ident.posterior import ResponsePosterior
 from ident.record import Record
 from ident.validation import FreshFit, Invalidation, fit_on_fresh_data, invalidate, repeat_scatter
 
@@ -117,3 +118,23 @@ def test_repeat_scatter_ratio_is_one_for_honest_bounds_and_shows_dishonest_ones(
     assert set(alone.to_dict()) >= {"predicted", "measured", "ratio"}
     with pytest.raises(ValueError, match="at least two repeats"):
         repeat_scatter([honest[0][:1]], [(0, 101)])
+    # 30 frequencies, circular errors, 6 repeats in 2 groups: 2 x 30 x 4.
+    assert rows[0].degrees_of_freedom == pytest.approx(240, rel=1e-3)
+
+
+def test_interval_of_the_scatter_ratio_holds_for_few_repeats_of_a_smooth_response():
+    poles = Poles.from_continuous(decay_per_s=[5.0], omega_rad_s=[30.0], zeta=[0.05], dt_s=DT)
+    rng = np.random.default_rng(7)
+    posterior = ResponsePosterior(poles, np.ones(3), 0.02 * rng.standard_normal((3, 3)), DT)
+    at = posterior.at(OMEGA)
+    inside = []
+    for _ in range(400):
+        draws = posterior.response_of(posterior.sample(rng, 3), OMEGA)
+        repeats = [FrequencyUncertainty(OMEGA, g, at.covariance, DT) for g in draws]
+        row = repeat_scatter([repeats], [(0, 101)], posterior=posterior)[0]
+        inside.append(row.ratio_low <= row.ratio <= row.ratio_high)
+        # Three coefficients, two degrees of freedom between repeats: not the 2 x 2 x 60 of loose frequencies.
+        assert 2 <= row.degrees_of_freedom <= 6
+    # Chi-square with matched mean and variance: exact for equal eigenvalues only, hence 3 % beside the 1.1 %
+    # of 400 trials.
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.035)
