@@ -275,7 +275,10 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
         residuals = [
-            structured_fit(item.data, item.end.poles, relative_degree).residual for item in (given, shifted)
+            fit(item.data, item.end.poles).residual
+            if structure.feedthrough  # which a relative degree of 1, the least there is, would refuse
+            else structured_fit(item.data, item.end.poles, relative_degree).residual
+            for item in (given, shifted)
         ]
         common = max(delay, other)
         ours = _power_from(residuals[0], given.data, common - delay)
