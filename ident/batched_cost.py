@@ -17,9 +17,9 @@ from ident.coordinates import blocks_of_point
 from ident.kernels import _schur_drop
 from ident.lanes import WIDTH, load, splat, store
 
-_PIECE = 32
-# Frozen columns are met four at a time.
-COLUMNS = 4
+_PIECE = 64
+# Frozen columns are met two at a time.
+COLUMNS = 2
 
 
 @numba.njit(cache=True)
@@ -70,14 +70,14 @@ def batched_rss(
             cross_lanes[:] = 0.0
             for at in range(starts[record], starts[record + 1], _PIECE):
                 length = min(_PIECE, starts[record + 1] - at)
-                for k in range(length):
-                    store(signal, k * WIDTH, splat(drive[at + k]))
-                _advance(blocks, n_real, n_blocks, state, signal, rows, length)
+                _advance(blocks, n_real, n_blocks, state, drive[at : at + length], signal, rows)
                 for i in range(0, n_rows, 2):
                     for j in range(0, i + 2, 2):
                         _add_products(rows, i, j, length, gram_lanes, n_rows)
-                    for j in range(0, n_against, COLUMNS):
-                        _add_cross_products(rows, i, against, at, j, length, cross_lanes)
+                    for j in range(0, n_against - 2, 4):
+                        _add_four_cross_products(rows, i, against, at, j, length, cross_lanes)
+                    if n_against % 4:
+                        _add_cross_products(rows, i, against, at, n_against - 2, length, cross_lanes)
             for lane in range(WIDTH):
                 for i in range(m):
                     for j in range(n_shared + 1):
@@ -104,21 +104,24 @@ def batched_rss(
 
 @numba.njit(cache=True)
 def _advance(
-    blocks: Any, n_real: int, n_blocks: int, state: Any, signal: Any, rows: Any, length: int
+    blocks: Any, n_real: int, n_blocks: int, state: Any, drive: Any, signal: Any, rows: Any
 ) -> None:
-    """`ident.basis.run_cascade` for eight cascades over one piece: states into rows, all-pass output into
-    signal."""
+    """`ident.basis.run_cascade` for eight cascades over one piece: states into rows; signal is room for what
+    one block hands to the next."""
     row = 0
     for i in range(n_blocks):
+        first, last = i == 0, i == n_blocks - 1
         p = i * 4 * WIDTH
         out1 = row * _PIECE * WIDTH
         x1 = load(state, row * WIDTH)
         if i < n_real:
             a, c = load(blocks, p), load(blocks, p + WIDTH)
-            for k in range(0, length * WIDTH, WIDTH):
-                v = load(signal, k)
-                store(rows, out1 + k, x1)
-                store(signal, k, c * x1 - a * v)
+            for k in range(drive.size):
+                at = k * WIDTH
+                v = splat(drive[k]) if first else load(signal, at)
+                store(rows, out1 + at, x1)
+                if not last:
+                    store(signal, at, c * x1 - a * v)
                 x1 = a * x1 + c * v
             store(state, row * WIDTH, x1)
             row += 1
@@ -128,12 +131,14 @@ def _advance(
             gb, gs, c1, c2 = gamma * beta, gamma * sb, beta * sg, sb * sg
             out2 = out1 + _PIECE * WIDTH
             x2 = load(state, (row + 1) * WIDTH)
-            for k in range(0, length * WIDTH, WIDTH):
-                v = load(signal, k)
-                store(rows, out1 + k, x1)
-                store(rows, out2 + k, x2)
-                store(signal, k, c2 * x2 - c1 * x1 + gamma * v)
-                following = gb * x1 - gs * x2 + sg * v
+            for k in range(drive.size):
+                at = k * WIDTH
+                v = splat(drive[k]) if first else load(signal, at)
+                store(rows, out1 + at, x1)
+                store(rows, out2 + at, x2)
+                if not last:
+                    store(signal, at, c2 * x2 - c1 * x1 + gamma * v)
+                following = (sg * v - gs * x2) + gb * x1
                 x2 = sb * x1 + beta * x2
                 x1 = following
             store(state, row * WIDTH, x1)
@@ -163,7 +168,29 @@ def _add_products(rows: Any, i: int, j: int, length: int, gram: Any, n_rows: int
 
 
 @numba.njit(cache=True)
-def _add_cross_products(rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any) -> None:
+def _add_cross_products(
+    rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any
+) -> None:
+    """cross[i : i + 2, j : j + 2] += products of rows i, i + 1 with columns j, j + 1 of against."""
+    a, n = i * _PIECE * WIDTH, against.shape[1] * WIDTH
+    at = i * n + j * WIDTH
+    c00, c01 = load(cross, at), load(cross, at + WIDTH)
+    c10, c11 = load(cross, at + n), load(cross, at + n + WIDTH)
+    for k in range(length):
+        a0, a1 = load(rows, a + k * WIDTH), load(rows, a + (k + _PIECE) * WIDTH)
+        q0, q1 = splat(against[start + k, j]), splat(against[start + k, j + 1])
+        c00 = c00 + a0 * q0
+        c01 = c01 + a0 * q1
+        c10 = c10 + a1 * q0
+        c11 = c11 + a1 * q1
+    store(cross, at, c00)
+    store(cross, at + WIDTH, c01)
+    store(cross, at + n, c10)
+    store(cross, at + n + WIDTH, c11)
+
+
+@numba.njit(cache=True)
+def _add_four_cross_products(rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any) -> None:
     """cross[i : i + 2, j : j + 4] += products of rows i, i + 1 with columns j .. j + 3 of against."""
     a, n = i * _PIECE * WIDTH, against.shape[1] * WIDTH
     at = i * n + j * WIDTH

@@ -82,11 +82,20 @@ class SearchSpace:
         pairs = np.where(proper, pairs, np.exp(size * (-zeta + 1j * np.sqrt(1 - zeta**2))))
         return Poles(blocks[: self.n_real, 0], pairs)
 
+    def levels(self, poles: Poles) -> RealArray:
+        """Where poles lie in the box, 0 to 1: (R + P,) by their first coordinate; beyond a side counts as on
+        it."""
+        if self.raw:
+            first = np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
+        else:
+            first = np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
+        low = np.repeat(self.low[:2], [poles.real.size, poles.pairs.size])
+        high = np.repeat(self.high[:2], [poles.real.size, poles.pairs.size])
+        return np.asarray(np.clip((first - low) / (high - low), 0, 1))
+
     def coordinates(self, units: RealArray) -> RealArray:
         """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s."""
-        points = np.empty_like(units)
-        for i, unit in enumerate(units):
-            points[i] = _coordinates_of_point(unit, self.n_real, self.low, self.high)
+        points = np.asarray(_coordinates_of_points(units, self.n_real, self.low, self.high))
         if not self.raw:
             points[:, self.n_real :: 2] -= np.log10(self.dt_s)
         return points
@@ -133,6 +142,16 @@ def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
         point[i] = floor
         point[i + 1] = low[2] + (high[2] - low[2]) * unit[i + 1]
     return point
+
+
+@numba.njit(cache=True)
+def _coordinates_of_points(units: Any, n_real: int, low: Any, high: Any) -> Any:
+    points = np.empty_like(units)
+    for i in range(units.shape[0]):
+        point = _coordinates_of_point(units[i], n_real, low, high)
+        for j in range(point.size):
+            points[i, j] = point[j]
+    return points
 
 
 @numba.njit(cache=True)

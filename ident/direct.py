@@ -61,10 +61,9 @@ def minimise(
 def best_apart(points: RealArray, costs: RealArray, count: int, apart: float = 0.15) -> RealArray:
     """Up to `count` of the best points (C, D), each at least `apart` from the better ones chosen before
     it."""
+    left = points[np.argsort(costs, kind="stable")]
     chosen: list[RealArray] = []
-    for i in np.argsort(costs, kind="stable"):
-        if all(np.linalg.norm(points[i] - other) >= apart for other in chosen):
-            chosen.append(points[i])
-            if len(chosen) == count:
-                break
+    while left.size and len(chosen) < count:
+        chosen.append(left[0])
+        left = left[np.sqrt(np.sum((left - left[0]) ** 2, axis=1)) >= apart]
     return np.array(chosen)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations_with_replacement, cycle, islice
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from ident.search_trace import PolishedMinimum, SearchStage
 
 # A rescan has to gain this fraction of J to count.
 _GAIN = 1e-6
+# Rescans of every block at most.
+_ROUNDS = 6
 # Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
 # end.
 _ROUGH = 1e-4
@@ -75,46 +79,75 @@ class PoleSearch:
         )
 
     def rescan(self, best: Polished) -> Polished:
-        """Look at each block on a grid with the rest frozen, descend from what is found, until nothing is
-        gained."""
-        for _ in range(6):
-            found = self._rescan_real(best)
-            for index in range(self.fixed.pairs.size, best.poles.pairs.size):
-                found = self._rescan_pair(found, index)
-            if not found.rss < best.rss * (1 - _GAIN):
-                return best
-            best = found
-        return best
-
-    def _rescan_real(self, best: Polished) -> Polished:
-        n_fixed = self.fixed.real.size
-        n_real = best.poles.real.size - n_fixed
+        """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round
+        gains nothing."""
+        n_fixed_real, n_fixed_pairs = self.fixed.real.size, self.fixed.pairs.size
+        n_real, n_pairs = best.poles.real.size, best.poles.pairs.size
         # Up to two real poles are looked at together: one alone can be held by the other.
-        together = min(n_real, 2)
-        for first in range(0, n_real, 2):
-            chosen = list(range(n_fixed + first, n_fixed + min(first + together, n_real)))
-            kept = Poles(np.delete(best.poles.real, chosen), best.poles.pairs)
-            space = self.space(len(chosen), 0)
-            cost = CandidateCost(self.data, space, kept, kept)
-            best = self._descend_from_grid(best, _real_grid(len(chosen)), cost, kept, n_starts=2)
+        couples = [slice(i, min(i + 2, n_real)) for i in range(n_fixed_real, n_real, 2)]
+        singles = [slice(i, i + 1) for i in range(n_fixed_pairs, n_pairs)]
+        scans = [partial(self._rescan_real, here=here) for here in couples]
+        scans += [partial(self._rescan_pair, here=here) for here in singles]
+        quiet = 0
+        for scan in islice(cycle(scans), _ROUNDS * len(scans)):
+            found = scan(best)
+            quiet = 1 if found.rss < best.rss * (1 - _GAIN) else quiet + 1
+            best = found
+            if quiet == len(scans):
+                break
         return best
 
-    def _rescan_pair(self, best: Polished, index: int) -> Polished:
-        kept = Poles(best.poles.real, np.delete(best.poles.pairs, index))
+    def _rescan_real(self, best: Polished, here: slice) -> Polished:
+        count = here.stop - here.start
+        kept = Poles(np.delete(best.poles.real, here), best.poles.pairs)
+        space = self.space(count, 0)
+        cost = CandidateCost(self.data, space, kept, kept)
+        here_now = np.sort(space.levels(Poles(best.poles.real[here])))
+
+        def looks(point: RealArray) -> tuple[Poles, bool]:
+            new = space.poles(point)
+            known = np.abs(np.sort(space.levels(new)) - here_now) <= 1 / (_REAL_GRID - 1)
+            real = best.poles.real.copy()
+            real[here] = new.real
+            return Poles(real, best.poles.pairs), bool(np.all(known))
+
+        return self._descend_from_grid(best, _real_grid(count), cost, looks, n_starts=2)
+
+    def _rescan_pair(self, best: Polished, here: slice) -> Polished:
+        kept = Poles(best.poles.real, np.delete(best.poles.pairs, here))
         space = self.space(0, 1)
         cost = CandidateCost(self.data, space, kept, kept)
+        here_now = space.levels(Poles(pairs=best.poles.pairs[here]))
         omegas, zetas = np.linspace(0, 1, _PAIR_GRID[0]), np.linspace(0, 1, _PAIR_GRID[1] + 2)[1:-1]
         grid = np.array([[omega, zeta] for omega in omegas for zeta in zetas])
-        return self._descend_from_grid(best, grid, cost, kept, n_starts=1)
+
+        def looks(point: RealArray) -> tuple[Poles, bool]:
+            new = space.poles(point)
+            known = np.abs(space.levels(new) - here_now) <= 1 / (_PAIR_GRID[0] - 1)
+            pairs = best.poles.pairs.copy()
+            pairs[here] = new.pairs
+            return Poles(best.poles.real, pairs), bool(np.all(known))
+
+        return self._descend_from_grid(best, grid, cost, looks, n_starts=1)
 
     def _descend_from_grid(
-        self, best: Polished, grid: RealArray, cost: CandidateCost, kept: Poles, n_starts: int
+        self,
+        best: Polished,
+        grid: RealArray,
+        cost: CandidateCost,
+        looks: Callable[[RealArray], tuple[Poles, bool]],
+        n_starts: int,
     ) -> Polished:
+        """Descents from the best points of the grid; `looks` gives the poles of a point, and whether it is
+        next to where the block already is: from there a descent would come back."""
         costs = cost.rss(grid)
         self.evaluations += cost.evaluations
         found = best
         for point in best_apart(grid, costs, n_starts):
-            trial = self.descend(kept.appended(cost.space.poles(point)), "rescan", _ROUGH)
+            start, known = looks(point)
+            if known:
+                continue
+            trial = self.descend(start, "rescan", _ROUGH)
             if trial.rss < found.rss * (1 - _GAIN):
                 found = self.descend(trial.poles, "rescan")
         return found
