@@ -18,6 +18,7 @@ from ident.order_selection import OrderStep
 from ident.poles import Poles
 from ident.record import Record
 from ident.search_trace import PolishedMinimum, SearchStage, SearchTrace
+from ident.stabilisation import Stabilisation
 from ident.structure import Structure
 from ident.uncertainty import ResponsePosterior
 from ident.validation import ScatterRow, fit_on_fresh_data
@@ -110,6 +111,22 @@ def identification(of: GobfModel, used: list[Record]) -> Identification:
         order_table=(OrderStep(1, 1, 2.5 * rss, 812.4), OrderStep(1, 2, rss, -95.1)),
         verdicts=("offset left out: its columns lower the test statistic by 0.3",),
         search=trace,
+    )
+
+
+def stabilisation_plot() -> Stabilisation:
+    """Two modes that stay and a pair that moves."""
+    return Stabilisation(
+        counts=np.arange(5),
+        rss=np.array([9.0, 4.0, 1.0, 0.99, 0.98]),
+        n_real=1,
+        chosen=2,
+        n_pairs=np.repeat([1, 2, 3, 4], [1, 2, 3, 4]),
+        omega_rad_s=np.array([14.1, 14.0, 62.0, 14.0, 40.0, 62.1, 5.0, 14.0, 40.1, 62.0]),
+        zeta=np.array([0.06, 0.05, 0.015, 0.05, 0.01, 0.0151, 0.3, 0.05, 0.02, 0.0149]),
+        previous=np.array([-1, 0, -1, 1, -1, 2, -1, 3, 4, 5]),
+        same_damping=np.array([False, False, False, True, False, True, False, True, False, True]),
+        needed=np.array([True, True, True, True, False, True, False, True, False, True]),
     )
 
 
@@ -261,6 +278,9 @@ def _save_identification(
         ]
         at = f"channel/{k}/"
         arrays |= {f"{at}identification/{key}": value for key, value in found.to_arrays().items()}
+        arrays |= {
+            f"{at}stabilisation/{key}": value for key, value in stabilisation_plot().to_arrays().items()
+        }
         for i, one in enumerate(used):
             arrays |= {f"{at}used/{i}/{key}": value for key, value in one.to_arrays().items()}
         for i, fit in enumerate(fresh):
@@ -281,7 +301,7 @@ def _save_uncertainty(
         omega = uncertainty_stage.display_grid(result.identification.model, result.used)
         frequency = found.at(omega, 0.95)
         empirical = uncertainty_stage.empirical_response(
-            result.used, settings.channels[k], result.identification.model.integrators
+            result.used, integrators=result.identification.model.integrators
         )
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in found.to_arrays().items()}
@@ -299,6 +319,7 @@ def _save_uncertainty(
                 "report": None,
                 "bands": [uncertainty_stage.band_row(frequency, low, high) for low, high in bands],
                 "tests": uncertainty_stage.residual_tests(found, result.bounded),
+                "intervals": uncertainty_stage.intervals_of(found, nominal.poles, 0.95),
                 "nominal": uncertainty_stage.nominal_row(frequency, nominal),
                 "repeat_scatter": [row.to_dict() for row in scatter_rows()] if scatter else None,
             }

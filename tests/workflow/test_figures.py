@@ -22,6 +22,7 @@ from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
 from workflow.figures.error_surface import draw_error_surface, searched_pairs
 from workflow.figures.nyquist import draw_nyquist, uncertain_loop
+from workflow.figures.order import draw_order
 from workflow.figures.overview import StepView, draw_overview
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import ShownRecord, draw_records
@@ -145,6 +146,15 @@ def repeats_figure(name: str = "hub") -> Figure:
     return draw_repeat_scatter(example.scatter_rows(), name=name)
 
 
+def order_figure(name: str = "hub") -> Figure:
+    steps = example.identification(
+        example.model(), [example.record([example.model()], "prbs", 1)]
+    ).order_table
+    found = frequency()
+    seen = EmpiricalResponse(OMEGA, found.centre)
+    return draw_order(steps, (1, 2), example.stabilisation_plot(), name=name, response=seen)
+
+
 FAMILIES: list[Callable[..., Figure]] = [
     records_figure,
     bode_figure,
@@ -157,6 +167,7 @@ FAMILIES: list[Callable[..., Figure]] = [
     validation_figure,
     residuals_figure,
     repeats_figure,
+    order_figure,
 ]
 
 
@@ -397,3 +408,25 @@ def test_wrong_surface_and_missing_records_are_refused():
         draw_records([ShownRecord(used[0], "estimation")], [example.INPUT], ["hub_angle_rad", "wrong"])
     with pytest.raises(ValueError, match="no band"):
         draw_repeat_scatter([], name="hub")
+
+
+def test_stabilisation_marks_say_what_the_record_says():
+    plot = example.stabilisation_plot()
+    figure = draw_order(
+        example.identification(example.model(), [example.record([example.model()], "prbs", 1)]).order_table,
+        (1, 2),
+        plot,
+        name="hub",
+    )
+    _, right = figure.axes
+    marks = {
+        line.get_label(): line.get_xdata().size
+        for line in right.lines
+        if not line.get_label().startswith("_")
+    }
+    assert marks["stays, and the data need it"] == int(np.count_nonzero(plot.stable & plot.needed))
+    assert marks["stays, but the data would not miss it"] == int(np.count_nonzero(plot.stable & ~plot.needed))
+    columns = [line.get_xdata()[0] for line in right.lines if line.get_label().startswith("_")]
+    np.testing.assert_allclose(columns, [mode.omega_rad_s for mode in plot.columns()])
+    with pytest.raises(ValueError, match="no structure"):
+        draw_order([], (1, 2), plot, name="hub")

@@ -76,6 +76,7 @@ def test_page_and_pictures_are_written(drawn):
     assert families == {
         "records",
         "error-surface",
+        "order",
         "poles",
         "bode",
         "validation",
@@ -208,8 +209,8 @@ def test_without_validation_data_the_page_warns(undrawn, tmp_path):
     ("chosen", "words"),
     [
         ({}, "Structures tried; the smallest criterion wins."),
-        ({"n_real": 1}, "n_real = 1 by the configuration, the smallest criterion decides the rest."),
-        ({"n_real": 1, "n_pairs": 2}, "asks for n_real = 1 and n_pairs = 2; the criterion, which would"),
+        ({"n_real": 1}, "n_real = 1 was asked for, the smallest criterion decides the rest."),
+        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 was asked for; the criterion, which would"),
     ],
 )
 def test_the_page_says_who_chose_the_order(undrawn, tmp_path, chosen, words):

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
-
 from workflow import storage
 from workflow.config import RunConfig
-from workflow.figures.style import Picture, inline_svg, render
+from workflow.figures.style import Picture, render
 from workflow.report.data import RunData, load
 from workflow.report.loop_sections import (
     closed_loop_section,
@@ -23,6 +18,7 @@ from workflow.report.loop_sections import (
 from workflow.report.model_sections import identification_section, records_section, uncertainty_section
 from workflow.report.page import Plot, Section, Table
 from workflow.report.pictures import pictures_of
+from workflow.report.rendering import page
 from workflow.report.verdict import reproducibility_section, verdict_of
 from workflow.run_directory import RunDirectory
 from workflow.summary import summarise
@@ -85,29 +81,10 @@ def page_of(run: RunDirectory, data: RunData, pictures: Mapping[str, Picture]) -
     table = Table(("", "quantity", "value"), tuple(rows))
     picture = (Plot("overview", OVERVIEW_CAPTION),) if "overview" in pictures else ()
     overview = Section("summary", "Summary", "Summary", (*picture, table))
-    environment = Environment(
-        loader=PackageLoader("workflow", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2").render(
+    return page(
+        "report.html.j2",
         title=data.config.run.title or data.config.run.name,
-        verdict=verdict_of(data, certified=summary.certified),
         sections=[overview, *sections],
-        drawn={plot.name: _embedded(plot, pictures[plot.name]) for plot in _plots([overview, *sections])},
+        pictures=pictures,
+        verdict=verdict_of(data, certified=summary.certified),
     )
-
-
-def _plots(sections: list[Section]) -> list[Plot]:
-    return [block for section in sections for block in section.blocks if isinstance(block, Plot)]
-
-
-def _embedded(plot: Plot, picture: Picture) -> Markup:
-    """The picture inside the page: SVG elements with ids of their own, or a base64 image."""
-    label = html.escape(plot.caption, quote=True)
-    if picture.kind == "svg":
-        return Markup(inline_svg(picture.content, f"{plot.name}-", label))
-    content = base64.b64encode(picture.content).decode("ascii")
-    return Markup(f'<img src="data:image/png;base64,{content}" alt="{label}">')

@@ -14,6 +14,7 @@ from control_design.plant_set import UncertainPlant
 from control_design.synthesis_result import Outcome, SynthesisResult
 from ident.model import GobfModel
 from ident.record import Record
+from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty
 from workflow.conditioning import as_fitted
 from workflow.config import Channel, RunConfig
@@ -40,6 +41,7 @@ class ChannelData:
     nominal: GobfModel
     frequency: FrequencyUncertainty
     empirical: FrequencyUncertainty | None
+    stabilisation: Stabilisation | None
     identified: Mapping[str, Any]
     uncertain: Mapping[str, Any]
     fresh_records: tuple[Record, ...]
@@ -117,12 +119,14 @@ def load(run: RunDirectory, config: RunConfig) -> RunData:
     for k, channel in enumerate(config.channels):
         result = channel_result(identified, k)
         empirical = uncertain.under(f"channel/{k}/empirical/")
+        plot = identified.under(f"channel/{k}/stabilisation/")
         channels.append(
             ChannelData(
                 result=result,
                 nominal=GobfModel.from_arrays(uncertain.under(f"channel/{k}/nominal/")),
                 frequency=FrequencyUncertainty.from_arrays(uncertain.under(f"channel/{k}/frequency/")),
                 empirical=FrequencyUncertainty.from_arrays(empirical) if empirical else None,
+                stabilisation=Stabilisation.from_arrays(plot) if plot else None,
                 identified=identified.document["channels"][k],
                 uncertain=uncertain.document["channels"][k],
                 fresh_records=tuple(_as_fitted(by_name[fit.name], channel) for fit in result.fresh),

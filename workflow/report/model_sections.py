@@ -6,11 +6,23 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ident.options import IdentOptions
 from workflow.config import SimulatedSource
 from workflow.report.data import ChannelData, RunData
+from workflow.report.model_blocks import (
+    STABILISATION_CAPTION,
+    band_table,
+    band_words,
+    order_table,
+    pole_tables,
+    residual_caption,
+    stabilisation_sentence,
+    structure_words,
+    test_remarks,
+    tests_by_name,
+    unknown_bands,
+)
 from workflow.report.page import Block, Plot, Remarks, Section, Table, Text, heading, maybe
-from workflow.report.pictures import channel_picture, fresh_index, residual_tests, shown_pair
+from workflow.report.pictures import channel_picture, fresh_index, shown_pair
 from workflow.report.words import count, frequency, listing, number, percent, sentence
 
 _ROLE = {"estimation": "estimation", "validation": "validation", "repeat": "repeat"}
@@ -91,32 +103,17 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     model = channel.result.identification.model
     single = len(data.channels) == 1
     blocks: list[Block] = [] if single else [heading(f"Channel {channel.label}")]
-    parts = [f"order {about['order']}"]
-    if about["integrators"]:
-        parts.append(f"{count(about['integrators'], 'integrator')} given as known")
-    if about["input_delay_samples"]:
-        parts.append(f"{count(about['input_delay_samples'], 'sample')} of input delay")
-    if about["feedthrough"]:
-        parts.append("a direct term")
     of = "Fit to"
     if about["increments"]:
         of = "Fitted to the differences from sample to sample, so that drift weighs less. Fit to those of"
     fits = listing([f"{percent(fit)} ({name})" for name, fit in about["fit_estimation_percent"].items()])
     blocks.append(
         Text(
-            f"{about['input']} to {about['output']}: {listing(parts)}, found with "
+            f"{about['input']} to {about['output']}: {structure_words(about)}, found with "
             f"{about['search_evaluations']} evaluations of the error. {of} the records used: {fits}."
         )
     )
-    modes = tuple(
-        (number(m["frequency_Hz"], 4), number(m["omega_rad_s"], 4), number(m["damping"]))
-        for m in about["modes"]
-    )
-    reals = tuple((number(z, 6), _rate(z, model.dt_s)) for z in about["real_poles_z"])
-    if modes:
-        blocks.append(Table(("pole pair: frequency [Hz]", "[rad/s]", "damping ratio [1]"), modes))
-    if reals:
-        blocks.append(Table(("real pole z [1]", "decay rate [1/s]"), reals))
+    blocks += pole_tables(about, model.dt_s, channel.uncertain.get("intervals"))
     pair = shown_pair(channel)
     if pair is not None:
         omega = float(model.poles.omega_rad_s(model.dt_s)[pair])
@@ -144,44 +141,13 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     staged = about.get("two_stage")
     blocks += maybe((sentence(staged),) if staged else (), "note", "Records made in closed loop")
     blocks += [*maybe(tuple(map(sentence, about["verdicts"])), "note", "What the data decided")]
-    if len(about["order_table"]) > 1:
-        best = min(step["criterion"] for step in about["order_table"])
-        steps = tuple(
-            (
-                str(step["n_real"]),
-                str(step["n_pairs"]),
-                number(step["rss"], 4),
-                f"{step['criterion'] - best:.1f}",
-            )
-            for step in about["order_table"]
-        )
-        head = ("real poles", "pairs", "residual sum of squares", "criterion above the best")
-        blocks.append(Table(head, steps, _who_chose(data.config.channels[index].identification)))
-    return blocks
-
-
-def _who_chose(options: IdentOptions) -> str:
-    """Caption of the table of structures: the criterion decides only what the configuration leaves open."""
-    fixed = [
-        f"{name} = {value}"
-        for name, value in (("n_real", options.n_real), ("n_pairs", options.n_pairs))
-        if value is not None
-    ]
-    if not fixed:
-        return "Structures tried; the smallest criterion wins."
-    if len(fixed) == 2:
-        return (
-            f"Structures passed on the way. The configuration asks for {listing(fixed)}; the criterion, "
-            "which would take the structure with 0, did not decide."
-        )
-    return f"Structures tried; {fixed[0]} by the configuration, the smallest criterion decides the rest."
-
-
-def _rate(z: float, dt_s: float) -> str:
-    """Decay rate of a real pole; one at or left of the origin has no counterpart in continuous time."""
-    if z > 0:
-        return number(-math.log(z) / dt_s, 4)
-    return "gone after one sample" if z == 0 else "changes sign every sample"
+    options = data.config.channels[index].identification
+    if channel.stabilisation is not None and about["order_table"]:
+        blocks += [
+            Text(stabilisation_sentence(channel.stabilisation)),
+            Plot(channel_picture("order", index, channel.label), STABILISATION_CAPTION),
+        ]
+    return blocks + order_table(about, options)
 
 
 def uncertainty_section(data: RunData) -> Section:
@@ -196,17 +162,11 @@ def _uncertain(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     about, label = channel.uncertain, channel.label
     level = percent(100 * about["level"], 4)
     bands: Sequence[Mapping[str, float]] = about["bands"]
-    narrow = min(bands, key=lambda band: band["median_radius_percent"])
-    wide = max(bands, key=lambda band: band["median_radius_percent"])
     blocks: list[Block] = [] if len(data.channels) == 1 else [heading(f"Channel {label}")]
     blocks += [
         Text(
-            f"Method '{about['method']}'. The {level} ellipses are narrowest between "
-            f"{number(narrow['from_rad_s'])} and "
-            f"{number(narrow['to_rad_s'])} rad/s (median radius {percent(narrow['median_radius_percent'])} "
-            "of the gain) "
-            f"and widest between {number(wide['from_rad_s'])} and {number(wide['to_rad_s'])} rad/s "
-            f"({percent(wide['median_radius_percent'])}). The level holds at each frequency taken alone."
+            f"Method '{about['method']}'. The {level} ellipses are {band_words(bands)}. The level holds at "
+            "each frequency taken alone."
         ),
         Plot(
             channel_picture("bode", index, label),
@@ -214,18 +174,7 @@ def _uncertain(data: RunData, index: int, channel: ChannelData) -> list[Block]:
             "of the "
             "ellipses beside the gain.",
         ),
-        Table(
-            ("from [rad/s]", "to [rad/s]", "median ellipse / gain [%]", "largest [%]"),
-            tuple(
-                (
-                    number(band["from_rad_s"]),
-                    number(band["to_rad_s"]),
-                    number(band["median_radius_percent"]),
-                    number(band["largest_radius_percent"]),
-                )
-                for band in bands
-            ),
-        ),
+        band_table(bands),
     ]
     nominal = about["nominal"]
     blocks.append(
@@ -236,21 +185,7 @@ def _uncertain(data: RunData, index: int, channel: ChannelData) -> list[Block]:
             f"{number(nominal['largest_distance'])} times the ellipse's own radius from its centre."
         )
     )
-    beyond = [band for band in bands if band["median_radius_percent"] > 100]
-    if beyond:
-        blocks.append(
-            Remarks(
-                tuple(
-                    f"Between {number(band['from_rad_s'])} and {number(band['to_rad_s'])} rad/s the "
-                    "ellipses are larger "
-                    "than the response itself: gain and phase are not known there. Advice: excite this "
-                    "band, or keep "
-                    "the controller out of it."
-                    for band in beyond
-                ),
-                "warning",
-            )
-        )
+    blocks += maybe(unknown_bands(bands), "warning")
     return blocks + _validated(data, index, channel)
 
 
@@ -295,23 +230,9 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         rows = tuple((name, role, number(fit, 4)) for name, fit, role in fits)
         blocks.append(Table(("record", "kept as", "fit [%]"), rows))
     tests = channel.uncertain["tests"]
-    if {"whiteness", "independence"} <= residual_tests(channel).keys():
-        blocks.append(
-            Plot(
-                channel_picture("residuals", index, label),
-                f"Correlation of the residuals with themselves{_behind(channel.uncertain)} and with the past "
-                "input. The verdict takes all lags together; single lags outside their own band are expected "
-                "now and then.",
-            )
-        )
-    failed = [test for test in tests if not test["passed"]]
-    passed = [test for test in tests if test["passed"]]
-    blocks += maybe(
-        tuple(f"{_on(test)}: {test['verdict']}" for test in failed), "warning", "Residual tests that fail"
-    )
-    blocks += maybe(
-        tuple(f"{_on(test)}: {test['verdict']}" for test in passed), "good", "Residual tests that pass"
-    )
+    if {"whiteness", "independence"} <= tests_by_name(tests).keys():
+        blocks.append(Plot(channel_picture("residuals", index, label), residual_caption(channel.uncertain)))
+    blocks += test_remarks(tests)
     scatter = channel.uncertain["repeat_scatter"]
     if scatter:
         blocks += [
@@ -323,17 +244,6 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
             _scatter_table(scatter),
         ]
     return blocks
-
-
-def _behind(about: Mapping[str, Any]) -> str:
-    """Which residuals the whiteness test looks at."""
-    report = about["report"]
-    order = len(report["ar_coefficients"]) if report else 0
-    return f" (behind the noise model of order {order})" if order else ""
-
-
-def _on(test: Mapping[str, Any]) -> str:
-    return "Records of the fit" if test["data"] == "estimation" else f"Record {test['data']}"
 
 
 def _scatter_table(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -13,13 +13,15 @@ from control_design.frequency_grid import frequency_grid
 from control_design.plant_set import Mode, modes_of
 from control_design.stability import closed_loop_poles
 from ident.error_surface import error_surface
+from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
-from ident.validation import ResidualTest, ScatterRow, fit_on_fresh_data
+from ident.validation import ScatterRow, fit_on_fresh_data
 from workflow.figures.bands import Real
 from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
 from workflow.figures.error_surface import draw_error_surface, searched_pairs
 from workflow.figures.nyquist import UncertainLoop, draw_nyquist, uncertain_loop
+from workflow.figures.order import draw_order
 from workflow.figures.overview import StepView, draw_overview
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import ShownRecord, draw_records
@@ -29,6 +31,7 @@ from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
 from workflow.report.data import ChannelData, RunData
+from workflow.report.model_blocks import tests_by_name
 
 Drawer = Callable[[], Figure]
 
@@ -68,7 +71,10 @@ def _of_channel(data: RunData, index: int, channel: ChannelData) -> dict[str, Dr
     add("poles", lambda: _poles(data, channel, with_loop=index == data.config.control_index))
     add("bode", lambda: _bode(data, channel))
     add("validation", lambda: _validation(data, channel))
-    tests = residual_tests(channel)
+    plot, steps = channel.stabilisation, channel.result.identification.order_table
+    if plot is not None and steps:
+        add("order", lambda: _order(channel, plot))
+    tests = tests_by_name(channel.uncertain["tests"])
     if {"whiteness", "independence"} <= tests.keys():
         add(
             "residuals",
@@ -101,16 +107,6 @@ def fresh_index(data: RunData, channel: ChannelData) -> int | None:
             if role[fit.name] == wanted:
                 return i
     return None
-
-
-def residual_tests(channel: ChannelData) -> dict[str, ResidualTest]:
-    """The tests on the estimation records by name."""
-    found = {}
-    for document in channel.uncertain["tests"]:
-        if document["data"] == "estimation":
-            test = ResidualTest.from_dict({key: value for key, value in document.items() if key != "data"})
-            found[test.name] = test
-    return found
 
 
 def _records(data: RunData) -> Figure:
@@ -154,18 +150,31 @@ def _poles(data: RunData, channel: ChannelData, *, with_loop: bool) -> Figure:
     )
 
 
+def _order(channel: ChannelData, plot: Stabilisation) -> Figure:
+    return draw_order(
+        channel.result.identification.order_table,
+        (plot.n_real, plot.chosen),
+        plot,
+        name=channel.label,
+        response=_empirical(channel),
+    )
+
+
+def _empirical(channel: ChannelData) -> EmpiricalResponse | None:
+    if channel.empirical is None:
+        return None
+    return EmpiricalResponse(channel.empirical.omega_rad_s, channel.empirical.centre)
+
+
 def _bode(data: RunData, channel: ChannelData) -> Figure:
     model = channel.result.identification.model
-    empirical = None
-    if channel.empirical is not None:
-        empirical = EmpiricalResponse(channel.empirical.omega_rad_s, channel.empirical.centre)
     return draw_bode(
         channel.frequency,
         name=channel.label,
         input_label=(model.input_name, data.unit(model.input_name)),
         output_label=(model.output_name, data.unit(model.output_name)),
         model=channel.nominal,
-        empirical=empirical,
+        empirical=_empirical(channel),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ident.closed_loop import two_stage
 from ident.identify import Identification, identify
+from ident.stabilisation import stabilisation
 from ident.validation import FreshFit, fit_on_fresh_data
 from workflow.conditioning import as_bounded, as_fitted
 from workflow.config import RunConfig
@@ -50,6 +51,7 @@ def identify_channels(stage: StageInput) -> StageData:
             else:
                 used = [as_fitted(record, channel) for record in measured]
             found = identify(used, channel.identification, progress=report)
+            plot = stabilisation(used, found, channel.identification)
             # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
             fresh = [
                 fit_on_fresh_data(found.model, as_fitted(item.record, channel))
@@ -58,6 +60,7 @@ def identify_channels(stage: StageInput) -> StageData:
             ]
         at = f"channel/{k}/"
         arrays |= {f"{at}identification/{key}": value for key, value in found.to_arrays().items()}
+        arrays |= {f"{at}stabilisation/{key}": value for key, value in plot.to_arrays().items()}
         for i, record in enumerate(used):
             arrays |= {f"{at}used/{i}/{key}": value for key, value in record.to_arrays().items()}
         if channel.bounds_band_rad_s is not None:

@@ -17,6 +17,7 @@ from ident.embedding import classical, tangent
 from ident.model import GobfModel
 from ident.nominal import nominal_near
 from ident.nonparametric import empirical_frf
+from ident.pole_intervals import pole_intervals
 from ident.poles import Poles
 from ident.prefilter import increments
 from ident.record import Record
@@ -57,7 +58,12 @@ def find_uncertainty(stage: StageInput) -> StageData:
             omega = display_grid(model, result.bounded)
             frequency = posterior.at(omega, channel.uncertainty.level)
             nominal = nominal_of(posterior, model.poles, nominal_grid(omega, channel))
-            empirical = empirical_response(result.bounded, channel, model.integrators)
+            empirical = empirical_response(
+                result.bounded,
+                integrators=0 if channel.increments else model.integrators,
+                level=channel.uncertainty.level,
+                band_rad_s=channel.bounds_band_rad_s or channel.band_rad_s,
+            )
             scatter = scatter_of(channel, result, records, bands_of(omega))
         at = f"channel/{k}/"
         arrays |= {f"{at}posterior/{key}": value for key, value in posterior.to_arrays().items()}
@@ -74,6 +80,7 @@ def find_uncertainty(stage: StageInput) -> StageData:
                 "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
                 "tests": residual_tests(posterior, result.bounded),
                 "repeat_scatter": scatter,
+                "intervals": intervals_of(posterior, model.poles, channel.uncertainty.level),
                 "nominal": nominal_row(posterior.at(nominal_grid(omega, channel)), nominal),
             }
         )
@@ -189,24 +196,52 @@ def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> l
     ]
 
 
+def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> dict[str, Any] | None:
+    """Intervals of modes (by frequency) and decay rates (slowest first), or None: only the tangent posterior
+    has them."""
+    try:
+        found = pole_intervals(posterior, poles, level)
+    except ValueError:
+        return None
+    by_frequency = np.argsort(poles.omega_rad_s(posterior.dt_s), kind="stable")
+    slowest_first = [i for i in np.argsort(-poles.real, kind="stable") if poles.real[i] > 0]
+    return {
+        "level": level,
+        "modes": [
+            {
+                "frequency_Hz": (found.omega_rad_s[i] / (2 * np.pi)).tolist(),
+                "omega_rad_s": found.omega_rad_s[i].tolist(),
+                "damping": found.zeta[i].tolist(),
+            }
+            for i in by_frequency
+        ],
+        "real_poles_per_s": [found.decay_per_s[i].tolist() for i in slowest_first],
+    }
+
+
 def empirical_response(
-    records: Sequence[Record], channel: Channel, integrators: int
+    records: Sequence[Record],
+    *,
+    integrators: int = 0,
+    level: float = 0.95,
+    band_rad_s: tuple[float, float] | None = None,
 ) -> FrequencyUncertainty | None:
     """Response without a model from the largest set of equally long records, or None if they are too
-    short."""
+    short.
+
+    integrators: as often the differences from sample to sample are taken first, of input and output, unless
+    the records are confined to a band.
+    """
     by_length: dict[int, list[Record]] = {}
     for record in records:
         by_length.setdefault(record.n_samples, []).append(record)
     alike = max(by_length.values(), key=len)
-    band = channel.bounds_band_rad_s or channel.band_rad_s
-    if band is None and not channel.increments:
+    if band_rad_s is None:
         for _ in range(integrators):  # an integrated output ends elsewhere than it began and leaks everywhere
             alike = [increments(record) for record in alike]
-    low, high = band or (None, None)
+    low, high = band_rad_s or (None, None)
     try:
-        return empirical_frf(
-            alike, level=channel.uncertainty.level, omega_min_rad_s=low, omega_max_rad_s=high
-        )
+        return empirical_frf(alike, level=level, omega_min_rad_s=low, omega_max_rad_s=high)
     except ValueError:
         return None  # a picture the records are too short for; the identification stands without it
 
