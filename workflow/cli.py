@@ -221,6 +221,26 @@ def report(
         print_summary(summary)
 
 
+@app.command(short_help="Redraw Figs. 1-7 of Ziaei & Wang 2006.")
+def paper(
+    out: Annotated[Path, typer.Option(help="Directory for page, figures and table; new or empty.")],
+    seed: Annotated[int, typer.Option(min=0, help="Root of all inputs and noise.")] = 2006,
+    replace: Annotated[bool, typer.Option("--replace", help="Exchange an earlier page in --out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Redraw the figures of Ziaei & Wang 2006 with what the paper reports beside what we find."""
+    from workflow.console import TerminalProgress, print_summary
+    from workflow.paper.command import redraw_paper
+    from workflow.paper.settings import PaperSettings
+
+    with TerminalProgress() as progress:
+        summary = redraw_paper(out, PaperSettings(seed=seed), replace=replace, progress=progress)
+    if as_json:
+        _print_json(summary.to_document())
+    else:
+        print_summary(summary)
+
+
 def _print_json(document: Mapping[str, Any]) -> None:
     from workflow.storage import strict_json
 
