@@ -34,21 +34,26 @@ def batched_rss(
     n_shared: int,
     residual_power: float,
     starts: Any,
+    free: bool,
 ) -> Any:
     """Residual sums of squares (E,) at points (E, D) of the unit cube of a search space.
 
     drive (N,) is the input of the candidate blocks; against (N, Q) holds the residual of the frozen columns,
     then n_shared columns orthonormal over all records, then columns orthonormal within each record, then
-    zeros up to a multiple of `COLUMNS`.
+    zeros up to a multiple of `COLUMNS`. With `free`, which takes a single record, the candidate poles also
+    get their free responses: the same cascades without input from the state that an impulse leaves.
     """
     n_points = units.shape[0]
     n_blocks = n_real + (units.shape[1] - n_real) // 2
-    m = units.shape[1]
+    order = units.shape[1]
+    m = 2 * order if free else order
+    driven = m - order  # the first row of the driven responses
     n_rows = m + m % 2  # an odd number is filled up with a row of zeros: products are taken two by two
     n_against = against.shape[1]
     values = np.empty(n_points)
     blocks = np.zeros(n_blocks * 4 * WIDTH)
-    state = np.zeros(m * WIDTH)
+    state, free_state = np.zeros(order * WIDTH), np.zeros(order * WIDTH)
+    silence = np.zeros(_PIECE)
     signal = np.zeros(_PIECE * WIDTH)
     rows = np.zeros(n_rows * _PIECE * WIDTH)
     gram_lanes = np.zeros(n_rows * n_rows * WIDTH)
@@ -62,6 +67,7 @@ def batched_rss(
             for i in range(n_blocks):
                 for j in range(4):
                     blocks[(i * 4 + j) * WIDTH + lane] = point[i, j]
+            _strike(point, n_real, free_state, lane)
         gram_lanes[:] = 0.0
         cross[:] = 0.0
         local[:] = 0.0
@@ -70,7 +76,9 @@ def batched_rss(
             cross_lanes[:] = 0.0
             for at in range(starts[record], starts[record + 1], _PIECE):
                 length = min(_PIECE, starts[record + 1] - at)
-                _advance(blocks, n_real, n_blocks, state, drive[at : at + length], signal, rows)
+                _advance(blocks, n_real, n_blocks, state, drive[at : at + length], signal, rows, driven)
+                if free:
+                    _advance(blocks, n_real, n_blocks, free_state, silence[:length], signal, rows, 0)
                 for i in range(0, n_rows, 2):
                     for j in range(0, i + 2, 2):
                         _add_products(rows, i, j, length, gram_lanes, n_rows)
@@ -103,16 +111,34 @@ def batched_rss(
 
 
 @numba.njit(cache=True)
+def _strike(point: Any, n_real: int, state: Any, lane: int) -> None:
+    """State of the cascade after an impulse, in one lane: what each block gets has passed the direct terms
+    before."""
+    impulse = 1.0
+    row = 0
+    for i in range(point.shape[0]):
+        if i < n_real:
+            state[row * WIDTH + lane] = point[i, 1] * impulse
+            impulse *= -point[i, 0]
+            row += 1
+        else:
+            state[row * WIDTH + lane] = point[i, 2] * impulse
+            state[(row + 1) * WIDTH + lane] = 0.0
+            impulse *= point[i, 0]
+            row += 2
+
+
+@numba.njit(cache=True)
 def _advance(
-    blocks: Any, n_real: int, n_blocks: int, state: Any, drive: Any, signal: Any, rows: Any
+    blocks: Any, n_real: int, n_blocks: int, state: Any, drive: Any, signal: Any, rows: Any, first_row: int
 ) -> None:
-    """`ident.basis.run_cascade` for eight cascades over one piece: states into rows; signal is room for what
-    one block hands to the next."""
+    """`ident.basis.run_cascade` for eight cascades over one piece: states into rows from first_row on; signal
+    is room for what one block hands to the next."""
     row = 0
     for i in range(n_blocks):
         first, last = i == 0, i == n_blocks - 1
         p = i * 4 * WIDTH
-        out1 = row * _PIECE * WIDTH
+        out1 = (first_row + row) * _PIECE * WIDTH
         x1 = load(state, row * WIDTH)
         if i < n_real:
             a, c = load(blocks, p), load(blocks, p + WIDTH)
@@ -168,9 +194,7 @@ def _add_products(rows: Any, i: int, j: int, length: int, gram: Any, n_rows: int
 
 
 @numba.njit(cache=True)
-def _add_cross_products(
-    rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any
-) -> None:
+def _add_cross_products(rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any) -> None:
     """cross[i : i + 2, j : j + 2] += products of rows i, i + 1 with columns j, j + 1 of against."""
     a, n = i * _PIECE * WIDTH, against.shape[1] * WIDTH
     at = i * n + j * WIDTH
@@ -190,7 +214,9 @@ def _add_cross_products(
 
 
 @numba.njit(cache=True)
-def _add_four_cross_products(rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any) -> None:
+def _add_four_cross_products(
+    rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any
+) -> None:
     """cross[i : i + 2, j : j + 4] += products of rows i, i + 1 with columns j .. j + 3 of against."""
     a, n = i * _PIECE * WIDTH, against.shape[1] * WIDTH
     at = i * n + j * WIDTH

@@ -26,9 +26,9 @@ class CandidateCost:
     """Residual sum of squares over the unit cube of a search space, with other poles frozen.
 
     `shared` are the frozen poles driven by the input, `local` those of the free responses; their columns
-    are taken out of the output once, here. From `_FEWEST_IN_A_BATCH` points on, and as long as no free
-    responses are estimated, points are evaluated eight at a time (`ident.batched_cost`); the two ways agree
-    to rounding.
+    are taken out of the output once, here. From `_FEWEST_IN_A_BATCH` points on, unless several records
+    have free responses, points are evaluated eight at a time (`ident.batched_cost`); the two ways agree to
+    rounding.
     """
 
     def __init__(self, data: Regression, space: SearchSpace, shared: Poles, local: Poles) -> None:
@@ -45,7 +45,8 @@ class CandidateCost:
         """Residual sums of squares (E,) at points (E, D) of the unit cube."""
         self.evaluations += len(units)
         space, frozen = self.space, self._frozen
-        if len(units) >= _FEWEST_IN_A_BATCH and not self._data.structure.estimate_initial_state:
+        free = self._data.structure.estimate_initial_state
+        if len(units) >= _FEWEST_IN_A_BATCH and not (free and self._data.n_records > 1):
             if self._against is None:
                 self._against = _against(frozen)
             together = batched_rss(
@@ -59,6 +60,7 @@ class CandidateCost:
                 frozen.shared_q.shape[0],
                 self._residual_power,
                 self._data.starts,
+                free,
             )
             return np.asarray(together, dtype=np.float64)
         values = _scan(
@@ -72,7 +74,7 @@ class CandidateCost:
             self._data.starts,
             frozen.local_q,
             frozen.shared_q,
-            self._data.structure.estimate_initial_state,
+            free,
         )
         return np.asarray(values, dtype=np.float64)
 

@@ -20,9 +20,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.basis import _blocks
-from ident.kernels import _dot, _schur_drop, linearise
-from ident.lane_signals import cascade_states, pitch_of, products, single_states
+from ident.basis import _blocks, run_cascade_free
+from ident.kernels import _dot, _schur_drop, _subtract, linearise
+from ident.lane_signals import cascade_states, combine, pitch_of, products, row_products, single_states
 
 # Least square of a column's part outside the columns before it, relative to its own: the error of G^-1 is
 # about 1e-16 over this, before refinement.
@@ -179,6 +179,18 @@ def _backward(factor: Any, n: int, b: Any) -> None:
 
 
 @numba.njit(cache=True)
+def _fours(count: int) -> int:
+    return -(-count // 4) * 4
+
+
+@numba.njit(cache=True)
+def room_for_rows(order: int, n_samples: int, feedthrough: bool, free: bool) -> int:
+    """Length of the scratch array of `linearise_by_products`."""
+    n_columns = order * (2 if free else 1) + (1 if feedthrough else 0)
+    return int((_fours(n_columns) + _fours(order) + 2) * pitch_of(n_samples))
+
+
+@numba.njit(cache=True)
 def linearise_by_products(
     blocks: Any,
     n_real: int,
@@ -187,82 +199,78 @@ def linearise_by_products(
     starts: Any,
     local_q: Any,
     feedthrough: bool,
+    free: bool,
     rows: Any,
     normal: Any,
     gradient: Any,
 ) -> float:
-    """J with its Kaufman linearisation as in `ident.kernels.linearise`, or -1 if the columns are too
-    dependent.
+    """J with its Kaufman linearisation as `ident.kernels.linearise`, or -1 if the columns are too dependent.
 
     y (N,) without its part in local_q (Q, N), the polynomial nuisance columns made orthonormal within each
-    record; rows is room for 2 n + 2 rows, rounded up to fours, of the pitch of N.
+    record; free only with a single record; rows is zeros (`room_for_rows`), or what an earlier call with
+    poles of the same number left there.
     """
     n_total, n = y.size, normal.shape[0]
-    n_columns, n_local = n + (1 if feedthrough else 0), local_q.shape[0]
-    n_rows = n_columns + n + 1
+    n_columns = n * (2 if free else 1) + (1 if feedthrough else 0)
+    first = _fours(n_columns)  # the row of the first state
+    n_rows = first + _fours(n)
     pitch = pitch_of(n_total)
+    fitted = rows[n_rows * pitch : (n_rows + 1) * pitch]
+    output = rows[(n_rows + 1) * pitch : (n_rows + 2) * pitch]
+    _put(output, y)
     for r in range(starts.size - 1):
         cascade_states(blocks, n_real, u, starts[r], starts[r + 1], rows, 0, pitch)
+    if free:
+        run_cascade_free(blocks, n_real, rows.reshape((-1, pitch)), n, n_total)
     if feedthrough:
-        _put(rows, n * pitch, u)
-    _put(rows, n_columns * pitch, y)
+        _put(rows[(n_columns - 1) * pitch :], u)
     gram = np.empty((n_rows, n_rows))
-    products(rows, pitch, 0, n_columns + 1, gram)
-    on_local = np.empty((n_rows, n_local * (starts.size - 1)))
+    products(rows, pitch, 0, first, gram)
+    n_local = local_q.shape[0]
+    on_local = np.zeros((n_rows, n_local * (starts.size - 1)))
     _project_products(rows, pitch, 0, n_columns, local_q, starts, on_local, gram)
-    theta = np.empty(n_columns)
-    for i in range(n_columns):
-        theta[i] = gram[n_columns, i]
+    theta = np.zeros(n_rows)
+    row_products(rows, pitch, first, output, theta)
     if not _factorise(gram, n_columns, _LEAST_PIVOT):
         return -1.0
     _forward(gram, n_columns, theta)
     _backward(gram, n_columns, theta)
-    # The last row becomes the fitted output, then the residual before refinement.
-    last = (n_rows - 1) * pitch
-    fitted = rows[last : last + n_total]
-    for k in range(n_total):
-        fitted[k] = 0.0
-    for i in range(n_columns):
-        row, factor = rows[i * pitch : i * pitch + n_total], theta[i]
-        for k in range(n_total):
-            fitted[k] += factor * row[k]
+    combine(rows, pitch, first, theta, fitted)
     for r in range(starts.size - 1):
-        single_states(blocks, n_real, fitted, starts[r], starts[r + 1], rows, n_columns, pitch)
+        single_states(blocks, n_real, fitted, starts[r], starts[r + 1], rows, first, pitch)
     for k in range(n_total):
-        fitted[k] = y[k] - fitted[k]
+        fitted[k] = output[k] - fitted[k]
+    # From here on "fitted" is the residual before refinement.
     for r in range(starts.size - 1):
         lo, hi = starts[r], starts[r + 1]
         for i in range(n_local):
-            row, part = local_q[i, lo:hi], fitted[lo:hi]
-            factor = _dot(local_q[i], fitted, lo, hi)
-            for k in range(hi - lo):
-                part[k] -= factor * row[k]
-    products(rows, pitch, n_columns, n_rows, gram)
-    _project_products(rows, pitch, n_columns, n_columns + n, local_q, starts, on_local, gram)
-    # Rows of S and e, multiplied with L^-1 on the side of the columns: what lies in the columns.
-    for i in range(n_columns, n_rows):
+            _subtract(fitted, _dot(local_q[i], fitted, lo, hi), local_q[i], lo, hi)
+    products(rows, pitch, first, n_rows, gram)
+    _project_products(rows, pitch, first, first + n, local_q, starts, on_local, gram)
+    on_residual = np.empty(n_rows)
+    row_products(rows, pitch, n_rows, fitted, on_residual)
+    # Multiplied with L^-1 on the side of the columns: what of the states and the residual lies in them.
+    _forward(gram, n_columns, on_residual)
+    for i in range(first, first + n):
         _forward(gram, n_columns, gram[i])
     for i in range(n):
-        at = n_columns + i
         for j in range(i + 1):
-            total = gram[at, n_columns + j]
+            left = gram[first + i, first + j]
             for q in range(n_columns):
-                total -= gram[at, q] * gram[n_columns + j, q]
-            normal[i, j] = total
-            normal[j, i] = total
-        total = gram[n_rows - 1, at]
+                left -= gram[first + i, q] * gram[first + j, q]
+            normal[i, j] = left
+            normal[j, i] = left
+        gradient[i] = on_residual[first + i]
         for q in range(n_columns):
-            total -= gram[at, q] * gram[n_rows - 1, q]
-        gradient[i] = total
-    rss = gram[n_rows - 1, n_rows - 1]
+            gradient[i] -= gram[first + i, q] * on_residual[q]
+    rss = _dot(fitted, fitted, 0, n_total)
     for q in range(n_columns):
-        rss -= gram[n_rows - 1, q] ** 2
+        rss -= on_residual[q] ** 2
     return float(rss)
 
 
 @numba.njit(cache=True)
-def _put(rows: Any, at: int, values: Any) -> None:
-    target = rows[at : at + values.size]
+def _put(target: Any, values: Any) -> None:
     for k in range(values.size):
         target[k] = values[k]
 
@@ -308,8 +316,7 @@ def descend(
     stationary.
     """
     n, n_free_real = real.size + 2 * pairs.size, real.size - n_fixed_real
-    n_rows = 2 * n + 1 + (1 if feedthrough else 0)
-    rows = np.zeros(0 if free else pitch_of(y.size) * (4 * ((n_rows + 3) // 4)))
+    rows = np.zeros(room_for_rows(n, y.size, feedthrough, free))
     residual = np.empty(y.size)
     x = clip_parameters(free_parameters(real, pairs, n_fixed_real, n_fixed_pairs), n_free_real, bounds)
     _set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
@@ -405,9 +412,9 @@ def _linearised(
     normal: Any,
     gradient: Any,
 ) -> float:
-    if not free:
+    if not free or starts.size == 2:
         rss = linearise_by_products(
-            blocks, n_real, u, y_clear, starts, local_q, feedthrough, rows, normal, gradient
+            blocks, n_real, u, y_clear, starts, local_q, feedthrough, free, rows, normal, gradient
         )
         if rss >= 0:
             return float(rss)

@@ -140,17 +140,14 @@ def _spread(
 
 @numba.njit(cache=True)
 def products(rows: Any, pitch: int, first: int, n_rows: int, gram: Any) -> None:
-    """gram[i, j] = row i times row j for first <= i < n_rows and j <= i; rows come in fours.
-
-    There must be room in rows for n_rows rounded up to a multiple of four.
-    """
-    for i in range(first - first % 4, n_rows, 4):
+    """gram[i, j] = row i times row j for first <= i < n_rows, j <= i; both multiples of four."""
+    for i in range(first, n_rows, 4):
         for j in range(0, i + 4, 4):
-            _tile(rows, i * pitch, j * pitch, pitch, gram, i, j, first, n_rows)
+            _sixteen_products(rows, i * pitch, j * pitch, pitch, gram[i : i + 4, j : j + 4])
 
 
 @numba.njit(cache=True)
-def _tile(rows: Any, a: int, b: int, pitch: int, gram: Any, i: int, j: int, first: int, n_rows: int) -> None:
+def _sixteen_products(rows: Any, a: int, b: int, pitch: int, target: Any) -> None:
     g00, g01, g02, g03 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
     g10, g11, g12, g13 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
     g20, g21, g22, g23 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
@@ -178,12 +175,41 @@ def _tile(rows: Any, a: int, b: int, pitch: int, gram: Any, i: int, j: int, firs
         g31 = g31 + a0 * b1
         g32 = g32 + a0 * b2
         g33 = g33 + a0 * b3
-    sums = np.array([
-        [total(g00), total(g01), total(g02), total(g03)],
-        [total(g10), total(g11), total(g12), total(g13)],
-        [total(g20), total(g21), total(g22), total(g23)],
-        [total(g30), total(g31), total(g32), total(g33)],
-    ])  # fmt: skip
-    for p in range(max(first - i, 0), min(4, n_rows - i)):
-        for q in range(min(4, i + p - j + 1)):
-            gram[i + p, j + q] = sums[p, q]
+    target[0, 0], target[0, 1], target[0, 2], target[0, 3] = total(g00), total(g01), total(g02), total(g03)
+    target[1, 0], target[1, 1], target[1, 2], target[1, 3] = total(g10), total(g11), total(g12), total(g13)
+    target[2, 0], target[2, 1], target[2, 2], target[2, 3] = total(g20), total(g21), total(g22), total(g23)
+    target[3, 0], target[3, 1], target[3, 2], target[3, 3] = total(g30), total(g31), total(g32), total(g33)
+
+
+@numba.njit(cache=True)
+def row_products(rows: Any, pitch: int, n_rows: int, vector: Any, target: Any) -> None:
+    """target[i] = row i times vector (pitch,), for i < n_rows, a multiple of four."""
+    for i in range(0, n_rows, 4):
+        a = i * pitch
+        g0, g1, g2, g3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        for k in range(0, pitch, WIDTH):
+            v = load(vector, k)
+            g0 = g0 + load(rows, a + k) * v
+            g1 = g1 + load(rows, a + pitch + k) * v
+            g2 = g2 + load(rows, a + 2 * pitch + k) * v
+            g3 = g3 + load(rows, a + 3 * pitch + k) * v
+        target[i], target[i + 1], target[i + 2], target[i + 3] = total(g0), total(g1), total(g2), total(g3)
+
+
+@numba.njit(cache=True)
+def combine(rows: Any, pitch: int, n_rows: int, factors: Any, target: Any) -> None:
+    """target (pitch,) = sum of factors[i] times row i over i < n_rows, a multiple of four."""
+    for k in range(0, pitch, WIDTH):
+        store(target, k, splat(0.0))
+    for i in range(0, n_rows, 4):
+        a = i * pitch
+        f0, f1, f2, f3 = (
+            splat(factors[i]),
+            splat(factors[i + 1]),
+            splat(factors[i + 2]),
+            splat(factors[i + 3]),
+        )
+        for k in range(0, pitch, WIDTH):
+            sum01 = f0 * load(rows, a + k) + f1 * load(rows, a + pitch + k)
+            sum23 = f2 * load(rows, a + 2 * pitch + k) + f3 * load(rows, a + 3 * pitch + k)
+            store(target, k, load(target, k) + (sum01 + sum23))
