@@ -111,7 +111,7 @@ def test_conditions_are_those_of_scipys_matrix_logarithm(k):
 
 @pytest.mark.parametrize("k", [0, 2])
 def test_functionals_of_the_model_and_of_blocks_behind_it_are_contour_integrals(k):
-    poles = with_zeros(Poles([0.7], [0.9 * np.exp(0.5j)]), k)
+    poles = with_zeros(Poles([0.7], [0.9 * np.exp(0.5j), 0.6 * np.exp(0.9j)]), k)
     coefficients = np.random.default_rng(0).normal(size=poles.order)
     blocks = (Poles([0.7]), Poles(pairs=[0.9 * np.exp(0.5j)]))
     rows, behind = conditions_with_sensitivities(poles, k, 4, coefficients, blocks)
