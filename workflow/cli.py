@@ -114,7 +114,7 @@ def simulate(
             typer.echo(str(path))
 
 
-@app.command(short_help="Identify one channel from log files.")
+@app.command(short_help="Identify one channel from log files; one-page report.")
 def identify(
     log: Annotated[
         list[Path],
@@ -128,8 +128,22 @@ def identify(
     dt_s: Annotated[
         float | None, typer.Option(help="Sampling period [s], if there is no --time.", show_default=False)
     ] = None,
+    report_page: Annotated[
+        Path | None,
+        typer.Option(
+            "--report",
+            help="Write a one-page report here (HTML, one file): findings in words, then the pictures.",
+            show_default=False,
+        ),
+    ] = None,
     validation: Annotated[
         list[Path] | None, typer.Option(help="Log kept for validation (repeatable).", show_default=False)
+    ] = None,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            help="Reference column of logs made in closed loop: identified in two stages.", show_default=False
+        ),
     ] = None,
     pairs: Annotated[
         int | None,
@@ -143,37 +157,52 @@ def identify(
     delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
     feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
     level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the model here for other programs: .json or .mat by the ending (state space, poles, "
+            "ellipses).",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Write model and ellipses here (npz), for `flexlink design`.", show_default=False),
+        typer.Option(help="Write model and posterior here (npz), for `flexlink design`.", show_default=False),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Identify one channel from log files: poles, modes, fit, residual tests."""
+    """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     from ident.options import IdentOptions
-    from workflow.console import print_summary
-    from workflow.entry import identify_logs
+    from workflow.console import TerminalProgress, print_summary
+    from workflow.log_identification import identify_logs
     from workflow.settings import check
 
     chosen = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "feedthrough": feedthrough}
-    summary = identify_logs(
-        log,
-        input_name,
-        output_name,
-        time=time,
-        dt_s=dt_s,
-        validation=validation or [],
-        options=check(IdentOptions, {**chosen, "input_delay_samples": delay}, source="options"),
-        level=level,
-        out=out,
-    )
+    options = check(IdentOptions, {**chosen, "input_delay_samples": delay}, source="options")
+    with TerminalProgress() as progress:
+        summary = identify_logs(
+            log,
+            input_name,
+            output_name,
+            time=time,
+            dt_s=dt_s,
+            reference=reference,
+            validation=validation or [],
+            options=options,
+            level=level,
+            out=out,
+            report=report_page,
+            export=export,
+            progress=progress,
+        )
     if as_json:
         document = summary.to_document()
-        _print_json({key: document[key] for key in ("title", "verdict", "numbers", "table")})
+        _print_json({key: document[key] for key in ("title", "verdict", "report", "numbers", "table")})
     else:
         print_summary(summary)
-        if out is not None:
-            typer.echo(f"model: {out}")
+        for name, path in (("model", export), ("model for flexlink design", out)):
+            if path is not None:
+                typer.echo(f"{name}: {path}")
 
 
 @app.command()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,9 @@ from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis_result import Outcome
-from ident.embedding import EmbeddingOptions, tangent
-from ident.identify import identify
 from ident.model import GobfModel
-from ident.options import IdentOptions
 from ident.record import Record
 from ident.uncertainty import ResponsePosterior
-from ident.validation import fit_on_fresh_data, whiteness_test
 from workflow import storage
 from workflow.config import RunConfig, SimulatedSource, load_config
 from workflow.errors import InputError, naming
@@ -31,25 +26,13 @@ from workflow.randomness import stage_rng
 from workflow.run_directory import RunDirectory, default_directory
 from workflow.settings import check, read_toml
 from workflow.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
-from workflow.stages.identify import describe_model
-from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.stages.results import load_plant
-from workflow.stages.uncertainty import (
-    band_row,
-    bands_of,
-    display_grid,
-    nominal_of,
-    nominal_row,
-    residual_tests,
-)
 from workflow.storage import AnyArray
 from workflow.summary import (
     RunSummary,
     Section,
     certificate_rows,
-    channel_rows,
     design_rows,
-    uncertainty_rows,
 )
 
 
@@ -139,89 +122,6 @@ def csv_text(record: Record) -> str:
     table = np.column_stack([record.time_s, record.input, record.output])
     lines += [",".join(f"{value:.9g}" for value in row) for row in table]
     return "\n".join(lines) + "\n"
-
-
-def identify_logs(
-    logs: Sequence[Path],
-    input_name: str,
-    output_name: str,
-    *,
-    time: str | None = None,
-    dt_s: float | None = None,
-    validation: Sequence[Path] = (),
-    options: IdentOptions | None = None,
-    level: float = 0.95,
-    out: Path | None = None,
-) -> RunSummary:
-    """Identify one channel from log files (tangent uncertainty); with `out` write model and posterior as npz.
-
-    The noise is modelled where the residuals are not white.
-    Raises InputError: one line naming file, column or line.
-    """
-    if not 0.5 < level < 1:
-        raise InputError(f"--level must lie between 0.5 and 1, got {level}")
-    if out is not None:
-        storage.check_writable(out)
-    refuse_repeated_files([*logs, *validation])
-    used = [read_log(Path(path), [input_name], [output_name], time=time, dt_s=dt_s) for path in logs]
-    fresh_logs = [
-        read_log(Path(path), [input_name], [output_name], time=time, dt_s=dt_s) for path in validation
-    ]
-    for record in used:
-        refuse_constant_input(record)
-    common = with_common_sampling_time([*used, *fresh_logs])
-    used, fresh_logs = common[: len(used)], common[len(used) :]
-    with naming("identify"):
-        found = identify(used, options)
-        fresh = tuple(fit_on_fresh_data(found.model, record) for record in fresh_logs)
-        # White-noise bounds around coloured residuals are far too narrow, so the data decide.
-        coloured = not whiteness_test(found.residuals).passed
-        posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=coloured))
-        omega = display_grid(found.model, used)
-        nominal = nominal_of(posterior, found.model.poles, omega)
-        frequency = posterior.at(omega, level)
-        tests = residual_tests(posterior, used)
-    about = {
-        "name": output_name,
-        **describe_model(found),
-        "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),
-        "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
-        "fit_repeat_percent": {},
-    }
-    spread = {
-        "level": level,
-        "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
-        "tests": tests,
-        "repeat_scatter": None,
-        "nominal": nominal_row(frequency, nominal),
-    }
-    if out is not None:
-        storage.write_npz(out, plant_arrays(nominal, posterior, level))
-    return RunSummary(
-        title=f"{input_name} to {output_name}",
-        sections=(Section("model", channel_rows(about)), Section("uncertainty", uncertainty_rows(spread))),
-        numbers={**about, "uncertainty": spread, "file": None if out is None else str(out)},
-        verdict="; ".join(found.warnings) or "no warnings",
-    )
-
-
-def refuse_repeated_files(paths: Sequence[Path]) -> None:
-    """A log given twice would count its noise twice as well known, or validate what it was fitted to."""
-    seen: set[Path] = set()
-    for path in paths:
-        place = Path(path).resolve()
-        if place in seen:
-            raise InputError(f"{path}: given twice; expected different experiments")
-        seen.add(place)
-
-
-def plant_arrays(model: GobfModel, posterior: ResponsePosterior, level: float) -> dict[str, AnyArray]:
-    """What `flexlink identify --out` writes and `flexlink design` reads."""
-    return {
-        **{f"model/{key}": value for key, value in model.to_arrays().items()},
-        **{f"posterior/{key}": value for key, value in posterior.to_arrays().items()},
-        "level": np.array(level),
-    }
 
 
 def load_plant_file(path: Path) -> UncertainPlant:

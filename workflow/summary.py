@@ -67,7 +67,10 @@ def summarise(run: RunDirectory, config: RunConfig) -> RunSummary:
         documents["identify"]["channels"], documents["uncertainty"]["channels"], strict=True
     ):
         channels.append(
-            Section(f"channel {found['name']}", (*channel_rows(found), *uncertainty_rows(spread)))
+            Section(
+                f"channel {found['name']}",
+                (*channel_rows(found, spread["intervals"]), *uncertainty_rows(spread)),
+            )
         )
     design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
     unit = _unit(documents["records"], config.control_channel.output)
@@ -129,16 +132,21 @@ def record_rows(document: Mapping[str, Any]) -> tuple[Row, ...]:
     return tuple(rows)
 
 
-def channel_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
-    """Structure, modes and fits of one channel."""
+def channel_rows(found: Mapping[str, Any], intervals: Mapping[str, Any] | None = None) -> tuple[Row, ...]:
+    """Structure, modes (with the intervals of the posterior, if given) and fits of one channel."""
     extras = [_count(found["integrators"], "integrator")] if found["integrators"] else []
     extras += [f"delay {found['input_delay_samples']}"] if found["input_delay_samples"] else []
     extras += ["direct term"] if found["feedthrough"] else []
     rows = [Row("order", ", ".join([str(found["order"]), *extras]))]
-    rows += [
-        Row("mode", f"{mode['frequency_Hz']:.4g} Hz, damping {mode['damping']:.3g}")
-        for mode in found["modes"]
-    ]
+    for index, mode in enumerate(found["modes"]):
+        text = f"{mode['frequency_Hz']:.4g} Hz, damping {mode['damping']:.3g}"
+        if intervals is not None:
+            known = intervals["modes"][index]
+            text += (
+                f" ({100 * intervals['level']:g} %: {between(*known['frequency_Hz'])} Hz, "
+                f"{between(*known['damping'])})"
+            )
+        rows.append(Row("mode", text))
     if found["real_poles_per_s"]:
         rates = ", ".join(f"{rate:.4g}" for rate in found["real_poles_per_s"])
         rows.append(Row("real poles", f"{rates} 1/s"))
@@ -151,6 +159,15 @@ def channel_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
             of = " of increments" if found.get("increments") else ""
             rows.append(Row(f"fit, {role}", _range(fits, f"%{of}")))
     return tuple(rows)
+
+
+def between(low: float, high: float) -> str:
+    """low to high, with as many digits as tell them apart; 'not known' where an end is open."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return "not known"
+    largest, span = max(abs(low), abs(high)), high - low
+    digits = min(2 + math.ceil(math.log10(largest / span)), 9) if span > 0 else 3
+    return f"{low:.{max(digits, 2)}g} to {high:.{max(digits, 2)}g}"
 
 
 def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:

@@ -21,11 +21,12 @@ def draw_poles(
     integrators: int = 0,
     closed_loop: Complex | None = None,
     others: Sequence[tuple[str, Complex]] = (),
+    zeros: Complex | None = None,
     name: str = "",
 ) -> Figure:
     """Identified poles (n,), known poles at z = 1, and closed-loop poles (m,), whole circle and near z = 1.
 
-    `others` are further named sets, e.g. those of a second channel.
+    `others` are further named sets, e.g. those of a second channel; zeros (k,) are the model's, circles.
     """
     known = np.ones(1 if integrators else 0, dtype=np.complex128)
     with style.house_style():
@@ -55,6 +56,18 @@ def draw_poles(
                     color=style.MEASURED,
                     label=style.plain(label),
                 )
+            if zeros is not None:
+                axes.plot(
+                    zeros.real,
+                    zeros.imag,
+                    ls="none",
+                    marker="o",
+                    ms=7,
+                    mfc="none",
+                    mec=style.MEASURED,
+                    mew=1.3,
+                    label="zeros",
+                )
             axes.plot(
                 identified.real,
                 identified.imag,
@@ -80,9 +93,9 @@ def draw_poles(
             axes.set_ylabel("imaginary part of z [1]")
         whole.set_xlim(-1.1, 1.1)
         whole.set_ylim(-1.1, 1.1)
-        whole.set_title(
-            f"Poles{': ' + style.plain(name, 13) if name else ''} (sampled every {dt_s * 1e3:.4g} ms)"
-        )
+        what = "Poles" if zeros is None else "Poles, zeros"
+        where = f": {style.plain(name, 13)}" if name else ""
+        whole.set_title(f"{what}{where} (sampled every {dt_s * 1e3:.4g} ms)")
         corner = _near_corner(np.concatenate([identified, known]))
         near.set_xlim(1 - corner, 1 + 0.12 * corner)
         near.set_ylim(-0.12 * corner, corner)

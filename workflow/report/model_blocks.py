@@ -11,9 +11,10 @@ from typing import Any
 
 from ident.options import IdentOptions
 from ident.stabilisation import Stabilisation
-from ident.validation import ResidualTest
 from workflow.report.page import Block, Remarks, Table, maybe
-from workflow.report.words import count, frequency, interval, listing, number, percent
+from workflow.report.words import count, frequency, listing, number, percent
+from workflow.stages.uncertainty import noise_order
+from workflow.summary import between
 
 Document = Mapping[str, Any]
 
@@ -33,7 +34,7 @@ def structure_words(about: Document) -> str:
 def pole_tables(about: Document, dt_s: float, intervals: Document | None) -> list[Block]:
     """Pairs and real poles, with the intervals of the posterior where there are any."""
     blocks: list[Block] = []
-    between = intervals["modes"] if intervals is not None else None
+    known = intervals["modes"] if intervals is not None else None
     level = "" if intervals is None else f"{percent(100 * intervals['level'], 4)}"
     rows: list[tuple[str, ...]]
     head: tuple[str, ...] = ("pole pair: frequency [Hz]", "[rad/s]", "damping ratio [1]")
@@ -41,11 +42,11 @@ def pole_tables(about: Document, dt_s: float, intervals: Document | None) -> lis
         (number(m["frequency_Hz"], 4), number(m["omega_rad_s"], 4), number(m["damping"]))
         for m in about["modes"]
     ]
-    if rows and between is not None:
+    if rows and known is not None:
         head = (*head, f"{level} interval of the frequency [Hz]", "of the damping [1]")
         rows = [
-            (*row, interval(*b["frequency_Hz"]), interval(*b["damping"]))
-            for row, b in zip(rows, between, strict=True)
+            (*row, between(*b["frequency_Hz"]), between(*b["damping"]))
+            for row, b in zip(rows, known, strict=True)
         ]
     if rows:
         blocks.append(Table(head, tuple(rows)))
@@ -53,7 +54,7 @@ def pole_tables(about: Document, dt_s: float, intervals: Document | None) -> lis
     if reals:
         rates = iter(() if intervals is None else intervals["real_poles_per_s"])
         cells = [
-            (number(z, 6), decay_words(z, dt_s), interval(*next(rates)) if intervals and z > 0 else "–")
+            (number(z, 6), decay_words(z, dt_s), between(*next(rates)) if intervals and z > 0 else "–")
             for z in reals
         ]
         if intervals is None:
@@ -180,22 +181,6 @@ def band_words(bands: Sequence[Document]) -> str:
         f"{number(wide['from_rad_s'])} and {number(wide['to_rad_s'])} rad/s "
         f"({percent(wide['median_radius_percent'])})"
     )
-
-
-def tests_by_name(documents: Sequence[Document]) -> dict[str, ResidualTest]:
-    """The tests on the estimation records by name."""
-    found = {}
-    for document in documents:
-        if document["data"] == "estimation":
-            test = ResidualTest.from_dict({key: value for key, value in document.items() if key != "data"})
-            found[test.name] = test
-    return found
-
-
-def noise_order(spread: Document) -> int:
-    """Order of the noise model behind which the residuals were tested."""
-    report = spread["report"]
-    return len(report["ar_coefficients"]) if report else 0
 
 
 def residual_caption(spread: Document) -> str:

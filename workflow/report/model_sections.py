@@ -18,12 +18,12 @@ from workflow.report.model_blocks import (
     stabilisation_sentence,
     structure_words,
     test_remarks,
-    tests_by_name,
     unknown_bands,
 )
 from workflow.report.page import Block, Plot, Remarks, Section, Table, Text, heading, maybe
 from workflow.report.pictures import channel_picture, fresh_index, shown_pair
 from workflow.report.words import count, frequency, listing, number, percent, sentence
+from workflow.stages.uncertainty import tests_by_name
 
 _ROLE = {"estimation": "estimation", "validation": "validation", "repeat": "repeat"}
 

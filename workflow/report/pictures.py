@@ -31,7 +31,7 @@ from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
 from workflow.report.data import ChannelData, RunData
-from workflow.report.model_blocks import tests_by_name
+from workflow.stages.uncertainty import tests_by_name
 
 Drawer = Callable[[], Figure]
 

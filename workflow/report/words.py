@@ -34,15 +34,6 @@ def frequency(omega_rad_s: float) -> str:
     return f"{number(omega_rad_s)} rad/s ({number(omega_rad_s / (2 * math.pi))} Hz)"
 
 
-def interval(low: float, high: float) -> str:
-    """low to high, with as many digits as tell them apart; 'not known' where one end is open."""
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return "not known"
-    span = high - low
-    digits = 3 if not span > 0 else max(3, 1 + math.ceil(math.log10(max(abs(low), abs(high)) / span)) + 1)
-    return f"{number(low, min(digits, 9))} to {number(high, min(digits, 9))}"
-
-
 def listing(items: Sequence[str]) -> str:
     """a, b and c."""
     if not items:

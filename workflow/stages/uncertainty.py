@@ -22,7 +22,13 @@ from ident.poles import Poles
 from ident.prefilter import increments
 from ident.record import Record
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
-from ident.validation import fit_on_fresh_data, independence_test, repeat_scatter, whiteness_test
+from ident.validation import (
+    ResidualTest,
+    fit_on_fresh_data,
+    independence_test,
+    repeat_scatter,
+    whiteness_test,
+)
 from workflow.conditioning import as_bounded
 from workflow.config import Channel, RunConfig, UncertaintyOptions
 from workflow.errors import naming
@@ -194,6 +200,22 @@ def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> l
         {"data": "estimation", **whiteness_test(whitened).to_dict()},
         {"data": "estimation", **independence_test(inputs, driven).to_dict()},
     ]
+
+
+def tests_by_name(documents: Sequence[Mapping[str, Any]]) -> dict[str, ResidualTest]:
+    """The tests on the estimation records by name, from the documents of `residual_tests`."""
+    found = {}
+    for document in documents:
+        if document["data"] == "estimation":
+            test = ResidualTest.from_dict({key: value for key, value in document.items() if key != "data"})
+            found[test.name] = test
+    return found
+
+
+def noise_order(spread: Mapping[str, Any]) -> int:
+    """Order of the noise model behind which the residuals were tested."""
+    report = spread["report"]
+    return len(report["ar_coefficients"]) if report else 0
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> dict[str, Any] | None:
