@@ -168,6 +168,6 @@ def _summary(out: Path, document: Mapping[str, object], findings: tuple[Finding,
         title="Ziaei & Wang 2006, redrawn",
         sections=sections,
         numbers=document,
-        verdict=f"{agreeing} of {len(findings)} figures as the paper reports; all numbers in {out / TABLE_CSV}",
+        verdict=f"{agreeing} of {len(findings)} figures as the paper reports; numbers in {out / TABLE_CSV}",
         report_path=str(out / PAGE),
     )

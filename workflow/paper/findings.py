@@ -9,12 +9,13 @@ import numpy as np
 
 from workflow.paper.bounds import TWO_SIGMA_LEVEL, Coverage
 from workflow.paper.experiments import RECIPE_BUDGET, Comparison, PaperResults
-from workflow.paper.methods import BETTER_STARTS, METHODS
+from workflow.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
 from workflow.report.words import listing, number
 
 # A response is matched where its RMS error stays below this; a fit is good within these points of the best.
 _MATCHED = 0.1
 _CLOSE_TO_BEST = 10.0
+_BAND = f"between {JUDGED_BAND_RAD_S[0]:.0f} and {JUDGED_BAND_RAD_S[1]:.0f} rad/s"
 
 
 @dataclass(frozen=True)
@@ -33,41 +34,38 @@ def findings_of(results: PaperResults) -> tuple[Finding, ...]:
 
 
 def _one(results: PaperResults) -> Finding:
-    study = results.surface
-    finest = study.counts[-1]
-    drawn = next((c for c in study.counts if c.n_points == study.surface.first.size), finest)
+    study, shares = results.surface, results.surface.shares
+    coarsest, finest = study.counts[0], study.counts[-1]
+    drawn = study.surface.first.size
+    elsewhere = study.descended - study.reached
+    inside = _span([item.inside for item in study.counts])
     several = finest.inside > 1
-    shares, searches = study.shares, study.shares.searches
-    border = f"{study.counts[0].border} to {finest.border}"
-    grids = f"{study.counts[0].n_points} to {finest.n_points}"
-    headline = (
-        f"{finest.inside} minima inside the window"
-        if several
-        else "one minimum inside the window, not several"
-    )
+    by_variant = [
+        100 * shares.hits["order 4", coordinates, variant] / shares.searches
+        for coordinates in ("raw", "log")
+        for variant in sorted(_variants(results))
+    ]
+    half = len(by_variant) // 2
     return Finding(
         several,
-        headline,
+        f"{finest.inside} minima inside the window"
+        if several
+        else "one minimum inside the window, not several",
         (
-            f"Inside the paper's window we count {_span([c.inside for c in study.counts])} on grids of "
-            f"{grids} "
-            f"points per axis. What grows with the grid ({border}) is the number of lowest points at the "
-            "border: "
-            "side valleys that run on out of the window. A coarse grid or a cut at constant gamma makes "
-            "minima "
-            "of them.",
-            f"Followed downhill with the window no longer in the way, {study.reached} of the "
-            f"{study.descended} "
-            f"border points on the {drawn.n_points}-point grid end in the global minimum"
-            + (", so the valleys do trap a descent." if study.reached < study.descended else "."),
-            f"A search does need more than a descent at order 4. There the {len(_variants(results))} DIRECT "
-            f"variants with {shares.evaluations} evaluations and one descent from their best point end in "
-            "the "
-            f"global minimum in {number(shares.share_percent('order 4', 'raw'))} % of the searches from the "
-            f"paper's box and {number(shares.share_percent('order 4', 'log'))} % in logarithmic coordinates "
-            f"({searches} records each); at order 2 in {number(shares.share_percent('order 2', 'raw'))} % "
-            "and "
-            f"{number(shares.share_percent('order 2', 'log'))} %. Coordinates matter, the variant hardly.",
+            f"Minima inside the paper's window: {inside}, on grids of {coarsest.n_points} to "
+            f"{finest.n_points} points per axis. The lowest points at its border are {coarsest.border} on "
+            f"the coarsest grid and {finest.border} on the finest: side valleys that run on out of the "
+            "window, no minima of the surface. A cut at constant gamma shows a minimum for each of them.",
+            f"Followed downhill, with the window no longer in the way, {study.reached} of the "
+            f"{study.descended} border points of the {drawn}-point grid end in the global minimum and "
+            f"{elsewhere} elsewhere.",
+            f"At order 4 the {half} DIRECT variants, {shares.evaluations} evaluations and one descent from "
+            f"the best point, end in the global minimum in {_share(results, 'order 4', 'raw')} of the "
+            f"searches in (x, beta, gamma) and in {_share(results, 'order 4', 'log')} in logarithmic "
+            f"coordinates; single variants range over {_range_words(by_variant[:half])} and "
+            f"{_range_words(by_variant[half:])}. At order 2 the shares are "
+            f"{_share(results, 'order 2', 'raw')} and {_share(results, 'order 2', 'log')} "
+            f"({shares.searches} records each).",
         ),
     )
 
@@ -88,14 +86,12 @@ def _two(results: PaperResults) -> Finding:
         (
             f"GOBF puts the mode at {mode}; true are {number(shown.machine.mode[0], 4)} rad/s and "
             f"{number(shown.machine.mode[1])}. The response is off by {_percent(own.response_error)} RMS "
-            "between "
-            f"1 and 100 rad/s (median of {number(many['trials'])} records "
-            f"{_percent(many['response_error'])}, mode "
+            f"{_BAND} (median of {number(many['trials'])} records {_percent(many['response_error'])}, mode "
             f"found in {number(many['mode_found'])}).",
             "The search as printed, DIRECT alone in the raw box with "
-            f"{RECIPE_BUDGET * results.settings.evaluations} "
-            f"evaluations, {found} on this record: {_percent(recipe.response_error)} RMS. "
-            "The paper does not say how long it searched, nor from which bounds.",
+            f"{RECIPE_BUDGET * results.settings.evaluations} evaluations, {found} on this record: "
+            f"{_percent(recipe.response_error)} RMS. The paper does not say how long it searched, nor from "
+            "which bounds.",
             "Near half the sampling rate the curves part: the held input puts a zero there that 30 dB "
             "cannot show.",
         ),
@@ -108,15 +104,14 @@ def _three(results: PaperResults) -> Finding:
     found = [name for name in peers if shown.scores[name].mode_found]
     return Finding(
         not found,
-        "none of the three finds the mode" if not found else f"{listing(found)} finds the mode",
+        f"{listing(found)} finds the mode" if found else "none of the three finds the mode",
         (
-            f"{_mode_counts(shown, peers)}. RMS error between 1 and 100 rad/s on the drawn record: "
-            f"{_errors(shown, peers)}; GOBF {_percent(shown.scores['GOBF'].response_error)}.",
-            "It is the starts, more than the noise: from a Steiglitz-McBride start the same structures "
-            "find the "
-            f"mode ({_mode_counts(shown, BETTER_STARTS)}) and come to {_errors(shown, BETTER_STARTS)}. ARX "
-            "has "
-            "no start to choose; it is biased, because its noise model is wrong.",
+            f"{_mode_counts(shown, peers)} RMS error {_BAND} on the drawn record: {_errors(shown, peers)}; "
+            f"GOBF {_percent(shown.scores['GOBF'].response_error)}.",
+            "The same structures from a better start, Steiglitz-McBride, on the same noise: "
+            f"{_errors(shown, BETTER_STARTS)}. {_mode_counts(shown, BETTER_STARTS)}",
+            "ARX has no start to choose; under white output noise its noise model is wrong, and it is "
+            "biased.",
         ),
     )
 
@@ -124,18 +119,17 @@ def _three(results: PaperResults) -> Finding:
 def _four(results: PaperResults) -> Finding:
     shown = results.experiment
     found = [name for name in METHODS if shown.scores[name].mode_found]
-    agrees = set(found) == {"GOBF", "OE"}
     return Finding(
-        agrees,
+        set(found) == {"GOBF", "OE"},
         f"the resonance is found by {listing(found)}" if found else "nobody finds the resonance",
         (
             f"The arm's first mode lies at {number(shown.machine.mode[0])} rad/s with damping "
-            f"{number(shown.machine.mode[1])} (the motor's back-EMF damps it). "
-            f"{_mode_counts(shown, METHODS)}; "
-            f"RMS error against the linear arm: {_errors(shown, METHODS)}.",
-            f"With a better start: {_mode_counts(shown, BETTER_STARTS)}, {_errors(shown, BETTER_STARTS)}. "
-            "The "
-            "paper's OE did find the resonance of its machine, whose damping and noise it does not give.",
+            f"{number(shown.machine.mode[1])}: the motor's back-EMF damps it. "
+            f"{_mode_counts(shown, METHODS)} RMS error against the linear arm on the drawn record: "
+            f"{_errors(shown, METHODS)}.",
+            f"From a better start: {_errors(shown, BETTER_STARTS)}. {_mode_counts(shown, BETTER_STARTS)} "
+            "The paper's OE did find the resonance of its machine, whose damping and noise it does not "
+            "give.",
             "The second mode is out of reach of order 4 for every method.",
         ),
     )
@@ -144,17 +138,18 @@ def _four(results: PaperResults) -> Finding:
 def _five(results: PaperResults) -> Finding:
     shown = results.experiment
     own, many = shown.scores["GOBF"].fit_percent, shown.medians["GOBF"]
-    good = own >= shown.ceiling_percent - _CLOSE_TO_BEST
+    residual = shown.trial.fresh.output[:, 0] - shown.simulated["GOBF"]
+    power = np.abs(np.fft.rfft(residual)) ** 2
+    slow = np.fft.rfftfreq(residual.size, shown.trial.fresh.dt_s) < 1.0
     return Finding(
-        good,
+        own >= shown.ceiling_percent - _CLOSE_TO_BEST,
         f"fit {number(own)} %, of {number(shown.ceiling_percent)} % that the sensor noise leaves",
         (
             f"Free run from rest on fresh data, nothing taken out: fit {number(own)} % (median of "
             f"{number(many['trials'])} records {number(many['fit_percent'])} %); the true tip without noise "
-            "would "
-            f"reach {number(shown.ceiling_percent)} %.",
-            "What is left moves slowly: the tip integrates whatever dry friction does, and no linear model "
-            "knows it.",
+            f"would reach {number(shown.ceiling_percent)} %.",
+            f"{_percent(float(power[slow].sum() / power.sum()))} of the power of what is left lies below 1 "
+            "Hz: the tip integrates whatever dry friction does.",
         ),
     )
 
@@ -173,8 +168,8 @@ def _six(results: PaperResults) -> Finding:
             + listing([f"{name} {number(shown.medians[name]['fit_percent'])} %" for name in METHODS])
             + ".",
             f"From a better start: {_fits(shown, BETTER_STARTS)}. The fit of a free run is won at low "
-            "frequency, "
-            "where the tip moves most: a model without the mode can still score well, so Fig. 4 says more.",
+            "frequency, where the tip moves most: a model without the mode can still score well, so Fig. 4 "
+            "says more.",
         ),
     )
 
@@ -191,10 +186,8 @@ def _seven(results: PaperResults) -> Finding:
         f"bounds grow from {_percent(low)} of |G| (1 to 10 rad/s) to {_percent(high)} (above 100 rad/s)",
         (
             f"On this record the truth lies inside at {number(study.inside_percent['classical'][0])} % of "
-            "the "
-            "frequencies between 1 and 100 rad/s (classical) and "
-            f"{number(study.inside_percent['tangent'][0])} % "
-            f"(tangent); an honest bound of two standard deviations holds it at "
+            f"the frequencies {_BAND} (classical) and {number(study.inside_percent['tangent'][0])} % "
+            "(tangent); an honest bound of two standard deviations holds it at "
             f"{_percent(TWO_SIGMA_LEVEL)}, on average over records.",
             "Means over records: "
             + "; ".join(_coverage_words(of, name) for name in _machines(study.coverage))
@@ -218,14 +211,12 @@ def _machines(coverage: Sequence[Coverage]) -> list[str]:
 def _friction_words(of: dict[tuple[str, str], Coverage]) -> str:
     with_friction, without = of["experiment", "tangent"], of["experiment without friction", "tangent"]
     return (
-        "No bound from one record can hold the linear arm when dry friction moves the response itself: over "
-        "the "
-        f"{with_friction.records} records the mean of all tangent models is "
-        f"{number(with_friction.offset_percent)} % "
-        f"off the linear arm, with bounds of {number(with_friction.radius_percent)} %; without friction "
-        f"{number(without.offset_percent)} % off, with bounds of {number(without.radius_percent)} %. "
-        "Records at "
-        "several amplitudes show this part of the uncertainty (ident.conditions)."
+        "No bound from one record can hold the linear arm when dry friction moves the response itself: "
+        f"over the {with_friction.records} records the mean of all tangent models is "
+        f"{number(with_friction.offset_percent)} % off the linear arm, with bounds of "
+        f"{number(with_friction.radius_percent)} %; without friction {number(without.offset_percent)} % "
+        f"off, with bounds of {number(without.radius_percent)} %. Records at several amplitudes show this "
+        "part of the uncertainty (ident.conditions)."
     )
 
 
@@ -235,8 +226,16 @@ def _variants(results: PaperResults) -> set[str]:
 
 def _mode_counts(shown: Comparison, names: Sequence[str]) -> str:
     trials = number(shown.medians[names[0]]["trials"])
-    counts = listing([f"{name} {number(shown.medians[name]['mode_found'])}" for name in names])
-    return f"mode found, of {trials} records: {counts}"
+    counts = listing([f"{number(shown.medians[name]['mode_found'])} for {name}" for name in names])
+    return f"Mode found, of {trials} records: {counts}."
+
+
+def _share(results: PaperResults, problem: str, coordinates: str) -> str:
+    return f"{number(results.surface.shares.share_percent(problem, coordinates))} %"
+
+
+def _range_words(values: Sequence[float]) -> str:
+    return f"{number(min(values))} to {number(max(values))} %"
 
 
 def _errors(shown: Comparison, names: Sequence[str]) -> str:

@@ -20,8 +20,8 @@ from workflow.paper.settings import N_PAIRS, N_REAL, ORDER
 from workflow.paper.usual_starts import usual_oe
 
 METHODS = ("GOBF", "ARX", "ARMAX", "OE")
-# Not the paper's: how the two iterative methods do from starts its toolbox did not try.
-BETTER_STARTS = ("ARMAX, better start", "OE, better start")
+# Not the paper's: how the two iterative methods do from a Steiglitz-McBride start as well.
+BETTER_STARTS = ("ARMAX (better start)", "OE (better start)")
 
 # Where the response is judged: above the record's length and below the second mode, the band of control.
 JUDGED_BAND_RAD_S = (1.0, 100.0)
@@ -50,8 +50,8 @@ def fit_methods(record: Record, *, better_starts: bool = False) -> dict[str, Lin
             "OE": usual_oe(record, ORDER, ORDER),
         }
         if better_starts:
-            models["ARMAX, better start"] = armax(record, ORDER, ORDER, ORDER)
-            models["OE, better start"] = oe(record, ORDER, ORDER)
+            models[BETTER_STARTS[0]] = armax(record, ORDER, ORDER, ORDER)
+            models[BETTER_STARTS[1]] = oe(record, ORDER, ORDER)
     return models
 
 

@@ -1,7 +1,7 @@
-"""OE as toolboxes of the paper's time started it: from four-stage instrumental variables, and from ARX.
+"""OE from the usual starts: four-stage instrumental variables, and ARX.
 
-`ident.comparators.oe` starts from Steiglitz-McBride, which did not belong to them and finds what they missed;
-the paper's failures can only be judged from the starts it had.
+`ident.comparators.oe` starts from Steiglitz-McBride, which finds what these miss. The paper does not say how
+its toolbox started; its failures can only be judged from a start that is no better than usual.
 """
 
 from __future__ import annotations
