@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ident.identification import Identification
 from ident.input_checks import advice, refuse_unusable
@@ -37,6 +37,8 @@ from ident.structured_fit import structured_fit, structured_optimality
 
 # A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
 _NUISANCE_LEVEL = 0.99
+# Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
+_MISLED = 2.0
 
 __all__ = ["Identification", "identify"]
 
@@ -90,18 +92,21 @@ def identify(
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    """A search that has come to an end on one structure."""
+    """A search that has come to an end on one structure; `free` is its end polished with initial states."""
 
     data: Regression
     search: PoleSearch
     selection: OrderSelection
     best: Polished
+    free: Polished | None = None
 
 
-def _searched(data: Regression, options: IdentOptions, report: Progress) -> _Outcome:
+def _searched(
+    data: Regression, options: IdentOptions, report: Progress, start: Polished | None = None
+) -> _Outcome:
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
-    return _Outcome(data, search, selection, selection.run())
+    return _Outcome(data, search, selection, selection.run(start))
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,7 @@ class _NuisanceTest:
 
     @property
     def limit(self) -> float:
-        return float(chi2.ppf(_NUISANCE_LEVEL, self.columns))
+        return float(chdtri(self.columns, 1 - _NUISANCE_LEVEL))
 
     @property
     def needed(self) -> bool:
@@ -151,6 +156,7 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
     if not free.n_samples > free.n_parameters(max(without.poles.order, 4)):
         return outcome
     search = PoleSearch(free, options)
+    start, polished = None, None
     if without.poles.order - search.fixed.order < 3 and None in (options.n_real, options.n_pairs):
         # Nothing found from rest: a free decay looks just so. Judge by what a search with free responses
         # finds.
@@ -160,9 +166,12 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
         without = PoleSearch(data, options).descend(end.poles, "from rest")
     else:
         end = search.descend(without.poles, "with initial state")
+        polished = end
+        # Transients no larger than the noise leave the search from rest its bearings: go on from its poles.
+        start = end if without.rss < _MISLED * end.rss else None
     if end.poles.order == 0 or not _nuisance_test("initial state", (data, without), (free, end)).needed:
-        return outcome
-    return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message))
+        return replace(outcome, free=polished)
+    return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
 
 
 def _fitted_on_all(
@@ -189,7 +198,10 @@ def _fitted_on_all(
             continue  # the polynomials that integrators leave free contain the offset
         if not other_data.n_samples > other_data.n_parameters(order):
             continue
-        there = (other_data, _moved(other_data, best, search))
+        if key == "estimate_initial_state" and outcome.free and best is outcome.best:
+            there = (other_data, outcome.free)  # the very same descent was made when the search was judged
+        else:
+            there = (other_data, _moved(other_data, best, search))
         with_it, without = (here, there) if getattr(data.structure, key) else (there, here)
         test = _nuisance_test(name, without, with_it)
         verdicts.append(test.verdict())
@@ -209,17 +221,18 @@ def _priors_judged(
     search = PoleSearch(data, options)
     search.minima = list(outcome.search.minima)
     given = judged = Fitted(data, best, search)
+    searched = part, outcome.data.structure
     tests: list[PriorTest] = []
     if best.poles.order == 0:
         return data, best, ()
     if options.integrators:
-        test, free = integrators_test(records, (part, outcome.data.structure), given)
+        test, free = integrators_test(records, searched, given)
         tests.append(test)
         outcome.search.evaluations += free.search.evaluations
         if test.refused:
             judged = free
     if options.fixed_poles:
-        tests.append(fixed_poles_test(given))
+        tests.append(fixed_poles_test(records, searched, given))
     asked = options.relative_degree
     if asked in (1, "auto"):
         tests.append(direct_term_test(records, judged))

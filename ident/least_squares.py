@@ -75,16 +75,21 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
     """
     local = shared if local is None else local
     columns = shared_columns(data, shared)
-    residual = data.y.copy()
-    n_local = data.polynomials.shape[0] + (local.order if data.structure.estimate_initial_state else 0)
-    local_q = np.zeros((n_local, data.n_samples))
-    if n_local:
+    if local.order and data.structure.estimate_initial_state:
+        residual = data.y.copy()
+        local_q = np.zeros((data.polynomials.shape[0] + local.order, data.n_samples))
         for i in range(data.n_records):
             here = data.segment(i)
             q, _ = np.linalg.qr(local_columns(data, local, i))
             local_q[: q.shape[1], here] = q.T
             columns[here] -= q @ (q.T @ columns[here])
             residual[here] -= q @ (q.T @ residual[here])
+    else:
+        local_q, residual = data.polynomials_q, data.y_clear.copy()
+        for here in map(data.segment, range(data.n_records)):
+            columns[here] -= local_q[:, here].T @ (local_q[:, here] @ columns[here])
+    if columns.shape[1] == 0:
+        return Projection(local_q, np.zeros((0, data.n_samples)), np.zeros((0, 0)), residual)
     q, triangle = np.linalg.qr(columns)
     residual -= q @ (q.T @ residual)
     return Projection(local_q, np.ascontiguousarray(q.T), triangle, residual)

@@ -73,15 +73,17 @@ class OrderSelection:
         self._n = search.data.n_samples
         self._power = float(search.data.y @ search.data.y)
 
-    def run(self) -> Polished:
-        """Best poles with the numbers asked for, or with those the criterion keeps."""
+    def run(self, start: Polished | None = None) -> Polished:
+        """Best poles with the numbers asked for, or with those the criterion keeps; `start`: poles to go on
+        from, such as those found under another structure."""
         options = self.options
         n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         self.progress(0.05, "global search for the first poles")
         # One mode is searched together with the real poles, further ones pair by pair: a joint search over
         # several pairs has never found the best poles.
-        best = self._noted(self.search.rescan(self.search.joint(n_real, min(1, most_pairs))))
+        first = self.search.joint(n_real, min(1, most_pairs)) if start is None else start
+        best = self._noted(self.search.rescan(first))
         for _ in range(3):
             order = best.poles.order
             best = self._grow_pairs(best, most_pairs)

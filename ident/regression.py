@@ -108,20 +108,25 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
                 f"{record.label}: {record.n_samples} samples, not more than the input delay {delay}"
             )
         u = filter_input(record.input[:, 0], structure.integrators, delay)[delay:]
-        abscissa = np.linspace(-1, 1, u.size)
         inputs.append(u)
         outputs.append(record.output[delay:, 0])
-        polynomials.append(np.polynomial.legendre.legvander(abscissa, max(structure.n_polynomials - 1, 0)))
+        polynomials.append(_legendre(u.size, structure.n_polynomials))
         starts.append(starts[-1] + u.size)
-    basis = np.concatenate(polynomials).T[: structure.n_polynomials]
     return Regression(
         u=np.concatenate(inputs),
         y=np.concatenate(outputs),
         starts=np.array(starts, dtype=np.int64),
-        polynomials=np.ascontiguousarray(basis),
+        polynomials=np.ascontiguousarray(np.concatenate(polynomials, axis=1)),
         structure=structure,
         dt_s=dt_s,
     )
+
+
+def _legendre(n_samples: int, count: int) -> RealArray:
+    """Legendre polynomials of degrees 0 .. count - 1 over a record, (count, T)."""
+    if count < 2:
+        return np.ones((count, n_samples))
+    return np.polynomial.legendre.legvander(np.linspace(-1, 1, n_samples), count - 1).T
 
 
 def thinned(records: Sequence[Record], limit: int) -> tuple[list[Record], bool]:
