@@ -236,20 +236,32 @@ def _one_real_pole_less_value(given: Fitted) -> float:
     return min(values, default=np.inf)
 
 
-def fixed_poles_test(given: Fitted) -> PriorTest:
-    """Poles fixed by the user against the same poles left free, from where they are."""
-    options = given.search.options
-    search = PoleSearch(given.data, options.model_copy(update={"fixed_poles": ()}))
-    freed = Fitted(given.data, search.descend(given.end.poles, "fixed poles freed"), search)
-    k = options.integrators
-    n_real, n_pairs = given.search.fixed.real.size - k, given.search.fixed.pairs.size
-    real, pairs = freed.end.poles.real[k : k + n_real], freed.end.poles.pairs[:n_pairs]
-    where = ", ".join([f"[{a:.6g}, 0]" for a in real] + [f"[{p.real:.6g}, {p.imag:.6g}]" for p in pairs])
+def fixed_poles_test(
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+) -> PriorTest:
+    """Poles fixed by the user against as many free ones, from where they are and searched anew."""
+    k, fixed, poles = given.data.structure.integrators, given.search.fixed, given.end.poles
+    options = given.search.options.model_copy(
+        update={
+            "fixed_poles": (),
+            "n_real": poles.real.size - k,
+            "n_pairs": poles.pairs.size,
+        }
+    )
+    search = PoleSearch(given.data, options)
+    found = OrderSelection(PoleSearch(prepare(*searched), options), _silent).run()
+    starts = [poles, found.poles]
+    best = min(
+        (search.descend(start, "fixed poles freed", _ROUGH) for start in starts), key=lambda end: end.rss
+    )
+    freed = Fitted(given.data, search.descend(best.poles, "fixed poles freed"), search)
+    real = ", ".join(f"{a:.6g}" for a in np.sort(freed.end.poles.real[k:]))
+    pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.end.poles.pairs)
     return _judged(
         "fixed_poles",
         statistic(given.end.rss, freed),
-        n_real + 2 * n_pairs,
-        f"leaving them free (they move to {where})",
+        fixed.real.size - k + 2 * fixed.pairs.size,
+        f"leaving them free (poles at {', '.join(part for part in (real, pairs) if part)})",
         "leave them to the search, or check sampling time and units",
     )
 
