@@ -146,20 +146,23 @@ class _Loop:
             use = (intervals.centre - h < self.band[1]) & (intervals.centre + h > self.band[0])
             if np.any(use):
                 within = replace(intervals, centre=intervals.centre[use], half_width=h[use])
-                upper["mode damping"][use] = self._damping(
-                    within, {side: value[use] for side, value in ends.items()}
+                upper["mode damping"][use], middle["mode damping"][use] = self._damping(
+                    within, {side: value[use] for side, value in ends.items()}, at_middle[use]
                 )
         reach = np.maximum(np.abs(clear.end(-1)), np.abs(clear.end(1))) + clear.remainder
         distance = np.where(low > 0, low / reach, 0.0)
         return _Bounds(intervals, upper, middle, distance, loop.centre.end(-1), loop.centre.end(1))
 
-    def _damping(self, intervals: Intervals, ends: dict[int, Real]) -> Real:
+    def _damping(self, intervals: Intervals, ends: dict[int, Real], at_middle: Real) -> tuple[Real, Real]:
+        """Upper bounds and the values at the middles."""
         own, i_plant = self.controller.integrators, self.plant.n_integrators
         clear = cleared_integrators(own + i_plant, intervals)
         if self.performance is not None:
             channel = self.performance.expand(intervals, 0)
             largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
-            return np.asarray(self.damping_weight * largest * _quotient(clear, ends), dtype=np.float64)
+            bound = self.damping_weight * largest * _quotient(clear, ends)
+            here = self.damping_weight * _farthest(channel, 0) * _ratio(np.abs(clear.value), at_middle)
+            return bound, here
         # Members G, G0 of the ellipses at omega and at the middle, g = G/(1 + G K):
         # g - g0 = (G - G0 + G G0 (K0 - K))/((1 + G K)(1 + G0 K0)), hence with the largest |G - G0| = e
         # M <= M0 + e/(d d0) + M M0 |K - K0|.
@@ -178,7 +181,7 @@ class _Loop:
         with np.errstate(divide="ignore", invalid="ignore"):
             # d0 >= nearest as well: the middle belongs to the interval.
             bound = (most + moved / nearest**2) / (1.0 - turn)
-        return np.where(good, self.damping_weight * bound, np.inf)
+        return np.where(good, self.damping_weight * bound, np.inf), self.damping_weight * most
 
 
 def _least(factor: FirstOrder) -> Real:

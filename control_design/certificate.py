@@ -13,6 +13,8 @@ from control_design.biquads import SOLVER_SLACK
 from control_design.controller import Controller
 from control_design.ellipses import Complex, Real
 from control_design.frequency_grid import frequency_grid, plant_grid
+from control_design.joint_coverage import JointCoverage, at_level
+from control_design.joint_coverage import joint_coverage as calibrate
 from control_design.margins import Margins, ellipse_margins, nominal_margins
 from control_design.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
@@ -45,7 +47,8 @@ class SpecificationItem:
         verdict = "met" if self.met else "NOT met"
         unit = f" {self.unit}" if self.unit else ""
         numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
-        proved = "" if self.bound is None else f" ({self.bound:.4g} proved for all frequencies)"
+        known = self.met and self.bound is not None
+        proved = f" ({self.bound:.4g} proved for all frequencies)" if known else ""
         return f"{self.plant}: {self.requirement}: {numbers}{proved}: {verdict}"
 
 
@@ -85,7 +88,8 @@ class Certificate:
     -1, and every item of the specification is met: for all frequencies on plants where
     `PlantVerdict.all_frequencies` is possible, else on the grids named in `checked`. gamma: largest weighted
     worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or None where
-    some plant allows no proof.
+    some plant allows no proof. joint: calibration of the ellipses to whole responses, where asked for; the
+    ellipses checked are then those of the calibrated level where it is above the given one.
     """
 
     certified: bool
@@ -95,6 +99,7 @@ class Certificate:
     checked: tuple[str, ...]
     not_checked: tuple[str, ...]
     gamma_bound: float | None = None
+    joint: JointCoverage | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinities become None inside margins and the string "inf" elsewhere."""
@@ -102,6 +107,7 @@ class Certificate:
         for verdict, plain in zip(self.plants, data["plants"], strict=True):
             plain["nominal_margins"] = verdict.nominal_margins.to_dict()
             plain["worst_margins"] = verdict.worst_margins.to_dict()
+        data["joint"] = None if self.joint is None else self.joint.to_dict()
         cleaned: dict[str, Any] = _plain(data)
         return cleaned
 
@@ -135,6 +141,7 @@ class Certificate:
             checked=tuple(data["checked"]),
             not_checked=tuple(data["not_checked"]),
             gamma_bound=_number(data.get("gamma_bound")),
+            joint=JointCoverage.from_dict(data["joint"]) if data.get("joint") else None,
         )
 
 
@@ -160,6 +167,9 @@ def certify(
     omega_min_rad_s: float = 1e-4,
     n_dense: int = 6000,
     between_own_points: Literal["nothing", "linear"] = "nothing",
+    joint_coverage: float | None = None,
+    rng: np.random.Generator | None = None,
+    joint_draws: int = 4000,
 ) -> Certificate:
     """Check a controller from any source against plants and specification.
 
@@ -170,6 +180,9 @@ def certify(
 
     between_own_points: what may be assumed of a response known on its own frequencies only. "nothing": no
     statement between them. "linear": at fraction x between two neighbours it lies in (1 - x) E_k + x E_{k+1}.
+
+    joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
+    and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
 
     Raises
     ------
@@ -183,6 +196,20 @@ def certify(
             f"the controller has {controller.computational_delay_samples} samples of computational delay, "
             f"the specification {specification.computational_delay_samples}"
         )
+    joint = None
+    if joint_coverage is not None:
+        if rng is None:
+            raise ValueError("joint_coverage needs rng, a numpy.random.Generator to draw responses with")
+        joint = calibrate(
+            controller,
+            plants,
+            specification,
+            rng=rng,
+            coverage=joint_coverage,
+            draws=joint_draws,
+            omega_min_rad_s=omega_min_rad_s,
+        )
+        plants = [at_level(plant, max(plant.level, joint.level)) for plant in plants]
     verdicts: list[PlantVerdict] = []
     items: list[SpecificationItem] = []
     for plant in plants:
@@ -203,9 +230,10 @@ def certify(
         gamma=max(v.worst_weighted for v in verdicts),
         plants=tuple(verdicts),
         items=tuple(items),
-        checked=_checked_words(verdicts, specification, between_own_points),
-        not_checked=_not_checked_words(plants, verdicts, between_own_points),
+        checked=_checked_words(verdicts, specification, between_own_points, joint),
+        not_checked=_not_checked_words(plants, verdicts, between_own_points, joint),
         gamma_bound=max(proof.gamma for proof in proofs) if all(p.possible for p in proofs) else None,
+        joint=joint,
     )
 
 
@@ -401,7 +429,10 @@ def _integrator_item(controller: Controller, plant: UncertainPlant) -> Specifica
 
 
 def _checked_words(
-    verdicts: Sequence[PlantVerdict], specification: Specification, between_own_points: str
+    verdicts: Sequence[PlantVerdict],
+    specification: Specification,
+    between_own_points: str,
+    joint: JointCoverage | None,
 ) -> tuple[str, ...]:
     words = [
         "nominal closed-loop poles of the full state space (plant, controller, computational delay)",
@@ -424,9 +455,11 @@ def _checked_words(
             words.append(
                 f"{verdict.plant}: for all frequencies from 0 to Nyquist (bounds on {proof.intervals} "
                 f"intervals): no ellipse comes nearer to -1 than {proof.distance:.4g}, the weighted worst "
-                f"case is at most {proof.gamma:.4g}, and the winding is that of a stable loop; so every plant "
-                f"in the ellipses with the nominal's unstable poles is stable{assumed}"
+                f"case is at most {proof.gamma:.4g}, and the winding is that of a stable loop; so every "
+                f"plant in the ellipses with the nominal's unstable poles is stable{assumed}"
             )
+    if joint is not None:
+        words.append(joint.sentence())
     if specification.mode_peak_ratio is not None:
         words.append("damping of the flexible mode as the peak of |Gp S| in its band")
     if specification.mode_damping is not None:
@@ -435,9 +468,12 @@ def _checked_words(
 
 
 def _not_checked_words(
-    plants: Sequence[UncertainPlant], verdicts: Sequence[PlantVerdict], between_own_points: str
+    plants: Sequence[UncertainPlant],
+    verdicts: Sequence[PlantVerdict],
+    between_own_points: str,
+    joint: JointCoverage | None,
 ) -> tuple[str, ...]:
-    words = []
+    words: list[str] = []
     for verdict in verdicts:
         proof = verdict.all_frequencies
         if proof.proved:
@@ -447,8 +483,11 @@ def _not_checked_words(
             )
         else:
             words.append(f"{verdict.plant}: between grid points: not proved ({proof.reason})")
+    if joint is None:
+        words.append(
+            "joint level: the ellipses hold at their level at each frequency, not at all frequencies together"
+        )
     words += [
-        "joint level: the ellipses hold at their level at each frequency, not at all frequencies together",
         "nonlinear effects (friction, saturation, quantisation, backlash) and anything outside the ellipses",
         "that the true plant has as many unstable poles and integrators as the nominal",
     ]

@@ -8,7 +8,7 @@ grows with frequency, so the ellipses are strongly elongated around the mode.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -116,6 +116,46 @@ class LinkUncertainty:
         growth = FirstOrder(one + 1j * (omega / 20) ** 2, one * (2j * omega / 400), (h / 20) ** 2, h)
         disc = centre.times(growth).scaled(_ISOTROPIC[self.scenario])
         return centre, stacked([*columns, disc, disc.scaled(1j)])
+
+    def draw(self, rng: np.random.Generator, draws: int) -> Callable[[Real], Complex]:
+        """Whole responses: the seven parameters normal with their spreads (drawn again while not positive),
+        put into the formula of G, plus the isotropic part.
+
+        The isotropic part is |G_nominal| c sqrt(1 + (omega/20)^4) n(omega) with n complex of unit variance in
+        each part: independent at knots a third of a decade apart, in between cos(a) n_k + sin(a) n_{k+1}.
+        """
+        parameters = [
+            {key: _positive(rng, _NOMINAL[key], spread) for key, spread in _SPREAD[self.scenario].items()}
+            for _ in range(draws)
+        ]
+        found = [_roots_and_gain(p) for p in parameters]
+        poles, zeros = np.array([f[0] for f in found]), np.array([f[1] for f in found])
+        gain = np.array([f[2] for f in found])
+        knots = np.arange(-15, 10) / 3.0
+        noise = rng.standard_normal((draws, knots.size)) + 1j * rng.standard_normal((draws, knots.size))
+
+        def at(omega: Real) -> Complex:
+            z = np.exp(1j * omega * _DT_S)
+            value = np.broadcast_to(gain[:, None], (draws, omega.size)).astype(np.complex128)
+            for k in range(poles.shape[1]):
+                value = value / (z - poles[:, k, None])
+            for k in range(zeros.shape[1]):
+                value = value * (z - zeros[:, k, None])
+            place = np.clip(np.log10(np.maximum(omega, 1e-300)), knots[0], knots[-1] - 1e-9)
+            left = np.searchsorted(knots, place, side="right") - 1
+            angle = 0.5 * np.pi * (place - knots[left]) * 3.0
+            n = np.cos(angle) * noise[:, left] + np.sin(angle) * noise[:, left + 1]
+            size = np.abs(_response(omega, _NOMINAL)) * np.sqrt(1 + (omega / 20) ** 4)
+            return np.asarray(value + _ISOTROPIC[self.scenario] * size * n, dtype=np.complex128)
+
+        return at
+
+
+def _positive(rng: np.random.Generator, nominal: float, spread: float) -> float:
+    while True:
+        value = nominal * (1 + spread * float(rng.standard_normal()))
+        if value > 0:
+            return value
 
 
 def _roots_and_gain(p: Mapping[str, float]) -> tuple[Complex, Complex, float]:

@@ -1,4 +1,4 @@
-"""Bounds for all frequencies: never below what sampling finds, close to it, honest where there is no proof."""
+"""Bounds for all frequencies: never below what sampling finds, close to it, honest where none is had."""
 
 from __future__ import annotations
 

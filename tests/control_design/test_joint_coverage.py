@@ -1,0 +1,119 @@
+"""Joint coverage: exact where the answer is known by hand, honest on fresh draws, refused without draws."""
+
+from __future__ import annotations
+
+import json
+
+import control
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from control_design import Certificate, Controller, Specification, UncertainPlant, certify
+from control_design.example_plants import flexible_link, flexible_link_specification
+from control_design.joint_coverage import JointCoverage, gamma_of_draws, joint_coverage
+from ident import Poles
+from ident.uncertainty import ResponsePosterior
+
+from .plants import RelativeDisc, hub_arm
+
+_DT = 0.005
+
+
+def _gain(value: float, delay: int = 1) -> Controller:
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    return Controller(*none, [[value]], _DT, computational_delay_samples=delay)
+
+
+def _lag_with_uncertain_gain(std: float) -> UncertainPlant:
+    """G = (1 + std x) 0.02/(z - 0.98), x ~ N(0, 1)."""
+    poles = Poles(np.array([0.98]), np.zeros(0, complex))
+    scale = 0.02 / np.sqrt(1 - 0.98**2)
+    posterior = ResponsePosterior(poles, np.array([scale]), np.array([[scale * std]]), _DT)
+    return UncertainPlant("lag", control.ss([[0.98]], [[1]], [[0.02]], 0, _DT), posterior)
+
+
+@pytest.mark.parametrize("coverage", [0.8, 0.95])
+def test_one_uncertain_gain_gives_the_one_sided_normal_quantile(coverage):
+    """|S| peaks higher the larger the gain, so P(gamma <= worst case of |x| <= r) = P(x <= r), exactly."""
+    plant = _lag_with_uncertain_gain(0.1)
+    draws = 8000
+    found = joint_coverage(
+        _gain(6.0), [plant], Specification(), rng=np.random.default_rng(1), coverage=coverage, draws=draws
+    )
+    radius = norm.ppf(coverage)
+    # standard error of a quantile: sqrt(c (1 - c)/n)/density; four of them
+    error = 4 * np.sqrt(coverage * (1 - coverage) / draws) / norm.pdf(radius)
+    assert np.sqrt(-2 * np.log1p(-found.level)) == pytest.approx(radius, abs=error)
+    given = np.sqrt(-2 * np.log(0.05))
+    # 4.5 standard deviations of the share
+    assert found.coverage_given == pytest.approx(norm.cdf(given), abs=4e-3)
+    # the whole response lies in the ellipses where |x| <= r
+    assert found.simultaneous_given == pytest.approx(1 - 2 * norm.sf(given), abs=6e-3)
+    assert found.stable_share == 1.0
+    assert JointCoverage.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+
+
+def test_unstable_draws_are_those_whose_poles_say_so():
+    plant, controller = _lag_with_uncertain_gain(0.3), _gain(40.0)
+    omega = np.array([1.0])
+    rng = np.random.default_rng(2)
+    found = gamma_of_draws(controller, plant, Specification(), rng, 400)
+    posterior = plant.uncertainty
+    again = posterior.sample(np.random.default_rng(2), 250)  # the first chunk
+    share = posterior.response_of(again, omega)[:, 0] / posterior.centre(omega)[0]
+    for index, factor in enumerate(np.real(share)):
+        # z^2 - 0.98 z + 40 (0.02) factor: gain times lag times one sample of delay
+        poles = np.roots([1, -0.98, 40.0 * 0.02 * factor])
+        assert found.stable[index] == (np.max(np.abs(poles)) < 1)
+        assert np.isfinite(found.gamma[index]) == found.stable[index]
+    assert 0 < np.mean(found.stable) < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["A", "B", "C"])
+def test_link_holds_in_95_percent_of_fresh_draws(scenario):
+    plant, spec = flexible_link(scenario), flexible_link_specification(1)
+    # Largest effort and peak of S both matter for this first-order controller.
+    k = [[0.99999]], [[0.002]], [[1.0]], [[0.25]]
+    controller = Controller(*k, plant.dt_s, computational_delay_samples=0)
+    found = joint_coverage(controller, [plant], spec, rng=np.random.default_rng(1))
+    fresh = gamma_of_draws(controller, plant, spec, np.random.default_rng(2), 3000)
+    # binomial of 3000 (0.4 %) and of the 4000 calibrating draws (0.34 %): 2 % is almost four of their sum
+    assert np.mean(fresh.gamma <= found.gamma) == pytest.approx(0.95, abs=0.02)
+
+
+def test_certificate_uses_the_calibrated_level_and_says_so():
+    plant = _lag_with_uncertain_gain(0.05)
+    spec = Specification(modulus_margin=0.3)
+    plain = certify(_gain(6.0), [plant], spec)
+    assert any(words.startswith("joint level") for words in plain.not_checked)
+    high = certify(_gain(6.0), [plant], spec, joint_coverage=0.999, rng=np.random.default_rng(0))
+    assert high.joint is not None
+    assert high.joint.level > 0.95
+    assert high.gamma == pytest.approx(high.joint.gamma, rel=1e-3)
+    assert high.gamma > plain.gamma
+    assert high.gamma <= high.gamma_bound
+    assert any("joint coverage" in words for words in high.checked)
+    assert not any(words.startswith("joint level") for words in high.not_checked)
+    assert Certificate.from_dict(json.loads(json.dumps(high.to_dict(), allow_nan=False))) == high
+    # A level under the given one changes gamma's statement, not the ellipses that are checked.
+    low = certify(_gain(6.0), [plant], spec, joint_coverage=0.6, rng=np.random.default_rng(0))
+    assert low.gamma == plain.gamma > low.joint.gamma
+
+
+def test_what_cannot_be_drawn_from_is_refused():
+    rng = np.random.default_rng(0)
+    measured = RelativeDisc(hub_arm(), 0.02, 60.0).at(np.geomspace(0.5, 200.0, 200), 0.95)
+    plant = UncertainPlant("frf", hub_arm(), measured)
+    lag = _lag_with_uncertain_gain(0.1)
+    with pytest.raises(ValueError, match="draws of whole responses"):
+        joint_coverage(_gain(0.3), [plant], Specification(), rng=rng)
+    with pytest.raises(ValueError, match=r"must lie in \(0, 1\)"):
+        joint_coverage(_gain(0.3), [lag], Specification(), rng=rng, coverage=95.0)
+    with pytest.raises(ValueError, match="at least 100 draws"):
+        joint_coverage(_gain(0.3), [lag], Specification(), rng=rng, draws=10)
+    with pytest.raises(ValueError, match="at least one plant"):
+        joint_coverage(_gain(0.3), [], Specification(), rng=rng)
+    with pytest.raises(ValueError, match="needs rng"):
+        certify(_gain(0.3), [lag], Specification(), joint_coverage=0.95)
