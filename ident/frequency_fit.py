@@ -245,7 +245,14 @@ def identify_frf(
         search=SearchTrace(
             tuple(search.stages),
             tuple(search.minima),
-            tuple(dict.fromkeys(pole_warnings(poles, fixed, search.bounds, response.dt_s))),
+            tuple(
+                dict.fromkeys(
+                    [
+                        *pole_warnings(poles, fixed, search.bounds, response.dt_s),
+                        *_outside_the_band(poles, fixed, response),
+                    ]
+                )
+            ),
             search.evaluations,
         ),
     )
@@ -262,6 +269,17 @@ def _residual_verdict(rss: float, freedom: int) -> str:
     if rss < low:
         return f"The residual is smaller than the covariances say ({numbers}): they are on the safe side."
     return f"The covariances explain the residual ({numbers})."
+
+
+def _outside_the_band(poles: Poles, fixed: Poles, response: FrequencyUncertainty) -> list[str]:
+    """One sentence for each pair that no measured frequency surrounds."""
+    low, high = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
+    return [
+        f"the pole pair at {omega:.4g} rad/s lies outside the measured band ({low:.4g} to {high:.4g} rad/s): "
+        "it stands for whatever is there; measure further, or take the model as extrapolation there"
+        for omega in poles.omega_rad_s(response.dt_s)[fixed.pairs.size :]
+        if not low <= omega <= high
+    ]
 
 
 def _in_order(poles: Poles, fixed: Poles) -> Poles:

@@ -125,11 +125,11 @@ class FrfSearch:
             if options.n_real is None:
                 best = self._grow_real(best)
                 if options.n_pairs is None:
-                    best = self._split_overdamped(best)
+                    best = self._split_overdamped(best, options.max_real)
             best = self._prune(best)
             if best.poles.order == order:
                 break
-        return best
+        return best if None in (options.n_real, options.n_pairs) else self._exchanged(best)
 
     def table(self, best: Polished) -> tuple[OrderStep, ...]:
         """Every structure that was tried, by order, judged by the residual of the chosen model."""
@@ -240,7 +240,7 @@ class FrfSearch:
             best = trial
         return best
 
-    def _split_overdamped(self, best: Polished) -> Polished:
+    def _split_overdamped(self, best: Polished, most_real: int) -> Polished:
         """A pair that went to its largest damping wants to be two real poles; it may."""
         zeta = best.poles.zeta()
         for i in reversed(range(self.fixed.pairs.size, zeta.size)):
@@ -249,9 +249,44 @@ class FrfSearch:
             omega = abs(np.log(best.poles.pairs[i]))
             real = np.concatenate([best.poles.real, np.exp(-omega * np.array([0.7, 1.4]))])
             trial = self._noted(self.descend(Poles(real, np.delete(best.poles.pairs, i)), "two real poles"))
-            if trial.rss < best.rss and self._counts(trial.poles)[0] <= self.options.max_real:
+            if trial.rss < best.rss and self._counts(trial.poles)[0] <= most_real:
                 best = trial
         return best
+
+    def _exchanged(self, best: Polished) -> Polished:
+        """One pole more and the least needed one of its kind less, as long as something is gained.
+
+        A search that grows to a given structure can end with a pair where two real poles should be and no way
+        to move them one by one.
+        """
+        counts = self._counts(best.poles)
+        for _ in range(4):
+            if not self._visible(best):
+                return best
+            larger = [self.add_pair(best.poles)]
+            if counts[0]:
+                larger.append(self.add_real(best.poles))
+                larger.append(self.add_pair(self._split_overdamped(best, counts[0] + 2).poles))
+            found = min((self._reduced(end, counts) for end in larger), key=lambda end: end.rss)
+            if not found.rss < best.rss * (1 - _GAIN):
+                return best
+            best = self._noted(self.rescan(found))
+        return best
+
+    def _reduced(self, end: Polished, counts: tuple[int, int]) -> Polished:
+        """Poles taken out one by one, the one first whose loss costs least, down to the given numbers."""
+        while True:
+            here = self._counts(end.poles)
+            trials = []
+            if here[0] > counts[0]:
+                for i in range(self.fixed.real.size, end.poles.real.size):
+                    trials.append(Poles(np.delete(end.poles.real, i), end.poles.pairs))
+            if here[1] > counts[1]:
+                for i in range(self.fixed.pairs.size, end.poles.pairs.size):
+                    trials.append(Poles(end.poles.real, np.delete(end.poles.pairs, i)))
+            if not trials:
+                return end
+            end = self._best_descent(trials, "exchange")
 
     def _prune(self, best: Polished) -> Polished:
         """Take out poles whose loss the criterion does not mind, the least needed first."""
