@@ -74,7 +74,7 @@ def _surface(figure: Figure, axes: Axes, study: SurfaceStudy) -> None:
     axes.grid(visible=False)
     bar = figure.colorbar(mesh, ax=axes, pad=0.02, aspect=30, ticks=levels[:: max(levels.size // 6, 1)])
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.5f"))
-    bar.set_label("J [squared output unit]")
+    bar.set_label("J [output²]")
 
 
 def _cuts(close: Axes, whole: Axes, study: SurfaceStudy) -> None:
@@ -86,7 +86,7 @@ def _cuts(close: Axes, whole: Axes, study: SurfaceStudy) -> None:
         axes.set_xlim(study.surface.first[0], study.surface.first[-1])
         axes.xaxis.set_major_locator(MultipleLocator(0.005))
         axes.xaxis.set_major_formatter(FormatStrFormatter("%.3f"))
-        axes.set_ylabel("J")
+        axes.set_ylabel("J [output²]")
     close.set_ylim(0.92 * top, 1.01 * top)
     close.tick_params(labelbottom=False)
     whole.set_ylim(0, 1.05 * top)
@@ -104,8 +104,8 @@ def _counts(axes: Axes, counts: tuple[MinimaCount, ...]) -> None:
         for x, value in zip(place + offset, values, strict=True):
             axes.text(x, value + 0.3, f"{value}", ha="center", fontsize=8, color="#333333")
     axes.set_xticks(place, [f"{count.n_points}" for count in counts])
-    axes.set_xlabel("grid points per axis")
-    axes.set_ylabel("number")
+    axes.set_xlabel("grid points per axis [1]")
+    axes.set_ylabel("number [1]")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_title("Minima counted, by grid")
     axes.grid(visible=False, axis="x")

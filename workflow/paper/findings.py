@@ -10,6 +10,7 @@ import numpy as np
 from workflow.paper.bounds import TWO_SIGMA_LEVEL, Coverage
 from workflow.paper.experiments import RECIPE_BUDGET, Comparison, PaperResults
 from workflow.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
+from workflow.paper.surface import minima_along, slices
 from workflow.report.words import listing, number
 
 # A response is matched where its RMS error stays below this; a fit is good within these points of the best.
@@ -40,6 +41,8 @@ def _one(results: PaperResults) -> Finding:
     elsewhere = study.descended - study.reached
     inside = _span([item.inside for item in study.counts])
     several = finest.inside > 1
+    # The border of the window: what a reader of the paper's picture sees in front.
+    ((cut, along),) = slices(study.surface, [float(study.surface.second[0])])
     by_variant = [
         100 * shares.hits["order 4", coordinates, variant] / shares.searches
         for coordinates in ("raw", "log")
@@ -55,7 +58,7 @@ def _one(results: PaperResults) -> Finding:
             f"Minima inside the paper's window: {inside}, on grids of {coarsest.n_points} to "
             f"{finest.n_points} points per axis. The lowest points at its border are {coarsest.border} on "
             f"the coarsest grid and {finest.border} on the finest: side valleys that run on out of the "
-            "window, no minima of the surface. A cut at constant gamma shows a minimum for each of them.",
+            f"window. The cut at gamma = {cut:.4f} has {minima_along(along)} local minima along beta.",
             f"Followed downhill, with the window no longer in the way, {study.reached} of the "
             f"{study.descended} border points of the {drawn}-point grid end in the global minimum and "
             f"{elsewhere} elsewhere.",
