@@ -17,8 +17,8 @@ sqrt(3) omega^2 - 0.999 omega + sqrt(3) = 0. At such a frequency C = -c, c > 0, 
     f = k ((m1 + m2) omega^2 + c) - m1 m2 omega^4 = 0,
 
 affine in each parameter alone, so its extremes over a box lie at corners: the smallest box that holds a zero
-of f has it at a corner (m1, m2, k) = (1 +- x, 1 +- x, 1 +- x), a root of a cubic in x. Nothing else can happen
-before: the degree drops only at m1 m2 = 0 and a pole passes s = 0 only at k = 0, both at t = 5.
+of f has it at a corner (m1, m2, k) = (1 +- x, 1 +- x, 1 +- x), a root of a cubic in x. Nothing else can
+happen before: the degree drops only at m1 m2 = 0 and a pole passes s = 0 only at k = 0, both at t = 5.
 """
 
 from __future__ import annotations
