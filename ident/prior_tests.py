@@ -149,14 +149,15 @@ def integrators_test(
     name = f"integrators = {k}"
     test = _judged(name, value, k, "a slow pole in place of each", advice)
     if not test.refused:
-        needless, price = _one_integrator_less_value(records, given), 2 * float(np.log(given.worth()))
-        if needless <= price and not _one_real_pole_less_value(given) <= price:
+        spare = _spare_integrators(records, given)
+        if spare is not None:
+            fewer, needless, price = spare
             verdict = (
-                f"{name} not supported by the data: one integrator and one zero less fit as well (test "
-                f"statistic {needless:.1f} against {price:.1f}, the price of a pole), so a zero of the model "
-                f"cancels it; kept as asked, but set integrators = {k - 1}"
+                f"{name} not supported by the data: with {fewer}, and as many zeros less, the fit is as good "
+                f"(test statistic {needless:.1f} against {price:.1f}, the price of a pole), so zeros of the "
+                f"model cancel the rest; kept as asked, but set integrators = {fewer}"
             )
-            test = PriorTest(name, True, True, needless, price, 1, verdict)
+            test = PriorTest(name, True, True, needless, price, k - fewer, verdict)
     return test, free
 
 
@@ -177,21 +178,21 @@ def _without_integrators(
         polynomials = prepare(chosen, structure).polynomials
         return replace(prepare(chosen, replace(structure, integrators=0)), polynomials=polynomials)
 
-    data = prepared(records, given.data.structure)
-    search = PoleSearch(data, options)
-    starts = [
-        others.appended(Poles(1 - np.array(decays) / data.longest)) for decays in _SLOW_STARTS.get(k, ())
-    ]
+    # Starts are compared on the part that is searched, the best goes on with all samples.
+    small = PoleSearch(prepared(*searched), options)
+    longest = small.data.longest
+    starts = [others.appended(Poles(1 - np.array(decays) / longest)) for decays in _SLOW_STARTS[k]]
     if k >= 2:
-        rest = 1 - np.array([0.3] * (k - 2)) / data.longest
+        rest = 1 - np.array([0.3] * (k - 2)) / longest
         for turns in _SLOW_TURNS:
-            pair = np.exp(2 * np.pi * turns / data.longest * np.array([-0.3 + 1j]))
+            pair = np.exp(2 * np.pi * turns / longest * np.array([-0.3 + 1j]))
             starts.append(others.appended(Poles(rest, pair)))
-    ends = [search.descend(start, "integrators freed", _ROUGH) for start in starts]
-    found = OrderSelection(PoleSearch(prepared(*searched), options), _silent).run()
-    ends.append(search.descend(found.poles, "integrators freed", _ROUGH))
+    ends = [small.descend(start, "integrators freed", _ROUGH) for start in starts]
+    ends.append(OrderSelection(small, _silent).run())
     best = min(ends, key=lambda end: end.rss)
-    return Fitted(data, search.descend(best.poles, "integrators freed"), search)
+    search = PoleSearch(prepared(records, given.data.structure), options)
+    search.evaluations = small.evaluations
+    return Fitted(search.data, search.descend(best.poles, "integrators freed"), search)
 
 
 def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
@@ -211,29 +212,46 @@ def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int
     return statistic(end.rss, free)
 
 
-def _one_integrator_less_value(records: Sequence[Record], given: Fitted) -> float:
-    """Statistic of the model with one integrator less and the same other poles against the given one."""
+def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, float, float] | None:
+    """How few integrators are enough beside the same other poles, with statistic and price; None: all are
+    needed."""
     k = given.data.structure.integrators
-    structure = replace(given.data.structure, integrators=k - 1)
-    data = replace(prepare(records, structure), polynomials=given.data.polynomials)
-    search = PoleSearch(data, given.search.options.model_copy(update={"integrators": k - 1}))
-    others = Poles(given.end.poles.real[1:], given.end.poles.pairs)
-    if others.order == 0:
-        return np.inf
-    return statistic(search.descend(others, "one integrator less").rss, given)
+    one = 2 * float(np.log(given.worth()))
+    others = Poles(given.end.poles.real[k:], given.end.poles.pairs)
+    found: tuple[int, float, float] | None = None
+    for fewer in range(k - 1, -1, -1):
+        if others.order + fewer == 0:
+            break
+        structure = replace(given.data.structure, integrators=fewer)
+        data = replace(prepare(records, structure), polynomials=given.data.polynomials)
+        search = PoleSearch(data, given.search.options.model_copy(update={"integrators": fewer}))
+        start = Poles(np.concatenate([np.zeros(fewer), others.real]), others.pairs)
+        value = statistic(search.descend(start, "fewer integrators").rss, given)
+        if value > (k - fewer) * one:
+            break
+        found = fewer, value, (k - fewer) * one
+    if found is not None and _other_pole_to_spare(given, one):
+        return None
+    return found
 
 
-def _one_real_pole_less_value(given: Fitted) -> float:
-    """Statistic of the model with the integrators and the least needed searched real pole less.
+def _other_pole_to_spare(given: Fitted, price: float) -> bool:
+    """Is the model as good without one of its searched poles, or pairs (twice the price)?
 
-    Where that is as good, the pole too many was another one: it can take the place of an integrator.
+    Then the pole too many was another one: it can take the place of an integrator, or a pair that of two.
     """
-    poles, first = given.end.poles, given.search.fixed.real.size
-    values = [
-        statistic(given.search.descend(Poles(np.delete(poles.real, i), poles.pairs), "one less").rss, given)
-        for i in range(first, poles.real.size)
+    poles, fixed = given.end.poles, given.search.fixed
+    fewer = [
+        (Poles(np.delete(poles.real, i), poles.pairs), price) for i in range(fixed.real.size, poles.real.size)
     ]
-    return min(values, default=np.inf)
+    fewer += [
+        (Poles(poles.real, np.delete(poles.pairs, i)), 2 * price)
+        for i in range(fixed.pairs.size, poles.pairs.size)
+    ]
+    return any(
+        statistic(given.search.descend(start, "one less").rss, given) <= limit_here
+        for start, limit_here in fewer
+    )
 
 
 def fixed_poles_test(
@@ -248,12 +266,10 @@ def fixed_poles_test(
             "n_pairs": poles.pairs.size,
         }
     )
+    small = PoleSearch(prepare(*searched), options)
+    ends = [small.descend(poles, "fixed poles freed", _ROUGH), OrderSelection(small, _silent).run()]
+    best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
-    found = OrderSelection(PoleSearch(prepare(*searched), options), _silent).run()
-    starts = [poles, found.poles]
-    best = min(
-        (search.descend(start, "fixed poles freed", _ROUGH) for start in starts), key=lambda end: end.rss
-    )
     freed = Fitted(given.data, search.descend(best.poles, "fixed poles freed"), search)
     real = ", ".join(f"{a:.6g}" for a in np.sort(freed.end.poles.real[k:]))
     pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.end.poles.pairs)
