@@ -10,6 +10,7 @@ from scipy.special import chdtri
 
 from ident.identification import Identification
 from ident.input_checks import advice, refuse_unusable
+from ident.integrators_prior import integrators_test
 from ident.least_squares import fit, linearisation
 from ident.model import GobfModel
 from ident.options import IdentOptions
@@ -25,7 +26,6 @@ from ident.prior_tests import (
     delay_test,
     direct_term_test,
     fixed_poles_test,
-    integrators_test,
     not_imposed,
     relative_degree_test,
     too_few_poles,

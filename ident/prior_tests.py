@@ -31,16 +31,8 @@ from ident.structure import Structure
 from ident.structured_fit import structured_fit, structured_polish
 
 TEST_LEVEL = 0.99
-# Slow poles that freed integrators start from, as decays over the whole record.
-_SLOW_STARTS = {
-    1: ((0.1,), (1.0,), (5.0,), (20.0,)),
-    2: ((0.1, 1.0), (0.3, 5.0), (1.0, 20.0), (10.0, 30.0)),
-    3: ((0.1, 0.5, 2.0), (0.3, 2.0, 10.0), (2.0, 10.0, 30.0)),
-}
-# Two freed integrators may also have become a slow oscillation: turns over the whole record.
-_SLOW_TURNS = (0.3, 1.0, 3.0)
 # Descents that only compare starts stop when this fraction of J is left to gain.
-_ROUGH = 1e-4
+ROUGH = 1e-4
 
 
 @dataclass(frozen=True)
@@ -48,9 +40,9 @@ class PriorTest:
     """Verdict of the data on one prior.
 
     statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
-    above it the prior is refused; a cancelled integrator is refused the other way round (`integrators_test`,
-    the verdict says so). imposed says whether the model keeps to the prior; verdict is one sentence, with
-    advice where it is refused.
+    above it the prior is refused; a cancelled integrator is refused the other way round, as its verdict says
+    (`ident.integrators_prior`). imposed says whether the model keeps to the prior; verdict is one sentence,
+    with advice where it is refused.
     """
 
     prior: str
@@ -106,10 +98,11 @@ def statistic(rss_with_prior: float, without: Fitted) -> float:
 
 
 def limit(degrees_of_freedom: int) -> float:
+    """Chi-square quantile that a statistic of a true prior stays below in 99 % of the records."""
     return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
 
 
-def _judged(prior: str, value: float, degrees_of_freedom: int, without: str, advice: str) -> PriorTest:
+def judged(prior: str, value: float, degrees_of_freedom: int, without: str, advice: str) -> PriorTest:
     """`without`: what the data were offered instead; `advice`: what to do if they take it."""
     bound = limit(degrees_of_freedom)
     numbers = _numbers(value, bound)
@@ -127,133 +120,6 @@ def _numbers(value: float, bound: float) -> str:
     return f"test statistic {value:.1f} against {bound:.1f} at {TEST_LEVEL:.0%}"
 
 
-def integrators_test(
-    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
-) -> tuple[PriorTest, Fitted]:
-    """Integrators against as many free slow poles, order and numerator the same; also the fit with them free.
-
-    `searched` are the records that are searched (see `ident.regression.thinned`) and what is estimated on
-    them. The alternative is searched anew, too: wrong integrators lose a mode, and no descent from there
-    finds it again. An integrator that a zero of the model cancels is refused as well: with enough other poles
-    no freed pole can improve on it, but the model with one integrator and one zero less is as good, while
-    no other pole can be spared. It has to gain what the choice of the order asks of any pole, 2 ln Ne.
-    """
-    k = given.data.structure.integrators
-    free = _without_integrators(records, searched, given)
-    advice = "a wrong one spoils all that is slow and can lose a mode: set "
-    for fewer in range(k - 1, -1, -1):
-        if fewer == 0 or _fewer_integrators_value(records, free, fewer) <= limit(fewer):
-            advice += f"integrators = {fewer}" + (", which the data accept" if fewer else "")
-            break
-    value = statistic(given.end.rss, free)
-    name = f"integrators = {k}"
-    test = _judged(name, value, k, "a slow pole in place of each", advice)
-    if not test.refused:
-        spare = _spare_integrators(records, given)
-        if spare is not None:
-            fewer, needless, price = spare
-            verdict = (
-                f"{name} not supported by the data: with {fewer}, and as many zeros less, the fit is as good "
-                f"(test statistic {needless:.1f} against {price:.1f}, the price of a pole), so zeros of the "
-                f"model cancel the rest; kept as asked, but set integrators = {fewer}"
-            )
-            test = PriorTest(name, True, True, needless, price, k - fewer, verdict)
-    return test, free
-
-
-def _without_integrators(
-    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
-) -> Fitted:
-    k, fixed = given.data.structure.integrators, given.search.fixed
-    plain = given.end.poles
-    others = Poles(plain.real[k:], plain.pairs)
-    n_real = plain.real.size - fixed.real.size + k
-    n_pairs = plain.pairs.size - fixed.pairs.size
-    options = given.search.options.model_copy(
-        update={"integrators": 0, "n_real": n_real, "n_pairs": n_pairs, "decay_min_per_s": None}
-    )
-
-    def prepared(chosen: Sequence[Record], structure: Structure) -> Regression:
-        # The polynomials that integrators leave free belong to both sides of the comparison.
-        polynomials = prepare(chosen, structure).polynomials
-        return replace(prepare(chosen, replace(structure, integrators=0)), polynomials=polynomials)
-
-    # Starts are compared on the part that is searched, the best goes on with all samples.
-    small = PoleSearch(prepared(*searched), options)
-    longest = small.data.longest
-    starts = [others.appended(Poles(1 - np.array(decays) / longest)) for decays in _SLOW_STARTS[k]]
-    if k >= 2:
-        rest = 1 - np.array([0.3] * (k - 2)) / longest
-        for turns in _SLOW_TURNS:
-            pair = np.exp(2 * np.pi * turns / longest * np.array([-0.3 + 1j]))
-            starts.append(others.appended(Poles(rest, pair)))
-    ends = [small.descend(start, "integrators freed", _ROUGH) for start in starts]
-    ends.append(OrderSelection(small, _silent).run())
-    best = min(ends, key=lambda end: end.rss)
-    search = PoleSearch(prepared(records, given.data.structure), options)
-    search.evaluations = small.evaluations
-    return Fitted(search.data, search.descend(best.poles, "integrators freed"), search)
-
-
-def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
-    """Statistic of `fewer` integrators against none: the slowest real poles of the free fit become theirs."""
-    n_fixed = free.search.fixed.real.size
-    own = np.sort(free.end.poles.real[n_fixed:])
-    if own.size < fewer:
-        return np.inf
-    structure = replace(free.data.structure, integrators=fewer)
-    options = free.search.options.model_copy(update={"integrators": fewer})
-    data = replace(prepare(records, structure), polynomials=free.data.polynomials)
-    start = Poles(
-        np.concatenate([np.zeros(fewer), free.end.poles.real[:n_fixed], own[: own.size - fewer]]),
-        free.end.poles.pairs,
-    )
-    end = PoleSearch(data, options).descend(start, "fewer integrators")
-    return statistic(end.rss, free)
-
-
-def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, float, float] | None:
-    """How few integrators are enough beside the same other poles, with statistic and price; None: all are
-    needed."""
-    k = given.data.structure.integrators
-    one = 2 * float(np.log(given.worth()))
-    others = Poles(given.end.poles.real[k:], given.end.poles.pairs)
-    found: tuple[int, float, float] | None = None
-    for fewer in range(k - 1, -1, -1):
-        if others.order + fewer == 0:
-            break
-        structure = replace(given.data.structure, integrators=fewer)
-        data = replace(prepare(records, structure), polynomials=given.data.polynomials)
-        search = PoleSearch(data, given.search.options.model_copy(update={"integrators": fewer}))
-        start = Poles(np.concatenate([np.zeros(fewer), others.real]), others.pairs)
-        value = statistic(search.descend(start, "fewer integrators").rss, given)
-        if value > (k - fewer) * one:
-            break
-        found = fewer, value, (k - fewer) * one
-    if found is not None and _other_pole_to_spare(given, one):
-        return None
-    return found
-
-
-def _other_pole_to_spare(given: Fitted, price: float) -> bool:
-    """Is the model as good without one of its searched poles, or pairs (twice the price)?
-
-    Then the pole too many was another one: it can take the place of an integrator, or a pair that of two.
-    """
-    poles, fixed = given.end.poles, given.search.fixed
-    fewer = [
-        (Poles(np.delete(poles.real, i), poles.pairs), price) for i in range(fixed.real.size, poles.real.size)
-    ]
-    fewer += [
-        (Poles(poles.real, np.delete(poles.pairs, i)), 2 * price)
-        for i in range(fixed.pairs.size, poles.pairs.size)
-    ]
-    return any(
-        statistic(given.search.descend(start, "one less").rss, given) <= limit_here
-        for start, limit_here in fewer
-    )
-
-
 def fixed_poles_test(
     records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
 ) -> PriorTest:
@@ -267,13 +133,13 @@ def fixed_poles_test(
         }
     )
     small = PoleSearch(prepare(*searched), options)
-    ends = [small.descend(poles, "fixed poles freed", _ROUGH), OrderSelection(small, _silent).run()]
+    ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small, silent).run()]
     best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
     freed = Fitted(given.data, search.descend(best.poles, "fixed poles freed"), search)
     real = ", ".join(f"{a:.6g}" for a in np.sort(freed.end.poles.real[k:]))
     pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.end.poles.pairs)
-    return _judged(
+    return judged(
         "fixed_poles",
         statistic(given.end.rss, freed),
         fixed.real.size - k + 2 * fixed.pairs.size,
@@ -318,7 +184,7 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
         if value > best:
             best, chosen = value, other
     plural = "s" if chosen != 1 else ""
-    return _judged(
+    return judged(
         f"input_delay_samples = {delay}",
         best,
         1,
@@ -338,7 +204,7 @@ def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
     data = replace(data, polynomials=given.data.polynomials)
     search = PoleSearch(data, given.search.options.model_copy(update={"feedthrough": True}))
     free = Fitted(data, search.descend(given.end.poles, "direct term"), search)
-    return _judged(
+    return judged(
         "relative_degree = 1",
         statistic(given.end.rss, free),
         1,
@@ -358,7 +224,7 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
     again = free.search.descend(constrained.poles, "relative degree released")
     if again.rss < free.end.rss:
         free = replace(free, end=again)
-    test = _judged(
+    test = judged(
         f"relative_degree = {relative_degree}",
         statistic(constrained.rss, free),
         relative_degree - 1,
@@ -410,7 +276,7 @@ def best_under_relative_degree(free: Fitted, relative_degree: int) -> Polished:
             tolerance=tolerance,
         )
 
-    rough = min((descended(start, _ROUGH) for start in starts), key=lambda end: end.rss)
+    rough = min((descended(start, ROUGH) for start in starts), key=lambda end: end.rss)
     return descended(rough.poles, 1e-9)
 
 
@@ -427,5 +293,5 @@ def _distance(one: Poles, other: Poles) -> float:
     )
 
 
-def _silent(fraction: float, message: str) -> None:
+def silent(fraction: float, message: str) -> None:
     """Default progress: nobody listens."""
