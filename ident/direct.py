@@ -54,7 +54,13 @@ def minimise(
         problem.set_upper_bounds(np.ones(dimension))
         problem.set_min_objective(recorded)
         problem.set_maxeval(evaluations)
-        problem.optimize(np.full(dimension, 0.5))
+        try:
+            problem.optimize(np.full(dimension, 0.5))
+        except nlopt.runtime_error:
+            # The original DIRECT may fill its tables in mid-iteration (noise-free data) and report a bare
+            # failure; the points it looked at are a search all the same.
+            if not points:
+                raise
     return np.array(points), np.array(costs)
 
 
