@@ -12,7 +12,7 @@ import scipy.linalg
 
 from ident.arrays import ComplexArray, RealArray
 from ident.poles import Poles
-from ident.real_pair import kautz_numerators
+from ident.real_pair import combination, kautz_numerators
 
 
 def complex_realisation(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
@@ -41,10 +41,6 @@ def real_realisation(poles: Poles) -> tuple[RealArray, RealArray]:
     A, B = complex_realisation(poles)
     blocks: list[ComplexArray] = [np.eye(poles.real.size, dtype=np.complex128)]
     for pole in poles.pairs:
-        # L_i has the numerator z - conj(xi), L_{i+1} has 1 - conj(xi) z (times width over D): solve
-        # c1 (z - conj xi) + c2 (1 - conj xi z) = m1 z + m2 for each function, (7) and (13).
-        numerators = np.array([[1, -np.conj(pole)], [-np.conj(pole), 1]])
-        wanted = np.array(kautz_numerators(complex(pole)))
-        blocks.append(np.asarray(wanted @ np.linalg.inv(numerators), dtype=np.complex128))
+        blocks.append(combination(complex(pole), *kautz_numerators(complex(pole))))
     T = scipy.linalg.block_diag(*blocks)
     return np.real(T @ A @ np.linalg.inv(T)), np.real(T @ B)

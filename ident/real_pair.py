@@ -49,6 +49,17 @@ def kautz_numerators(pole: complex) -> tuple[RealArray, RealArray]:
     return scale * np.array([1.0, -beta]), scale * np.array([0.0, np.sqrt((1 - beta) * (1 + beta))])
 
 
+def combination(pole: complex, x1: RealArray, x2: RealArray) -> ComplexArray:
+    """[[c1, c2], [c3, c4]] of (7): the two real functions as combinations of the complex L_i, L_{i+1} of (5).
+
+    Over the width sqrt(1 - |xi|^2)/D these have the numerators z - conj(xi) and 1 - conj(xi) z, so (13) asks
+    for c1 (z - conj(xi)) + c2 (1 - conj(xi) z) = m1 z + m2. The matrix is unitary, (8) to (10), exactly when
+    x1 and x2 satisfy (14) and (15).
+    """
+    numerators = np.array([[1, -np.conj(pole)], [-np.conj(pole), 1]])
+    return np.asarray(np.array([x1, x2]) @ np.linalg.inv(numerators), dtype=np.complex128)
+
+
 def pair_response(pole: complex, x1: RealArray, x2: RealArray, z: ComplexArray) -> ComplexArray:
     """Values (F, 2) of the two functions with numerators x1 = (m1, m2) and x2 = (m3, m4) at the points z
     (F,).

@@ -1,0 +1,627 @@
+"""Equations (1) to (31) of Ziaei & Wang 2006: the function that is each of them, and the test that checks it.
+
+`EQUATIONS` is the table; the first tests walk it, so that a function or a test that moves is missed at once.
+Reading the printed text: (8) and (9) are about squared moduli, the first entry of (19) is negative (otherwise
+(15) fails), and gamma of (29) is |xi|^2 in (0, 1), Fig. 1's axis being -gamma.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+
+import nlopt
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+import scipy.signal
+
+from ident.basis import all_pass_response, basis_response, basis_state_space, block_parameters, regressor
+from ident.candidate_cost import CandidateCost
+from ident.comparators import fir
+from ident.coordinates import search_space
+from ident.direct import minimise
+from ident.error_surface import error_surface
+from ident.least_squares import fit
+from ident.model import GobfModel
+from ident.options import Algorithm, IdentOptions
+from ident.paper_realisation import complex_realisation, real_realisation
+from ident.poles import Poles
+from ident.real_pair import (
+    combination,
+    kautz_numerators,
+    pair_metric,
+    pair_response,
+    paper_numerators,
+    rotated_numerators,
+)
+from ident.record import Record
+from ident.regression import prepare
+from ident.structure import Structure
+
+HERE = Path(__file__).parent
+DT_S = 0.005
+MIXED = Poles([0.5, 0.9, -0.3], [0.8 * np.exp(0.4j), 0.95 * np.exp(2.0j)])
+Z = np.exp(1j * np.array([0.05, 0.3, 1.1, 2.0, 3.1]))
+ALGORITHMS = typing.get_args(Algorithm)
+
+
+@dataclass(frozen=True)
+class Equation:
+    """`functions` are dotted names below ident, `tests` "file::test" below tests/ident ("" is this file)."""
+
+    numbers: tuple[int, ...]
+    says: str
+    functions: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+EQUATIONS = (
+    Equation(
+        (1,),
+        "y = G(q) u + v, G a sum of delays",
+        ("model.GobfModel.simulate",),
+        ("::test_1_output_is_the_convolution_with_the_impulse_response",),
+    ),
+    Equation(
+        (2,),
+        "FIR: the sum cut off",
+        ("comparators.fir", "basis.regressor"),
+        ("::test_2_zero_poles_are_the_fir_model", "test_basis.py::test_fir_is_delay"),
+    ),
+    Equation(
+        (3,),
+        "y = sum theta_i L_i(q) u",
+        ("model.GobfModel.frequency_response", "model.GobfModel.simulate"),
+        (
+            "::test_3_model_is_the_weighted_sum_of_its_functions",
+            "test_model.py::test_simulation_agrees_with_control",
+        ),
+    ),
+    Equation(
+        (4,),
+        "orthonormal on the unit circle",
+        ("basis.basis_response",),
+        ("test_basis.py::test_basis_is_orthonormal_on_the_circle", "test_basis.py::test_kernel_identity"),
+    ),
+    Equation(
+        (5,),
+        "the generalised basis",
+        ("basis.basis_response", "basis.all_pass_response", "paper_realisation.complex_realisation"),
+        (
+            "test_basis.py::test_real_poles_give_the_printed_formula",
+            "test_basis.py::test_paper_complex_states_are_the_printed_functions",
+            "::test_5_6_fir_laguerre_and_kautz_are_one_code_path",
+        ),
+    ),
+    Equation(
+        (6,),
+        "Laguerre: one real pole repeated",
+        ("basis.basis_response", "basis.regressor"),
+        (
+            "::test_5_6_fir_laguerre_and_kautz_are_one_code_path",
+            "test_basis.py::test_laguerre_by_transfer_functions",
+        ),
+    ),
+    Equation(
+        (7,),
+        "real pair as combinations of the complex functions",
+        ("real_pair.combination",),
+        ("::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",),
+    ),
+    Equation(
+        (8, 9, 10),
+        "the combination is unitary",
+        ("real_pair.combination",),
+        ("::test_8_to_10_combination_is_unitary_for_every_solution",),
+    ),
+    Equation(
+        (11, 12),
+        "each function from the one before",
+        ("basis.basis_response", "paper_realisation.complex_realisation"),
+        ("::test_11_12_functions_follow_from_the_one_before",),
+    ),
+    Equation(
+        (13,),
+        "real numerator m1 q + m2 behind the all-pass of the poles before",
+        ("real_pair.pair_response", "real_pair.combination"),
+        (
+            "::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",
+            "::test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles",
+        ),
+    ),
+    Equation(
+        (14, 15, 16),
+        "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M",
+        ("real_pair.pair_metric", "real_pair.pair_response"),
+        (
+            "test_real_pair.py::test_solutions_satisfy_the_constraints",
+            "test_real_pair.py::test_constraints_make_the_pair_orthonormal",
+            "test_real_pair.py::test_wrong_numerators_are_refused",
+        ),
+    ),
+    Equation(
+        (17,),
+        "x_2 from x_1 by a quarter turn in the space of M",
+        ("real_pair.rotated_numerators",),
+        ("::test_17_second_numerator_is_the_quarter_turn",),
+    ),
+    Equation(
+        (18, 19),
+        "the solution with m2 = 0",
+        ("real_pair.paper_numerators",),
+        (
+            "::test_18_19_solution_with_m2_zero",
+            "test_real_pair.py::test_every_solution_gives_the_same_fit",
+            "::test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles",
+        ),
+    ),
+    Equation(
+        (20,),
+        "J, the mean square of the residual",
+        ("least_squares.fit", "error_surface.error_surface"),
+        (
+            "::test_20_cost_is_the_mean_square_residual",
+            "test_error_surface.py::test_surface_is_the_fit_at_every_point",
+        ),
+    ),
+    Equation(
+        (21,),
+        "linear regression phi' theta",
+        ("basis.regressor", "model.GobfModel.simulate"),
+        ("::test_21_output_is_linear_in_the_coefficients",),
+    ),
+    Equation(
+        (22,),
+        "difference equations of the states",
+        ("paper_realisation.complex_realisation", "basis.regressor"),
+        ("::test_22_difference_equations_give_the_printed_functions",),
+    ),
+    Equation(
+        (23, 24),
+        "E x(k+1) = A x + B u, solved for x(k+1)",
+        ("paper_realisation.complex_realisation",),
+        ("::test_23_24_matrices_are_the_printed_ones",),
+    ),
+    Equation(
+        (25, 26),
+        "real states by the block diagonal T",
+        ("paper_realisation.real_realisation", "basis.basis_state_space"),
+        (
+            "test_basis.py::test_paper_state_space_gives_the_same_basis",
+            "::test_25_26_transformation_keeps_the_space",
+            "::test_lossless_at_gamma_0_9999",
+            "test_basis.py::test_realisation_is_lossless_next_to_the_circle",
+        ),
+    ),
+    Equation(
+        (27,),
+        "least-squares coefficients",
+        ("least_squares.fit",),
+        (
+            "::test_27_least_squares_solves_the_normal_equations",
+            "test_least_squares.py::test_fit_is_the_dense_least_squares_fit",
+        ),
+    ),
+    Equation(
+        (28, 29),
+        "filter parameters eta, beta and gamma",
+        ("coordinates.search_space", "basis.block_parameters"),
+        (
+            "::test_28_29_filter_parameters_and_poles_correspond",
+            "test_pole_search.py::test_points_of_the_cube_are_ordered_poles_inside_the_circle",
+        ),
+    ),
+    Equation(
+        (30,),
+        "cost over eta with the coefficients fitted every time",
+        ("candidate_cost.CandidateCost.rss", "pole_search.PoleSearch.joint", "identify.identify"),
+        (
+            "::test_30_cost_of_eta_is_that_of_the_fitted_coefficients",
+            "test_pole_search.py::test_paper_coordinates_can_be_chosen",
+        ),
+    ),
+    Equation(
+        (31,),
+        "bounded global minimisation: DIRECT in all variants",
+        ("direct.minimise",),
+        (
+            "::test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum",
+            "::test_31_all_variants_of_nlopt_are_there",
+            "::test_31_a_search_that_nlopt_breaks_off_keeps_what_it_found",
+            "test_pole_search.py::test_every_variant_of_direct_finds_the_lowest_of_many_minima",
+        ),
+    ),
+)
+
+
+def test_table_covers_the_equations_in_order():
+    assert [n for entry in EQUATIONS for n in entry.numbers] == list(range(1, 32))
+
+
+@pytest.mark.parametrize("entry", EQUATIONS, ids=lambda entry: f"({entry.numbers[0]})")
+def test_functions_and_tests_of_the_table_exist(entry):
+    for name in entry.functions:
+        module, *path = name.split(".")
+        found = importlib.import_module(f"ident.{module}")
+        for part in path:
+            found = getattr(found, part)
+        assert callable(found), name
+        assert found.__doc__, f"{name} has no contract"
+    for name in entry.tests:
+        file, test = name.split("::")
+        tree = ast.parse((HERE / (file or Path(__file__).name)).read_text(encoding="utf-8"))
+        assert test in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, name
+
+
+def printed_functions(xi: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(5) as it stands, one column a function; complex for complex poles."""
+    columns, product = [], np.ones_like(z)
+    for pole in xi:
+        columns.append(np.sqrt(1 - abs(pole) ** 2) / (z - pole) * product)
+        product = product * (1 - np.conj(pole) * z) / (z - pole)
+    return np.column_stack(columns)
+
+
+def record(u: np.ndarray, y: np.ndarray) -> Record:
+    return Record("record", u[:, None], y[:, None], DT_S, ("u",), ("y",))
+
+
+def noise(seed: int, n: int = 400) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def test_1_output_is_the_convolution_with_the_impulse_response():
+    model = GobfModel(MIXED, np.arange(1.0, 8.0), DT_S)
+    u = noise(0, 200)
+    g = model.simulate(np.eye(1, 200)[0])
+    assert g[0] == 0  # k begins at 1: no direct term
+    np.testing.assert_allclose(model.simulate(u), np.convolve(u, g)[:200], atol=1e-11)
+
+
+def test_2_zero_poles_are_the_fir_model():
+    taps = np.array([0.5, -1.0, 0.25, 2.0, 0.125])
+    model = GobfModel(Poles(np.zeros(5)), taps, DT_S)
+    np.testing.assert_array_equal(model.simulate(np.eye(1, 12)[0]), [0, *taps, *np.zeros(6)])
+    # The same numbers from the regression on delayed inputs, and cut off they miss what lies behind the cut.
+    u = noise(1)
+    y = model.simulate(u)
+    np.testing.assert_allclose(fir(record(u, y), 5).b, taps, atol=1e-12)
+    slow = GobfModel(Poles([0.9]), np.ones(1), DT_S)
+    y = slow.simulate(u)
+    errors = [np.linalg.norm(fir(record(u, y), n).simulate(u) - y) for n in (10, 20, 40)]
+    # What is cut off of a decay 0.9^k shrinks by 0.9^10 and 0.9^20; the fit of the rest can only help.
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[2] < 0.2 * errors[1]
+
+
+def test_3_model_is_the_weighted_sum_of_its_functions():
+    theta = np.linspace(-1, 1, 7)
+    model = GobfModel(MIXED, theta, DT_S)
+    omega = np.angle(Z) / DT_S
+    np.testing.assert_allclose(model.frequency_response(omega), basis_response(MIXED, Z) @ theta, rtol=1e-12)
+    # Real poles alone, written out with (5) itself and filtered by scipy.
+    poles = Poles([0.5, -0.3])
+    u = noise(2)
+    first = scipy.signal.lfilter([0, np.sqrt(0.75)], [1, -0.5], u)
+    passed = scipy.signal.lfilter([-0.5, 1], [1, -0.5], u)
+    second = scipy.signal.lfilter([0, np.sqrt(0.91)], [1, 0.3], passed)
+    np.testing.assert_allclose(
+        GobfModel(poles, np.array([2.0, 3.0]), DT_S).simulate(u), 2 * first + 3 * second, atol=1e-12
+    )
+
+
+def test_5_6_fir_laguerre_and_kautz_are_one_code_path():
+    """FIR is the limit a -> 0 of Laguerre; Laguerre that of Kautz as the pair closes on the real axis."""
+    fir_functions = basis_response(Poles(np.zeros(4)), Z)
+    np.testing.assert_allclose(fir_functions, Z[:, None] ** -np.arange(1.0, 5.0), rtol=1e-13)
+    a = 0.7
+    i = np.arange(1, 5)
+    laguerre = np.sqrt(1 - a**2) / (Z[:, None] - a) * ((1 - a * Z[:, None]) / (Z[:, None] - a)) ** (i - 1)
+    np.testing.assert_allclose(basis_response(Poles([a] * 4), Z), laguerre, rtol=1e-12)
+    np.testing.assert_allclose(basis_response(Poles([1e-9] * 4), Z), fir_functions, atol=1e-8)
+    # The pair of nearly equal real poles spans what two equal ones span: projectors agree to the distance.
+    closing = basis_response(Poles([], [a + 1e-6j] * 2), np.exp(2j * np.pi * np.arange(512) / 512))
+    repeated = basis_response(Poles([a] * 4), np.exp(2j * np.pi * np.arange(512) / 512))
+    rest = repeated - closing @ (closing.conj().T @ repeated) / 512
+    assert np.abs(rest).max() < 1e-4
+
+
+SOLUTIONS = {
+    "paper (18)-(19)": paper_numerators,
+    "rotated by 0.7": lambda pole: rotated_numerators(pole, 0.7),
+    "rotated by 2.9": lambda pole: rotated_numerators(pole, 2.9),
+    "Kautz": kautz_numerators,
+}
+PAIRS = [0.9 * np.exp(0.3j), 0.99 * np.exp(2.5j), 0.3 * np.exp(1.0j), 0.999 * np.exp(0.05j)]
+
+
+@pytest.mark.parametrize("solution", SOLUTIONS)
+@pytest.mark.parametrize("pole", PAIRS)
+def test_7_13_combinations_of_the_complex_functions_are_the_real_ones(pole, solution):
+    x1, x2 = SOLUTIONS[solution](pole)
+    c = combination(pole, x1, x2)
+    complex_pair = printed_functions(np.array([pole, np.conj(pole)]), Z)
+    # Near the circle the 2 x 2 system has the condition 2 / |1 - |xi|^2|, a thousand here.
+    np.testing.assert_allclose(complex_pair @ c.T, pair_response(pole, x1, x2, Z), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("solution", SOLUTIONS)
+@pytest.mark.parametrize("pole", PAIRS)
+def test_8_to_10_combination_is_unitary_for_every_solution(pole, solution):
+    c = combination(pole, *SOLUTIONS[solution](pole))
+    np.testing.assert_allclose(c @ c.conj().T, np.eye(2), atol=1e-10)
+
+
+def test_11_12_functions_follow_from_the_one_before():
+    xi, z = MIXED.values, Z
+    A, B = complex_realisation(MIXED)
+    functions = np.array([np.linalg.solve(value * np.eye(xi.size) - A, B)[:, 0] for value in z])
+    for i in range(1, xi.size):
+        ratio = np.sqrt((1 - abs(xi[i]) ** 2) / (1 - abs(xi[i - 1]) ** 2))
+        step = ratio * (1 - np.conj(xi[i - 1]) * z) / (z - xi[i])  # (11)
+        np.testing.assert_allclose(functions[:, i], step * functions[:, i - 1], rtol=1e-10)
+    for i in (3, 5):  # the pairs: their second function from the one before the pair
+        ratio = np.sqrt((1 - abs(xi[i]) ** 2) / (1 - abs(xi[i - 1]) ** 2))
+        denominator = z**2 - 2 * xi[i].real * z + abs(xi[i]) ** 2
+        step = ratio * (1 - np.conj(xi[i - 1]) * z) * (1 - np.conj(xi[i]) * z) / denominator  # (12)
+        np.testing.assert_allclose(functions[:, i + 1], step * functions[:, i - 1], rtol=1e-10)
+    for i in (1, 2):  # and (11) among our own real functions
+        ratio = np.sqrt((1 - xi[i].real ** 2) / (1 - xi[i - 1].real ** 2))
+        ours = basis_response(MIXED, z)
+        step = ratio * (1 - xi[i - 1].real * z) / (z - xi[i].real)
+        np.testing.assert_allclose(ours[:, i], step * ours[:, i - 1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("first", SOLUTIONS)
+@pytest.mark.parametrize("second", SOLUTIONS)
+def test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles(first, second):
+    """Two real poles and two pairs, each pair by a solution of its own: the fit is that of the basis."""
+    poles = Poles([0.4, -0.6], [0.9 * np.exp(0.3j), 0.97 * np.exp(1.2j)])
+    u, y = noise(3), noise(4)
+    ours = regressor(poles, u)
+    expected = ours @ np.linalg.lstsq(ours, y)[0]
+    # By scipy: each section behind the all-pass of those before it.
+    columns, signal = [], u
+    for a in poles.real:
+        columns.append(scipy.signal.lfilter([0, 1], [1, -a], signal))
+        signal = scipy.signal.lfilter([-a, 1], [1, -a], signal)
+    for pole, name in zip(poles.pairs, (first, second), strict=True):
+        denominator = np.array([1, -2 * pole.real, abs(pole) ** 2])
+        columns += [
+            scipy.signal.lfilter([0, m[0], m[1]], denominator, signal) for m in SOLUTIONS[name](complex(pole))
+        ]
+        signal = scipy.signal.lfilter(denominator[::-1], denominator, signal)
+    theirs = np.column_stack(columns)
+    np.testing.assert_allclose(theirs @ np.linalg.lstsq(theirs, y)[0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("pole", PAIRS)
+def test_17_second_numerator_is_the_quarter_turn(pole):
+    root = np.real(scipy.linalg.sqrtm(pair_metric(pole)))
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    for angle in (0.0, 0.7, 2.9):
+        x1, x2 = rotated_numerators(pole, angle)
+        printed = np.linalg.inv(root) @ turn @ root @ x1
+        # Either sign of x2 solves (14) and (15).
+        assert min(np.linalg.norm(printed - x2), np.linalg.norm(printed + x2)) < 1e-8 * np.linalg.norm(x2)
+
+
+@pytest.mark.parametrize("pole", PAIRS)
+def test_18_19_solution_with_m2_zero(pole):
+    x1, x2 = paper_numerators(pole)
+    assert x1[1] == 0
+    size = np.sqrt(1 + abs(pole) ** 2)
+    np.testing.assert_allclose(x1[0], abs(1 - pole**2) / size, rtol=1e-14)
+    np.testing.assert_allclose(x2, [-(pole + np.conj(pole)).real / size, size], rtol=1e-14)
+    # It is one of the solutions of (17): the angle is that of M^1/2 x1, and x2 comes with either sign.
+    unit = np.real(scipy.linalg.sqrtm(pair_metric(pole))) @ x1
+    first, second = rotated_numerators(pole, float(np.arctan2(unit[1], unit[0])))
+    np.testing.assert_allclose(first, x1, atol=1e-8 * np.linalg.norm(x1))
+    assert min(np.linalg.norm(second - x2), np.linalg.norm(second + x2)) < 1e-8 * np.linalg.norm(x2)
+
+
+def test_20_cost_is_the_mean_square_residual():
+    poles = Poles([0.6], [0.9 * np.exp(0.3j)])
+    u, y = noise(5), noise(6)
+    found = fit(prepare([record(u, y)], Structure()), poles)
+    model = GobfModel(poles, found.coefficients, DT_S)
+    mean_square = np.mean((y - model.simulate(u)) ** 2)
+    assert found.rss / y.size == pytest.approx(mean_square, rel=1e-12)
+    gamma = abs(poles.pairs[0]) ** 2
+    beta = 2 * poles.pairs[0].real / (1 + gamma)
+    surface = error_surface(
+        [record(u, y)],
+        model,
+        Structure(),
+        coordinates="raw",
+        first=np.array([beta]),
+        second=np.array([gamma]),
+    )
+    assert surface.mean_square[0, 0] == pytest.approx(mean_square, rel=1e-9)
+
+
+def test_21_output_is_linear_in_the_coefficients():
+    u = noise(7)
+    one, two = noise(8, 7), noise(9, 7)
+
+    def output(theta):
+        return GobfModel(MIXED, theta, DT_S).simulate(u)
+
+    np.testing.assert_allclose(output(2 * one - 3 * two), 2 * output(one) - 3 * output(two), atol=1e-11)
+    np.testing.assert_allclose(output(one), regressor(MIXED, u) @ one, atol=1e-12)
+
+
+def test_22_difference_equations_give_the_printed_functions():
+    """(22) run sample by sample, real poles, against the regressor; complex ones against filters by scipy."""
+    u = noise(10, 150)
+    for xi in (np.array([0.5, 0.9, -0.3]), MIXED.values):
+        x = np.zeros((u.size + 1, xi.size), dtype=np.complex128)
+        for k, value in enumerate(u):
+            x[k + 1, 0] = xi[0] * x[k, 0] + np.sqrt(1 - abs(xi[0]) ** 2) * value
+            for i in range(1, xi.size):
+                factor = np.sqrt((1 - abs(xi[i]) ** 2) / (1 - abs(xi[i - 1]) ** 2))
+                x[k + 1, i] = (
+                    xi[i] * x[k, i] + factor * x[k, i - 1] - np.conj(xi[i - 1]) * factor * x[k + 1, i - 1]
+                )
+        signal = u.astype(np.complex128)
+        for i, pole in enumerate(xi):
+            expected = scipy.signal.lfilter([0, np.sqrt(1 - abs(pole) ** 2)], [1, -pole], signal)
+            np.testing.assert_allclose(x[:-1, i], expected, atol=1e-11)
+            signal = scipy.signal.lfilter([-np.conj(pole), 1], [1, -pole], signal)
+        if np.isrealobj(xi):
+            np.testing.assert_allclose(x[:-1].real, regressor(Poles(xi), u), atol=1e-12)
+
+
+def test_23_24_matrices_are_the_printed_ones():
+    xi = MIXED.values
+    n = xi.size
+    width = np.sqrt(1 - np.abs(xi) ** 2)
+    E, A = np.eye(n, dtype=np.complex128), np.diag(xi)
+    for i in range(1, n):
+        E[i, i - 1] = np.conj(xi[i - 1]) * width[i] / width[i - 1]
+        A[i, i - 1] = width[i] / width[i - 1]
+    B = np.zeros((n, 1))
+    B[0] = width[0]
+    A_bar, B_bar = complex_realisation(MIXED)
+    assert np.linalg.det(E) == pytest.approx(1)
+    np.testing.assert_allclose(E @ A_bar, A, atol=1e-13)
+    np.testing.assert_allclose(E @ B_bar, B, atol=1e-13)
+
+
+def test_25_26_transformation_keeps_the_space():
+    """T is block diagonal and unitary: the eigenvalues are the poles, the states span the complex ones."""
+    A, B = real_realisation(MIXED)
+    found = np.linalg.eigvals(A)
+    distances = np.abs(found[:, None] - MIXED.values[None, :])
+    assert distances.min(axis=0).max() < 1e-10
+    circle = np.exp(2j * np.pi * np.arange(2048) / 2048)
+    real = np.array([np.linalg.solve(z * np.eye(7) - A, B)[:, 0] for z in circle])
+    printed = printed_functions(MIXED.values, circle)
+    T = real.T @ printed.conj() / 2048
+    np.testing.assert_allclose(T @ T.conj().T, np.eye(7), atol=1e-10)
+    blocks = scipy.linalg.block_diag(np.ones((3, 3)), np.ones((2, 2)), np.ones((2, 2)))
+    np.testing.assert_allclose(T * (1 - blocks), 0, atol=1e-10)
+
+
+def test_lossless_at_gamma_0_9999():
+    """The realisation used instead of (24): A A' + B B' = I to 1e-14, where inverting E loses digits."""
+    pole = np.sqrt(0.9999) * np.exp(0.075j)
+    poles = Poles([0.999], [pole, np.sqrt(0.9999) * np.exp(1.3j)])
+    A, B, _, _ = basis_state_space(poles)
+    assert np.linalg.norm(A @ A.T + B @ B.T - np.eye(5)) <= 1e-14
+    assert block_parameters(poles)[1, 0] == pytest.approx(0.9999, rel=1e-15)
+    assert np.abs(np.abs(all_pass_response(poles, Z)) - 1).max() < 1e-13
+
+
+def test_27_least_squares_solves_the_normal_equations():
+    poles = Poles([0.6], [0.7 * np.exp(0.8j)])
+    u, y = noise(11), noise(12)
+    found = fit(prepare([record(u, y)], Structure()), poles)
+    phi = regressor(poles, u)
+    by_sums = np.linalg.inv(sum(np.outer(row, row) for row in phi)) @ sum(
+        row * value for row, value in zip(phi, y, strict=True)
+    )
+    np.testing.assert_allclose(found.coefficients, by_sums, rtol=1e-10)
+    np.testing.assert_allclose(phi.T @ found.residual, 0, atol=1e-10)
+
+
+def test_28_29_filter_parameters_and_poles_correspond():
+    space = search_space(1, 2, 1000, DT_S, IdentOptions(coordinates="raw"))
+    assert space.names == ("x 1", "beta 1", "gamma 1", "beta 2", "gamma 2")
+    rng, checked = np.random.default_rng(13), 0
+    for _ in range(200):
+        unit = rng.random(5)
+        x, beta_1, gamma_1, beta_2, gamma_2 = space.coordinates(unit[None, :])[0]
+        poles = space.poles(unit)
+        assert np.all(np.abs(poles.values) < 1)
+        assert poles.real[0] == pytest.approx(x, abs=1e-12)
+        for pole, beta, gamma in zip(poles.pairs, (beta_1, beta_2), (gamma_1, gamma_2), strict=True):
+            root = complex(np.roots([1, -beta * (1 + gamma), gamma])[0])
+            # Two real poles, or nearly, are moved to a pair of damping 0.95.
+            if root.imag != 0 and -np.log(root).real < 0.94 * abs(np.log(root)):
+                checked += 1
+                assert abs(pole) ** 2 == pytest.approx(gamma, rel=1e-9)
+                assert 2 * pole.real / (1 + abs(pole) ** 2) == pytest.approx(beta, rel=1e-9, abs=1e-12)
+    assert checked > 100
+    gamma, beta = block_parameters(Poles([], [0.9 * np.exp(0.3j)]))[0, :2]
+    assert gamma == pytest.approx(0.81)
+    assert beta == pytest.approx(1.8 * np.cos(0.3) / 1.81)
+
+
+def test_30_cost_of_eta_is_that_of_the_fitted_coefficients():
+    u, y = noise(14), noise(15)
+    data = prepare([record(u, y)], Structure())
+    space = search_space(1, 1, 400, DT_S, IdentOptions(coordinates="raw"))
+    none = Poles()
+    cost = CandidateCost(data, space, none, none)
+    units = np.random.default_rng(16).random((40, 3))
+    values = cost.rss(units)
+    checked = 0
+    for unit, value in zip(units, values, strict=True):
+        x, beta, gamma = space.coordinates(unit[None, :])[0]
+        # Columns from the parameters of (28) alone: denominators q - x and q^2 - beta (1 + gamma) q + gamma.
+        pair = np.array([1, -beta * (1 + gamma), gamma])
+        if np.abs(np.roots(pair)).max() > 0.99 or np.ptp(np.abs(np.roots(pair))) > 0.5:
+            continue
+        passed = scipy.signal.lfilter([-x, 1], [1, -x], u)
+        columns = np.column_stack(
+            [
+                scipy.signal.lfilter([0, 1], [1, -x], u),
+                scipy.signal.lfilter([0, 1, 0], pair, passed),
+                scipy.signal.lfilter([0, 0, 1], pair, passed),
+            ]
+        )
+        residual = y - columns @ np.linalg.lstsq(columns, y)[0]
+        assert value == pytest.approx(residual @ residual, rel=1e-8)
+        checked += 1
+    assert checked >= 10
+
+
+def test_31_all_variants_of_nlopt_are_there():
+    offered = {name for name in dir(nlopt) if name.startswith("GN_") and "DIRECT" in name}
+    assert offered <= set(ALGORITHMS)
+    assert {"SCIPY_DIRECT", "SCIPY_DIRECT_L"} <= set(ALGORITHMS)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum(algorithm):
+    """(30) by (31): a well-damped pair at 20 dB, in the paper's (beta, gamma); smooth near its optimum."""
+    pole = 0.8 * np.exp(0.9j)
+    u = noise(17)
+    clean = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
+    y = clean + 0.1 * np.std(clean) * noise(18)
+    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
+    cost = CandidateCost(prepare([record(u, y)], Structure()), space, Poles(), Poles())
+    points, values = minimise(cost.log, 2, algorithm, 1500)
+    assert np.all((points >= 0) & (points <= 1))
+    # The optimum by another method, from the true pair; gamma may not leave the box for the simplex either.
+    beta, gamma = 2 * pole.real / (1 + abs(pole) ** 2), abs(pole) ** 2
+    low, high = space.coordinates(np.array([[0.0, 0.0], [1.0, 1.0]]))
+    start = (np.array([beta, gamma]) - low) / (high - low)
+    best = scipy.optimize.minimize(
+        lambda unit: float(cost.log(unit[None, :])[0]),
+        start,
+        method="Nelder-Mead",
+        options={"xatol": 1e-8, "fatol": 1e-12},
+    )
+    # 1500 evaluations leave boxes of 3^-8 or less around the optimum.
+    np.testing.assert_allclose(points[np.argmin(values)], best.x, atol=3.0**-8)
+    assert values.min() == pytest.approx(best.fun, abs=1e-5)
+
+
+def test_31_a_search_that_nlopt_breaks_off_keeps_what_it_found():
+    """Noise-free, every box near the pole is worth dividing: the original DIRECT fills its tables."""
+    pole = 0.8 * np.exp(0.9j)
+    u = noise(17)
+    y = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
+    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
+    cost = CandidateCost(prepare([record(u, y)], Structure()), space, Poles(), Poles())
+    points, values = minimise(cost.log, 2, "GN_ORIG_DIRECT", 1500)
+    beta, gamma = space.coordinates(points[np.argmin(values)][None, :])[0]
+    assert beta == pytest.approx(2 * pole.real / (1 + abs(pole) ** 2), abs=0.02)
+    assert gamma == pytest.approx(abs(pole) ** 2, abs=0.02)
