@@ -154,7 +154,7 @@ def kyoto(path: Path, say: Print) -> None:
     dropped_points(plant, long, omega, say)
     head = f"{'':<46}" + "".join(f"{f'{a:g}-{b:g}':>9}" for a, b in KYOTO_BANDS) + "   rad/s"
     say(
-        "\nOne more run, predicted by the runs of one date (Hotelling's region, that date's outliers dropped):"
+        "\nOne more run, predicted by the runs of one date (Hotelling's region, its outliers dropped):"
         "\nshare of the other date's points inside 95 %, its own outliers kept. Reach 0.95."
     )
     say(head)
@@ -210,7 +210,7 @@ def dropped_points(plant: FrfRepeats, dates: Sequence[str], omega: np.ndarray, s
         gross = np.abs(np.log(np.abs(runs) / np.abs(centre))) > np.log(2)
         say(
             f"{date}: {dropped.sum()} of {dropped.size} points dropped (Hampel's rule across repeats, "
-            f"{OUTLIER:g} robust deviations), {dropped[:, omega < 600].sum()} of them below 600 rad/s; off by "
+            f"{OUTLIER:g} robust deviations), {dropped[:, omega < 600].sum()} below 600 rad/s; off by "
             f"more than a factor of two: {gross.sum()}, of which kept: {(gross & ~dropped).sum()} "
             f"({(gross & ~dropped)[:, omega < 600].sum()} below 600 rad/s)"
         )
@@ -270,8 +270,8 @@ def parametric(
     """Ellipses of a GOBF model fitted to one date, held against the means of all others."""
     say(
         "\nGOBF model fitted to one date up to 600 rad/s (one integrator, order from data): its ellipses and"
-        "\nthose of the other date's mean together, share inside 95 %; semi-axes over |G|. With 'gain', the error"
-        "\nthat the runs of a date share (deviation of a run's gain / sqrt(runs)) is added to the posterior."
+        "\nthose of the other date's mean together, share inside 95 %; semi-axes over |G|. With 'gain', the"
+        "\nerror the runs of a date share (deviation of a gain / sqrt(runs)) is added to the posterior."
     )
     say(head)
     limited = omega <= 600

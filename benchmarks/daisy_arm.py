@@ -1,0 +1,296 @@
+"""DaISy robot arm (96-009): fitted on the first half, run freely on the second, and honest splits beside it.
+
+    FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.daisy_arm
+
+Fit: 100 (1 - |y - yhat| / |y - mean y|) of a free run, no output fed back. "own state": second half alone,
+its initial state (one number per pole, no offset) estimated from it. "carried": the initial state of the
+first half is estimated there and the run goes on through the second, where it is judged. "through": from rest
+at the first sample through both halves, judged on the second, when the transient has died. "whole": the same
+judged on all 1024 samples, from a rest the arm was not in. "periodic": input repeated until the response is
+periodic.
+
+The second half is the first with its sign turned (odd harmonics only): a model that fits one half fits the
+other, and the split tests little. Honest splits: (a) the first half holds one sweep down and one up; fit one,
+run freely on the other, own initial state; (b) every second excited line of the whole period for the fit, the
+others for the judgement, so that the model has to know the response where it was not measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from benchmarks.results_file import ResultsFile
+from ident import GobfModel, IdentOptions, Record, identify
+from ident.autoregression import fit_autoregression
+from ident.basis import free_response
+from ident.comparators import PolynomialModel, armax, arx, oe
+from ident.embedding import EmbeddingOptions, tangent
+from ident.frequency_fit import identify_frf
+from ident.least_squares import fit
+from ident.pole_search import PoleSearch
+from ident.poles import Poles
+from ident.regression import prepare
+from ident.uncertainty import FrequencyUncertainty
+from ident.validation import fit_on_fresh_data
+
+HALF = 512
+ORDERS = (4, 6, 8, 10)
+REACH = {4: 96.4, 6: 96.9, 8: 97.2, 10: 97.4}
+THROUGH = 94.0
+DESCENTS = 60
+
+Model = GobfModel | PolynomialModel
+Print = Callable[[str], None]
+
+
+def percent(y: np.ndarray, error: np.ndarray) -> float:
+    """100 (1 - |error| / |y - mean y|)."""
+    return 100 * (1 - float(np.linalg.norm(error) / np.linalg.norm(y - y.mean())))
+
+
+def free_columns(model: Model, n_samples: int) -> np.ndarray:
+    """Every output the poles can give without input, (T, n)."""
+    if isinstance(model, GobfModel):
+        return free_response(model.poles, n_samples)
+    denominator = np.convolve(model.a, model.f)
+    impulses = np.eye(n_samples, denominator.size - 1)
+    return lfilter([1.0], denominator, impulses, axis=0)
+
+
+def largest_pole(model: Model) -> float:
+    """Modulus of the slowest pole; 1 or more is unstable."""
+    return float(np.abs(model.poles.values if isinstance(model, GobfModel) else model.poles).max())
+
+
+@dataclass(frozen=True)
+class Score:
+    """Fits in per cent, see the module text; radius is that of the largest pole."""
+
+    first: float
+    own_state: float
+    carried: float
+    through: float
+    whole: float
+    periodic: float
+    radius: float
+
+
+def score(model: Model, record: Record) -> Score:
+    """All runs of one model; nan where an unstable one has no meaning."""
+    u, y = record.input[:, 0], record.output[:, 0]
+    radius = largest_pole(model)
+    if not radius < 1:
+        return Score(*([np.nan] * 6), radius)
+    error = y - model.simulate(u)
+    free = free_columns(model, y.size)
+
+    def fitted(part: slice) -> np.ndarray:
+        columns = free[: part.stop - part.start]
+        rest = y[part] - model.simulate(u[part])
+        return rest - columns @ np.linalg.lstsq(columns, rest, rcond=1e-10)[0]
+
+    halves = slice(0, HALF), slice(HALF, 2 * HALF)
+    start = np.linalg.lstsq(free[:HALF], error[:HALF], rcond=1e-10)[0]
+    periods = 12
+    steady = y - model.simulate(np.tile(u, periods))[-y.size :]
+    return Score(
+        percent(y[:HALF], fitted(halves[0])),
+        percent(y[HALF:], fitted(halves[1])),
+        percent(y[HALF:], (error - free @ start)[HALF:]),
+        percent(y[HALF:], error[HALF:]),
+        percent(y, error),
+        percent(y, steady),
+        radius,
+    )
+
+
+def gobf(record: Record, order: int) -> GobfModel:
+    """Pairs only and a direct term: the structure of an acceleration."""
+    return identify([record], structure(order)).model
+
+
+def structure(order: int) -> IdentOptions:
+    """Options of every fit in the time domain here; records start in mid-sweep, hence the initial state.
+
+    Eight starts: with order 10 three miss the best minimum, and time is no matter here.
+    """
+    return IdentOptions(n_real=0, n_pairs=order // 2, feedthrough=True, estimate_initial_state=True, starts=8)
+
+
+def whitened(record: Record, order: int) -> GobfModel:
+    """The same behind the noise model of design 4.5: AR(<= 8) of the residual by BIC, two rounds."""
+    model = gobf(record, order)
+    for _ in range(2):
+        residual = fit_on_fresh_data(model, record, estimate_offset=False).residual
+        a = fit_autoregression([residual], 8)
+        kept = a.size - 1
+        filtered = Record(
+            record.name,
+            lfilter(a, [1.0], record.input, axis=0)[kept:],
+            lfilter(a, [1.0], record.output, axis=0)[kept:],
+            record.dt_s,
+            record.input_names,
+            record.output_names,
+        )
+        model = identify([filtered], structure(order)).model
+    return model
+
+
+def posterior_mean_fit(record: Record, order: int) -> float:
+    """Own-state fit on the second half of the tangent posterior's mean around the model of the first."""
+    first = record.slice(0, HALF)
+    posterior = tangent([first], gobf(first, order), EmbeddingOptions(coloured_noise=True))
+    half = record.slice(HALF, 2 * HALF)
+    return fit_on_fresh_data(posterior, half, estimate_offset=False).fit_percent
+
+
+PEERS: dict[str, Callable[[Record, int], Model]] = {
+    "ARX n, n + 1": lambda record, n: arx(record, n, n + 1, delay_samples=0),
+    "OE n + 1, n": lambda record, n: oe(record, n + 1, n, delay_samples=0),
+    "ARMAX n, n + 1, n": lambda record, n: armax(record, n, n + 1, n, delay_samples=0),
+    "GOBF behind an AR noise model": whitened,
+}
+
+
+def numbers(item: Score) -> str:
+    """One line of the tables."""
+    values = (item.first, item.own_state, item.carried, item.through, item.whole, item.periodic)
+    return "".join(f"{'unstable' if np.isnan(v) else f'{v:.2f}':>10}" for v in values)
+
+
+def minima(record: Record, say: Print) -> None:
+    """Ends of many descents at order 8 on the first half, by cost, with what they predict on the second."""
+    first = record.slice(0, HALF)
+    data = prepare([first], structure(8).structure())
+    search = PoleSearch(data, structure(8))
+    rng = np.random.default_rng(0)
+    found: list[tuple[float, Poles]] = []
+    for _ in range(DESCENTS):
+        omega = np.concatenate([[0.366, 0.796], np.exp(rng.uniform(np.log(0.05), np.log(3.1), 2))])
+        zeta = 10 ** np.concatenate([rng.uniform(-2.5, -2, 2), rng.uniform(-3, -0.3, 2)])
+        poles = Poles((), np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+        end = search.descend(poles, "start")
+        found.append((end.rss, end.poles))
+    found.sort(key=lambda end: end[0])
+    say(f"\nOrder 8: ends of {DESCENTS} descents on the first half (seed 0), the best five")
+    say("sum of squares   own state   through   poles (rad/sample, damping)")
+    last, shown = 0.0, 0
+    for rss, poles in found:
+        if rss < last * 1.003:
+            continue
+        last, shown = rss, shown + 1
+        linear = fit(data, poles)
+        item = score(GobfModel(poles, linear.coefficients, 1.0, linear.feedthrough), record)
+        names = ", ".join(
+            f"{w:.3f} {z:.4f}" for w, z in zip(poles.omega_rad_s(1.0), poles.zeta(), strict=True)
+        )
+        say(f"{rss:>14.6f} {item.own_state:>11.2f} {item.through:>9.2f}   {names}")
+        if shown == 5:
+            break
+
+
+def sweeps(record: Record, say: Print) -> None:
+    """Honest split (a): sweep down and sweep up of the first half."""
+    down, up = record.slice(0, 256), record.slice(256, HALF)
+    say("\nHonest split (a): fitted to the sweep down (samples 0-255), run on the sweep up (256-511); back")
+    say(f"{'':<32}" + "".join(f"{f'order {n}':>18}" for n in ORDERS))
+    methods: dict[str, Callable[[Record, int], Model]] = {"GOBF": gobf} | PEERS
+    for name, method in methods.items():
+        cells = []
+        for order in ORDERS:
+            values = []
+            for part, fresh in ((down, up), (up, down)):
+                model = method(part, order)
+                if not largest_pole(model) < 1:
+                    values.append("unstable")
+                    continue
+                u, y = fresh.input[:, 0], fresh.output[:, 0]
+                error, columns = y - model.simulate(u), free_columns(model, y.size)
+                rest = error - columns @ np.linalg.lstsq(columns, error, rcond=1e-10)[0]
+                values.append(f"{percent(y, rest):.1f}")
+            cells.append(f"{' / '.join(values):>18}")
+        say(f"{name:<32}" + "".join(cells))
+
+
+def lines(record: Record, say: Print) -> None:
+    """Honest split (b): every second excited line."""
+    u, y = (np.fft.rfft(signal[:, 0])[1:] for signal in (record.input, record.output))
+    omega = 2 * np.pi * np.arange(1, u.size + 1) / record.n_samples
+    odd = np.arange(u.size) % 2 == 0  # index 0 is line 1
+    excited = odd & (np.abs(u) > 0.05 * np.abs(u[odd]).max()) & (omega < np.pi)
+    chosen = np.flatnonzero(excited)
+    used, left = chosen[::2], chosen[1::2]
+    noise = float(np.mean(np.abs(y[~odd & (omega < omega[chosen[-1]])]) ** 2))
+    covariance = (noise / 2 / np.abs(u[used]) ** 2)[:, None, None] * np.eye(2)
+    frf = FrequencyUncertainty(omega[used], y[used] / u[used], covariance, record.dt_s)
+    say(
+        f"\nHonest split (b): {used.size} excited lines for the fit (identify_frf), the {left.size} between "
+        f"them for the judgement;\nfitted lines {4 * omega[0]:.4f} rad/sample apart, half widths of the "
+        "modes 0.0021 and 0.0037"
+    )
+    say(f"{'order':>6}{'fitted lines':>16}{'lines left out':>18}")
+    for order in ORDERS:
+        model = identify_frf(frf, IdentOptions(n_real=0, n_pairs=order // 2, feedthrough=True)).model
+        fits = [
+            100
+            * (1 - np.linalg.norm(y[k] - model.frequency_response(omega[k]) * u[k]) / np.linalg.norm(y[k]))
+            for k in (used, left)
+        ]
+        say(f"{order:>6}{fits[0]:>16.2f}{fits[1]:>18.2f}")
+
+
+def main() -> None:
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    folder = os.environ.get("FLEXLINK_DATA")
+    if not folder or not Path(folder).is_dir():
+        sys.exit("set FLEXLINK_DATA to the folder that holds daisy_robot_arm")
+    path = Path(folder) / "daisy_robot_arm" / "robot_arm.csv"
+    record = Record.from_csv(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
+    y, u = record.output[:, 0], record.input[:, 0]
+    first = record.slice(0, HALF)
+    with ResultsFile("daisy_arm", seeds="none: measured data") as say:
+        say("Fit in per cent, GOBF with order / 2 pairs and a direct term, fitted to samples 0-511")
+        head = "".join(
+            f"{name:>10}" for name in ("first", "own state", "carried", "through", "whole", "periodic")
+        )
+        say(f"order   reach own / through{head}   largest |pole|")
+        for order in ORDERS:
+            item = score(gobf(first, order), record)
+            # Both to the two decimals printed.
+            met = "met " if round(item.own_state, 2) >= REACH[order] and item.through >= THROUGH else "FAIL"
+            reach = f"{REACH[order]:.1f} / {THROUGH:.1f}"
+            say(f"{order:>5}   {reach}  {met}   {numbers(item)}   {item.radius:.5f}")
+        mirrored = percent(y[HALF:], y[HALF:] + y[:HALF])
+        say(
+            f"No model at all, the first half with its sign turned: {mirrored:.2f} (input: "
+            f"{percent(u[HALF:], u[HALF:] + u[:HALF]):.2f}). That much is in the split, whatever the model."
+        )
+        minima(record, say)
+        say("\nPeers in the same run, fitted to the same half")
+        say(f"{'method':<30}{'order':>6}{head}   largest |pole|")
+        for name, method in PEERS.items():
+            for order in (*ORDERS, 12) if name.startswith("ARX") else ORDERS:
+                item = score(method(first, order), record)
+                say(f"{name:<30}{order:>6}{numbers(item)}   {item.radius:.5f}")
+        for order in ORDERS:
+            mean = posterior_mean_fit(record, order)
+            say(f"{'tangent posterior mean around':<30}{order:>6}{'':>10}{mean:>10.2f}")
+        say("ARX as noted with the data, free run on the second half: 73.9, 92.5, 94.9, 93.9 at 4, 6, 8, 12.")
+        say("Published: no error figure (SLICOT: MOESP/N4SID of order 4 'good enough', 6 'slightly better';")
+        say("ControlSystemIdentification.jl: order 4 on half the data, low coherence near the notches).")
+        sweeps(record, say)
+        lines(record, say)
+
+
+if __name__ == "__main__":
+    main()
