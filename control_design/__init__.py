@@ -1,5 +1,6 @@
 """From an uncertain frequency response to a certified controller."""
 
+from control_design.between_grid_points import AllFrequencies
 from control_design.c_code import c_header, c_source
 from control_design.certificate import Certificate, PlantVerdict, SpecificationItem, certify
 from control_design.closed_loop import (
@@ -12,6 +13,7 @@ from control_design.closed_loop import (
 )
 from control_design.controller import Controller, ControllerStepper
 from control_design.ellipses import Ellipses
+from control_design.joint_coverage import JointCoverage
 from control_design.margins import Margins
 from control_design.plant_set import Channel, Mode, UncertainPlant
 from control_design.specification import RationalWeight, Specification, SpecificationError
@@ -25,6 +27,7 @@ from control_design.synthesis_result import (
 )
 
 __all__ = [
+    "AllFrequencies",
     "BlockingPoint",
     "Certificate",
     "Channel",
@@ -32,6 +35,7 @@ __all__ = [
     "Controller",
     "ControllerStepper",
     "Ellipses",
+    "JointCoverage",
     "LinearMachine",
     "Margins",
     "Mode",
