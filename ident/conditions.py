@@ -51,10 +51,10 @@ def group_posteriors(
     groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[ResponsePosterior]:
     """`tangent` for every group of records, all with the model's poles and one fir_length, fit to be
-    combined."""
+    combined: averaging over a missed mode is off, for it would give each its own further poles."""
     options = options or EmbeddingOptions()
     length = min(common_fir_length(group, model.poles.doubled(), options) for group in groups)
-    shared = options.model_copy(update={"fir_length": length})
+    shared = options.model_copy(update={"fir_length": length, "prior_missed_mode": 0.0})
     return [tangent(group, model, shared) for group in groups]
 
 

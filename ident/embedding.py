@@ -9,22 +9,19 @@ left, everything conditioned on the data.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.linalg import toeplitz
-from scipy.signal import lfilter
 
-from ident.arrays import RealArray
+from ident.arrays import ComplexArray, RealArray
 from ident.autoregression import fit_autoregression
-from ident.basis import free_response, regressor
 from ident.embedding_algebra import (
+    KernelGrid,
     KernelPosterior,
     ReducedRegression,
-    RegressionBlock,
     conditional_posterior,
     evaluate_grid,
     exponential_factor,
@@ -34,15 +31,33 @@ from ident.embedding_algebra import (
     prior_posterior,
     reduce_regression,
     tc_factor,
+    total_log_evidence,
 )
+from ident.embedding_rows import EmbeddingRows
 from ident.model import GobfModel
 from ident.poles import Poles
 from ident.posterior import EmbeddingReport, ResponsePosterior
 from ident.record import Record
-from ident.structure import filter_input
+from ident.residual_noise import gls_residuals
+from ident.structure import Structure
+from ident.undetected_mode import (
+    PairMixture,
+    candidate_pairs,
+    cascade_coordinates,
+    pair_mixture,
+    pair_statistics,
+    refined_pair,
+    with_pairs,
+)
 
 # Kernel of 150 taps (design 4.5), as far as the records can carry it.
 _DEFAULT_FIR_LENGTH = 150
+# Modes that the order selection missed and the embedding adds: coloured noise hides them from a search that
+# takes it for white, and whitening brings them out.
+_MOST_ADDED = 5
+# Rounds of residuals -> noise model -> whitening: the first sees residuals of an unwhitened fit, the others
+# remove what is left of its bias.
+_NOISE_ROUNDS = 3
 
 
 class EmbeddingOptions(BaseModel):
@@ -69,8 +84,14 @@ class EmbeddingOptions(BaseModel):
     estimate_initial_state: bool = Field(
         default=True, description="free response of all poles in each record"
     )
+    prior_missed_mode: float = Field(
+        default=0.5,
+        ge=0.0,
+        lt=1.0,
+        description="prior probability that the poles lack a lightly damped mode; 0: none is looked for",
+    )
     coloured_noise: bool = Field(
-        default=False, description="whiten with an AR model of the residuals, two rounds"
+        default=False, description="whiten with an AR model of the residuals, three rounds"
     )
     max_ar_order: int = Field(default=8, ge=1, le=100, description="largest AR order that BIC may choose")
     feedthrough: bool | None = Field(
@@ -111,24 +132,6 @@ def common_fir_length(records: Sequence[Record], poles: Poles, options: Embeddin
     return max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
 
 
-@dataclass(frozen=True, eq=False)
-class _Regression:
-    """How to make the matrices; made anew for each pass: only one record's are in memory."""
-
-    records: tuple[Record, ...]
-    model: GobfModel
-    poles: Poles
-    options: EmbeddingOptions
-    feedthrough: bool
-    fir_length: int
-
-    def blocks(self, whitening: RealArray) -> Iterator[RegressionBlock]:
-        for record in self.records:
-            yield _block(
-                record, self.model, self.poles, self.options, self.feedthrough, self.fir_length, whitening
-            )
-
-
 def _embed(
     records: Sequence[Record],
     model: GobfModel,
@@ -137,23 +140,37 @@ def _embed(
     *,
     classical_recipe: bool,
 ) -> ResponsePosterior:
-    feedthrough = model.feedthrough != 0 if options.feedthrough is None else options.feedthrough
-    regression = _build(records, model, poles, options, feedthrough)
-    whitening = np.ones(1)
-    reduced, kernel = _solve(regression, whitening, options, classical_recipe)
+    rows = _rows(records, model, poles, options)
+    solve = _solve_classical if classical_recipe else _solve
+    # Coloured noise taken for white passes for modes: none are added before it has been whitened.
+    first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
+    solved = solve(rows, first)
     if options.coloured_noise:
-        for _ in range(2):
-            residuals = _residuals(regression, whitening, reduced, kernel)
-            whitening = fit_autoregression(residuals, options.max_ar_order)
-            reduced, kernel = _solve(regression, whitening, options, classical_recipe)
-    mean, factor = joint_factor(reduced, kernel)
+        for _ in range(_NOISE_ROUNDS):
+            residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
+            whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
+            solved = solve(solved.rows.with_whitening(whitening), options)
+    poles = solved.rows.poles
+    reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
+    if missed is not None and missed.poles.size:
+        reduced, kernel = (
+            replace(reduced, r12=np.hstack([reduced.r12, missed.onto])),
+            with_pairs(kernel, missed),
+        )
+        poles = Poles(poles.real, np.concatenate([poles.pairs, missed.poles]))
+        mean, factor = (
+            _pairs_after_poles(part, solved.rows.poles.order, missed.poles)
+            for part in joint_factor(reduced, kernel)
+        )
+    else:
+        mean, factor = joint_factor(reduced, kernel)
     return ResponsePosterior(
         poles=poles,
         mean=mean,
         covariance_factor=factor,
         dt_s=model.dt_s,
-        fir_length=regression.fir_length,
-        has_feedthrough=feedthrough,
+        fir_length=rows.fir_length,
+        has_feedthrough=rows.structure.feedthrough,
         integrators=model.integrators,
         input_delay_samples=model.input_delay_samples,
         input_name=model.input_name,
@@ -167,14 +184,17 @@ def _embed(
             log_evidence=kernel.log_evidence,
             n_rows=reduced.n_rows,
             n_regressors=reduced.n_regressors,
-            ar_coefficients=tuple(float(a) for a in whitening[1:]),
+            ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
+            probability_missed_mode=missed.probability if missed else 0.0,
+            missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
+            n_added_modes=(solved.rows.poles.order - rows.poles.order) // 4,
         ),
     )
 
 
-def _build(
-    records: Sequence[Record], model: GobfModel, poles: Poles, options: EmbeddingOptions, feedthrough: bool
-) -> _Regression:
+def _rows(
+    records: Sequence[Record], model: GobfModel, poles: Poles, options: EmbeddingOptions
+) -> EmbeddingRows:
     if not records:
         raise ValueError("need at least one record")
     for record in records:
@@ -184,90 +204,74 @@ def _build(
             )
         if not abs(record.dt_s - model.dt_s) <= 1e-9 * model.dt_s:
             raise ValueError(f"record {record.name!r} has dt_s = {record.dt_s}, the model {model.dt_s}")
-    length = common_fir_length(records, poles, options)
-    return _Regression(tuple(records), model, poles, options, feedthrough, length)
-
-
-def _block(
-    record: Record,
-    model: GobfModel,
-    poles: Poles,
-    options: EmbeddingOptions,
-    feedthrough: bool,
-    length: int,
-    whitening: RealArray,
-) -> RegressionBlock:
-    """Matrices of one record, every column filtered by A(q), its first rows dropped.
-
-    That is exact for any noise before the record. Columns driven by the input from rest commute with the
-    filter, so for them the input is filtered; only the nuisance columns are filtered one by one.
-    """
-    n_samples, skip = record.n_samples, whitening.size - 1
-    u = _filtered(filter_input(record.input[:, 0], model.integrators, model.input_delay_samples), whitening)
-    delayed = np.concatenate([np.zeros(1), u[:-1]])
-    columns = [regressor(poles, u)]
-    if feedthrough:
-        columns.append(u[:, None])
-    degrees = max(int(options.estimate_offset), model.integrators if options.estimate_initial_state else 0)
-    ramp = np.linspace(-1.0, 1.0, n_samples)
-    nuisance = [ramp[:, None] ** degree for degree in range(degrees)]
-    if options.estimate_initial_state:
-        nuisance.append(free_response(poles, n_samples))
-    known = np.hstack(nuisance) if nuisance else np.zeros((n_samples, 0))
-    return RegressionBlock(
-        nuisance=_filtered(known, whitening)[skip:],
-        regressors=np.hstack(columns)[skip:],
-        kernel=toeplitz(delayed, np.zeros(length))[skip:],
-        output=_filtered(record.output[:, 0], whitening)[skip:],
+    structure = Structure(
+        integrators=model.integrators,
+        input_delay_samples=model.input_delay_samples,
+        feedthrough=model.feedthrough != 0 if options.feedthrough is None else options.feedthrough,
+        estimate_offset=options.estimate_offset,
+        estimate_initial_state=options.estimate_initial_state,
     )
+    length = common_fir_length(records, poles, options)
+    return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1))
 
 
-def _filtered(signal: RealArray, whitening: RealArray) -> RealArray:
-    if whitening.size == 1 or signal.size == 0:
-        return signal
-    return np.asarray(lfilter(whitening, np.ones(1), signal, axis=0), dtype=np.float64)
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Posterior without a missed mode, and the pairs that may be missing (None: not looked for)."""
+
+    rows: EmbeddingRows
+    reduced: ReducedRegression
+    kernel: KernelPosterior
+    missed: PairMixture | None = None
 
 
-def _solve(
-    regression: _Regression, whitening: RealArray, options: EmbeddingOptions, classical_recipe: bool
-) -> tuple[ReducedRegression, KernelPosterior]:
-    reduced = reduce_regression(regression.blocks(whitening))
-    length = regression.fir_length
+def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
+    """Posterior on these rows; modes that an order selection would have kept are added to their poles."""
+    n_added = 0
+    while True:
+        reduced, grid = _kernel_grid(rows, tc_factor)
+        weights, none = grid_weights(grid, options.prior_no_remainder)
+        if options.hyperparameters == "maximum":
+            # alpha = 0 is the lower end of the grid in the limit, so it wins only where the whole grid is
+            # worse.
+            none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
+            weights = np.zeros_like(weights)
+            weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
+        kernel = conditional_posterior(grid, weights, none)
+        if not options.prior_missed_mode > 0:
+            return _Solved(rows, reduced, kernel)
+        candidates = candidate_pairs(max(record.n_samples for record in rows.records))
+        statistics = pair_statistics(rows.pair_blocks(), reduced, candidates.poles)
+        odds = options.prior_missed_mode / (1 - options.prior_missed_mode)
+        log_rest = total_log_evidence(grid, options.prior_no_remainder)
+        missed = pair_mixture(candidates, statistics, reduced.degrees_of_freedom, log_rest, odds)
+        if missed.visible is None or n_added == _MOST_ADDED:
+            return _Solved(rows, reduced, kernel, missed)
+        rows = rows.with_pair(refined_pair(rows.pair_blocks, reduced, missed.visible))
+        n_added += 1
+
+
+def _solve_classical(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
+    reduced, grid = _kernel_grid(rows, exponential_factor)
+    return _Solved(rows, reduced, prior_posterior(grid))
+
+
+def _kernel_grid(
+    rows: EmbeddingRows, factor: Callable[[float, int], RealArray]
+) -> tuple[ReducedRegression, KernelGrid]:
+    reduced = reduce_regression(rows.blocks())
+    length = rows.fir_length
     # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
     decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
     # From a remainder far below the noise to one a hundred thousand times its amplitude.
     relative_alpha = np.geomspace(1e-2, 1e10, 49)
-    factor = exponential_factor if classical_recipe else tc_factor
     spectra = [
         kernel_spectrum(reduced, lam, factor(lam, length)) for lam in np.exp(-1.0 / decay_samples).tolist()
     ]
-    grid = evaluate_grid(reduced, spectra, relative_alpha)
-    if classical_recipe:
-        return reduced, prior_posterior(grid)
-    weights, none = grid_weights(grid, options.prior_no_remainder)
-    if options.hyperparameters == "maximum":
-        # alpha = 0 is the lower end of the grid in the limit, so it wins only where the whole grid is worse.
-        none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
-        weights = np.zeros_like(weights)
-        weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
-    return reduced, conditional_posterior(grid, weights, none)
+    return reduced, evaluate_grid(reduced, spectra, relative_alpha)
 
 
-def _residuals(
-    regression: _Regression, whitening: RealArray, reduced: ReducedRegression, kernel: KernelPosterior
-) -> list[RealArray]:
-    """y minus the posterior mean response and each record's nuisance, unwhitened, one array per record."""
-    mean, _ = joint_factor(reduced, kernel)
-    p = reduced.n_columns
-    residuals = []
-    for block in regression.blocks(np.ones(1)):
-        rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
-        if block.nuisance.shape[1]:
-            # The nuisance is fitted where it was estimated, in the whitened rows, and taken off the plain
-            # ones.
-            skip = whitening.size - 1
-            columns, target = (_filtered(part, whitening)[skip:] for part in (block.nuisance, rest))
-            coefficients, *_ = np.linalg.lstsq(columns, target, rcond=1e-10)
-            rest = rest - block.nuisance @ coefficients
-        residuals.append(rest)
-    return residuals
+def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:
+    """Rows (theta, eta, amplitudes) rearranged to (basis of all poles in cascade, direct term, eta)."""
+    first, rest, amplitudes = np.split(coefficients, [order, coefficients.shape[0] - 2 * pairs.size])
+    return np.concatenate([first, cascade_coordinates(pairs) @ amplitudes, rest])

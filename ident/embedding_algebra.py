@@ -238,6 +238,14 @@ def evaluate_grid(
     )
 
 
+def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:
+    """log of the likelihood averaged over the prior of `grid_weights`."""
+    n = grid.log_likelihood.size
+    top = max(float(grid.log_likelihood.max()), grid.log_likelihood_none)
+    mean = (1 - prior_no_remainder) * float(np.sum(np.exp(grid.log_likelihood - top))) / n
+    return top + float(np.log(mean + prior_no_remainder * np.exp(grid.log_likelihood_none - top)))
+
+
 def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray, float]:
     """Posterior weights (K,A) of the grid points and of alpha = 0; the prior is flat over the grid."""
     n = grid.log_likelihood.size
@@ -278,7 +286,7 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
     best = np.unravel_index(int(np.argmax(weights)), weights.shape)
     return KernelPosterior(
         kernel_mean=mean,
-        kernel_factor=_symmetric_factor(covariance),
+        kernel_factor=symmetric_factor(covariance),
         noise_variance=noise,
         alpha=float(grid.alpha[best]) if np.any(weights) else 0.0,
         lam=grid.spectra[best[0]].lam,
@@ -305,7 +313,7 @@ def prior_posterior(grid: KernelGrid) -> KernelPosterior:
 
 def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tuple[RealArray, RealArray]:
     """Mean (P+L,) and covariance factor (P+L, P') of (theta, eta), P counting the columns left out too."""
-    p, length = reduced.n_regressors, reduced.fir_length
+    p, length = reduced.n_regressors, posterior.kernel_mean.size
     scale = np.linalg.norm(reduced.r11, axis=0)
     right_hand = np.column_stack(
         [
@@ -325,7 +333,7 @@ def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tupl
     return mean, factor
 
 
-def _symmetric_factor(covariance: RealArray) -> RealArray:
+def symmetric_factor(covariance: RealArray) -> RealArray:
     """Factor S (L,L') with S S^T = covariance, directions below rounding left out."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     kept = values > values[-1] * 1e-15 if values[-1] > 0 else np.zeros(values.size, dtype=np.bool_)

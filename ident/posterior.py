@@ -26,6 +26,9 @@ class EmbeddingReport:
     weight; probability_no_remainder the posterior probability that the poles explain everything (prior 1/2);
     log_evidence the gain in restricted log likelihood of the best kernel over none; n_rows the samples used
     after nuisance columns; ar_coefficients (a_1 .. a_n) of the noise filter 1 / (1 + a_1 q^-1 + ...).
+    probability_missed_mode is the posterior probability that the poles lack a lightly damped mode, and
+    missed_mode_rad_s where it most probably is (0: nowhere more than a few per mille); n_added_modes counts
+    modes beyond the model's poles that were too plain to be left to a probability.
     """
 
     method: str
@@ -37,6 +40,9 @@ class EmbeddingReport:
     n_rows: int
     n_regressors: int
     ar_coefficients: tuple[float, ...] = ()
+    probability_missed_mode: float = 0.0
+    missed_mode_rad_s: float = 0.0
+    n_added_modes: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; `from_dict` is the inverse."""

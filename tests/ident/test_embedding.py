@@ -61,7 +61,12 @@ def test_exact_poles_and_no_remainder_leave_half_the_prior_odds_to_evidence():
     # 35 dB of the noise-free output; the noisy one is 0.02 % larger, the estimate has 2000 samples.
     assert report.noise_std == pytest.approx(noise, rel=0.07)
     missing = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:4]), np.zeros(6), DT)
-    assert tangent([arm.record], missing).report.probability_no_remainder < 1e-6
+    alone = EmbeddingOptions(prior_missed_mode=0.0)
+    assert tangent([arm.record], missing, alone).report.probability_no_remainder < 1e-6
+    # Looked for, the mode is found and added, and nothing remains.
+    found = tangent([arm.record], missing).report
+    assert found.n_added_modes == 1
+    assert found.probability_no_remainder > 0.3
 
 
 def dense(records, poles, structure, alpha, lam, s2, length):
@@ -121,7 +126,9 @@ def test_whole_path_equals_dense_formulas(structure):
         y = signal.lfilter([0.0, 0.2], [1.0, -0.6, 0.4], u, axis=0) + 0.3 * rng.standard_normal((n, 1))
         records.append(Record("r", u, y, DT, ("u",), ("y",)))
     model = GobfModel(Poles(poles), np.zeros(2), DT, integrators=integrators, input_delay_samples=delay)
-    options = EmbeddingOptions(fir_length=length, feedthrough=direct, hyperparameters="maximum")
+    options = EmbeddingOptions(
+        fir_length=length, feedthrough=direct, hyperparameters="maximum", prior_missed_mode=0.0
+    )
     posterior = tangent(records, model, options)
     report = posterior.report
     assert report.n_rows == 160 - 2 * (max(1, integrators) + 4)
