@@ -201,7 +201,7 @@ def sweeps(record: Record, say: Print) -> None:
     """Honest split (a): sweep down and sweep up of the first half."""
     down, up = record.slice(0, 256), record.slice(256, HALF)
     say("\nHonest split (a): fitted to the sweep down (samples 0-255), run on the sweep up (256-511); back")
-    say(f"{'':<32}" + "".join(f"{f'order {n}':>18}" for n in ORDERS))
+    say(f"{'':<32}" + "".join(f"{f'order {n}':>22}" for n in ORDERS))
     methods: dict[str, Callable[[Record, int], Model]] = {"GOBF": gobf} | PEERS
     for name, method in methods.items():
         cells = []
@@ -216,7 +216,7 @@ def sweeps(record: Record, say: Print) -> None:
                 error, columns = y - model.simulate(u), free_columns(model, y.size)
                 rest = error - columns @ np.linalg.lstsq(columns, error, rcond=1e-10)[0]
                 values.append(f"{percent(y, rest):.1f}")
-            cells.append(f"{' / '.join(values):>18}")
+            cells.append(f"{' / '.join(values):>22}")
         say(f"{name:<32}" + "".join(cells))
 
 
@@ -276,7 +276,7 @@ def main() -> None:
             f"{percent(u[HALF:], u[HALF:] + u[:HALF]):.2f}). That much is in the split, whatever the model."
         )
         minima(record, say)
-        say("\nPeers in the same run, fitted to the same half")
+        say("\nPeers in the same run, same half; OE and ARMAX take it to start from rest, ARX does not")
         say(f"{'method':<30}{'order':>6}{head}   largest |pole|")
         for name, method in PEERS.items():
             for order in (*ORDERS, 12) if name.startswith("ARX") else ORDERS:

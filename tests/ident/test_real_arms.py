@@ -7,10 +7,13 @@ import pytest
 import scipy.signal
 
 from ident.basis import free_response
+from ident.frequency_fit import identify_frf
+from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.identify import identify
 from ident.options import IdentOptions
 from ident.prefilter import band_limited
 from ident.record import Record
+from ident.validation import fit_on_fresh_data
 
 
 def percent(y, residual):
@@ -23,15 +26,18 @@ def robot_arm(flexlink_data):
     return Record.from_csv(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
 
 
+def robot_arm_options(n_pairs):
+    """Pairs and a direct term; the record starts in mid-sweep. Three starts miss the best order 10."""
+    return IdentOptions(n_real=0, n_pairs=n_pairs, feedthrough=True, estimate_initial_state=True, starts=8)
+
+
 # Second half predicted with its own initial state, and run through from rest over both halves. Measured
-# 96.44/96.90/ 97.12/97.46 and 94.2/94.9/94.6/94.5. The second half is the mirrored first half, so this is
-# no independent validation.
-@pytest.mark.parametrize(("n_pairs", "reach"), [(2, 96.4), (3, 96.8), (4, 97.0), (5, 97.3)])
+# 96.444/96.900/97.124/97.458 and 94.16/94.88/94.59/94.47 (benchmarks/daisy_arm.py). The second half is the
+# mirrored first half, so this is no independent validation.
+@pytest.mark.parametrize(("n_pairs", "reach"), [(2, 96.4), (3, 96.89), (4, 97.1), (5, 97.4)])
 def test_robot_arm_fitted_on_the_first_half_predicts_the_second(robot_arm, n_pairs, reach):
     half = robot_arm.slice(512, 1024)
-    model = identify(
-        [robot_arm.slice(0, 512)], IdentOptions(n_real=0, n_pairs=n_pairs, feedthrough=True)
-    ).model
+    model = identify([robot_arm.slice(0, 512)], robot_arm_options(n_pairs)).model
     y = half.output[:, 0]
     residual = y - model.simulate(half.input[:, 0])
     free = free_response(model.poles, 512)
@@ -39,6 +45,30 @@ def test_robot_arm_fitted_on_the_first_half_predicts_the_second(robot_arm, n_pai
     assert percent(y, residual) >= reach
     through = robot_arm.output[:, 0] - model.simulate(robot_arm.input[:, 0])
     assert percent(y, through[512:]) >= 94
+
+
+# One sweep goes down and one up within the first half: nothing is repeated between them. Measured 96.0/95.1
+# and 97.0/95.3.
+@pytest.mark.parametrize("n_pairs", [2, 3])
+def test_robot_arm_fitted_on_the_sweep_down_predicts_the_sweep_up_and_back(robot_arm, n_pairs):
+    down, up = robot_arm.slice(0, 256), robot_arm.slice(256, 512)
+    for part, fresh in ((down, up), (up, down)):
+        model = identify([part], robot_arm_options(n_pairs)).model
+        assert fit_on_fresh_data(model, fresh, estimate_offset=False).fit_percent > 94.5
+
+
+def test_robot_arm_known_at_every_second_line_is_known_between_them(robot_arm):
+    u, y = (np.fft.rfft(signal[:, 0])[1:] for signal in (robot_arm.input, robot_arm.output))
+    omega = 2 * np.pi * np.arange(1, u.size + 1) / robot_arm.n_samples
+    odd = np.abs(u[::2])
+    excited = 2 * np.flatnonzero(odd > 0.05 * odd.max())  # odd harmonics only
+    used, left = excited[::2], excited[1::2]
+    covariance = (1e-6 / np.abs(u[used]) ** 2)[:, None, None] * np.eye(2)
+    frf = FrequencyUncertainty(omega[used], y[used] / u[used], covariance, 1.0)
+    model = identify_frf(frf, IdentOptions(n_real=0, n_pairs=2, feedthrough=True)).model
+    error = y[left] - model.frequency_response(omega[left]) * u[left]
+    # Lines 0.0245 rad/sample apart, modes of half width 0.002 and 0.004. Measured 95.4 %.
+    assert 100 * (1 - np.linalg.norm(error) / np.linalg.norm(y[left])) > 94.5
 
 
 def test_robot_arm_needs_the_direct_term(robot_arm):
