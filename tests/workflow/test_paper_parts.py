@@ -69,7 +69,7 @@ def test_arm_without_friction_is_its_linear_response():
 
 
 def _response_at(machine: LinkExperiment, z):
-    system = machine._system
+    system = machine.system
     n = system.A.shape[0]
     return np.array(
         [(system.C[1] @ np.linalg.solve(value * np.eye(n) - system.A, system.B[:, 0])) for value in z]
@@ -82,7 +82,7 @@ def test_friction_makes_the_arm_nonlinear():
 
     machine = LinkExperiment()
     u = machine.trial(np.random.default_rng(0)).fitted.input[:, 0]
-    one, two = (simulate(machine._rig, factor * u, machine.effects).tip_true_m for factor in (1.0, 2.0))
+    one, two = (simulate(machine.rig, factor * u, machine.effects).tip_true_m for factor in (1.0, 2.0))
     assert np.linalg.norm(two - 2 * one) > 0.02 * np.linalg.norm(two)
 
 

@@ -108,7 +108,7 @@ def compare(
     for number in range(settings.repeats):
         report(number / settings.repeats, f"record {number + 1}")
         trial = machine.trial(stage_rng(settings.seed, "paper", machine.name, str(number)))
-        models = fit_methods(trial.fitted, better_starts=True)
+        models = fit_methods(trial.fitted)
         first = first or (trial, models)
         for name, model in models.items():
             collected[name].append(score(machine, trial, model, omega))

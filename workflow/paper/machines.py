@@ -16,7 +16,7 @@ import numpy as np
 
 from ident.arrays import ComplexArray, RealArray
 from ident.record import Record
-from plant import Effect, linear_arm, paper_example, paper_link, parse_effect, prbs, simulate
+from plant import Effect, Rig, linear_arm, paper_example, paper_link, parse_effect, prbs, simulate
 from workflow.paper.settings import DT_S
 
 # p. 104: noise variance 0.004^2 and 30 dB, so the output has a standard deviation of 0.1265.
@@ -84,7 +84,8 @@ class SimulationExample:
     gain_unit = "m / (N m)"
 
     @cached_property
-    def _system(self) -> Any:
+    def system(self) -> Any:
+        """The plant in state space, input held over a sample."""
         return control.sample_system(control.ss(paper_example()), DT_S, "zoh")
 
     @property
@@ -95,11 +96,11 @@ class SimulationExample:
 
     def response(self, omega_rad_s: RealArray) -> ComplexArray:
         """True response (F,) with the input held over a sample."""
-        return _response(self._system, omega_rad_s)
+        return _response(self.system, omega_rad_s)
 
     def output(self, u: RealArray) -> RealArray:
         """Noise-free output (T,) from rest."""
-        return np.asarray(control.forced_response(self._system, inputs=u).outputs, dtype=np.float64)
+        return np.asarray(control.forced_response(self.system, inputs=u).outputs, dtype=np.float64)
 
     def trial(self, rng: np.random.Generator) -> Trial:
         """A PRBS of new start state, scaled to the paper's output level, and a fresh one as large."""
@@ -134,30 +135,32 @@ class LinkExperiment:
         return (parse_effect({"name": "coulomb_friction", "torque_Nm": COULOMB_NM}),)
 
     @cached_property
-    def _rig(self) -> Any:
+    def rig(self) -> Rig:
+        """The preset with the paper's noise on the tip."""
         return paper_link().perturbed({"sensors.tip_noise_m": NOISE_STD})
 
     @cached_property
-    def _system(self) -> Any:
-        return linear_arm(self._rig).to_control(DT_S)
+    def system(self) -> Any:
+        """The arm without dry friction, voltage held over a sample."""
+        return linear_arm(self.rig).to_control(DT_S)
 
     @property
     def mode(self) -> tuple[float, float]:
-        poles = linear_arm(self._rig).poles_rad_s()
+        poles = linear_arm(self.rig).poles_rad_s()
         pairs = poles[poles.imag > 0]
         pole = complex(pairs[np.argmin(np.abs(pairs))])
         return abs(pole), -pole.real / abs(pole)
 
     def response(self, omega_rad_s: RealArray) -> ComplexArray:
         """Linear response (F,) of the arm without dry friction, all modes, voltage held over a sample."""
-        return _response(self._system, omega_rad_s, row=1, column=0)
+        return _response(self.system, omega_rad_s, row=1, column=0)
 
     def trial(self, rng: np.random.Generator) -> Trial:
         """Two runs of the nonlinear arm from rest, each with its own PRBS and sensor noise."""
         records, clean = [], np.zeros(0)
         for name in ("fitted", "fresh"):
             u = prbs(_REGISTER, 1, EXPERIMENT_AMPLITUDE_V, EXPERIMENT_SAMPLES, rng)
-            run = simulate(self._rig, u, self.effects, rng=rng)
+            run = simulate(self.rig, u, self.effects, rng=rng)
             records.append(_record(name, u, run.tip_m, "voltage_V", "V"))
             clean = run.tip_true_m
         return Trial(records[0], records[1], clean)

@@ -39,20 +39,18 @@ def gobf_options() -> IdentOptions:
     return IdentOptions(n_real=N_REAL, n_pairs=N_PAIRS)
 
 
-def fit_methods(record: Record, *, better_starts: bool = False) -> dict[str, LinearModel]:
-    """All four methods at order 4, delay of one sample, nothing known; six models with `better_starts`."""
+def fit_methods(record: Record) -> dict[str, LinearModel]:
+    """METHODS and BETTER_STARTS at order 4: delay of one sample, nothing known of the poles."""
     # An unstable ARX model, tried as a start, can leave the range of doubles; the search then drops it.
     with np.errstate(over="ignore", invalid="ignore"):
-        models: dict[str, LinearModel] = {
+        return {
             "GOBF": identify([record], gobf_options()).model,
             "ARX": arx(record, ORDER, ORDER),
             "ARMAX": armax(record, ORDER, ORDER, ORDER, output_error_start=False),
             "OE": usual_oe(record, ORDER, ORDER),
+            BETTER_STARTS[0]: armax(record, ORDER, ORDER, ORDER),
+            BETTER_STARTS[1]: oe(record, ORDER, ORDER),
         }
-        if better_starts:
-            models[BETTER_STARTS[0]] = armax(record, ORDER, ORDER, ORDER)
-            models[BETTER_STARTS[1]] = oe(record, ORDER, ORDER)
-    return models
 
 
 def poles_of(model: LinearModel) -> ComplexArray:
