@@ -34,49 +34,26 @@ class CandidateCost:
     def __init__(self, data: Regression, space: SearchSpace, shared: Poles, local: Poles) -> None:
         self.space = space
         self.evaluations = 0
-        self._data = data
-        self._frozen = project(data, shared, local)
-        self._drive = driving_signal(data, shared)
         self._floor = _FLOOR * float(data.y @ data.y)
-        self._residual_power = float(self._frozen.residual @ self._frozen.residual)
-        self._against: RealArray | None = None
+        frozen = project(data, shared, local)
+        free = data.structure.estimate_initial_state
+        residual_power = float(frozen.residual @ frozen.residual)
+        box = (space.n_real, space.low, space.high, space.raw)
+        drive = driving_signal(data, shared)
+        n_shared = frozen.shared_q.shape[0]
+        self._one_by_one = (
+            *box, drive, frozen.residual, data.starts, frozen.local_q, frozen.shared_q, free,
+        )  # fmt: skip
+        self._together: tuple[Any, ...] | None = None
+        if not (free and data.n_records > 1):
+            self._together = (*box, drive, _against(frozen), n_shared, residual_power, data.starts, free)
 
     def rss(self, units: RealArray) -> RealArray:
         """Residual sums of squares (E,) at points (E, D) of the unit cube."""
         self.evaluations += len(units)
-        space, frozen = self.space, self._frozen
-        free = self._data.structure.estimate_initial_state
-        if len(units) >= _FEWEST_IN_A_BATCH and not (free and self._data.n_records > 1):
-            if self._against is None:
-                self._against = _against(frozen)
-            together = batched_rss(
-                units,
-                space.n_real,
-                space.low,
-                space.high,
-                space.raw,
-                self._drive,
-                self._against,
-                frozen.shared_q.shape[0],
-                self._residual_power,
-                self._data.starts,
-                free,
-            )
-            return np.asarray(together, dtype=np.float64)
-        values = _scan(
-            units,
-            space.n_real,
-            space.low,
-            space.high,
-            space.raw,
-            self._drive,
-            frozen.residual,
-            self._data.starts,
-            frozen.local_q,
-            frozen.shared_q,
-            free,
-        )
-        return np.asarray(values, dtype=np.float64)
+        if self._together is not None and len(units) >= _FEWEST_IN_A_BATCH:
+            return np.asarray(batched_rss(units, *self._together))
+        return np.asarray(_scan(units, *self._one_by_one))
 
     def log(self, units: RealArray) -> RealArray:
         """log J (E,) at points (E, D), as DIRECT sees it."""

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy.signal
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ident.arrays import RealArray
 from ident.least_squares import fit, linearisation
@@ -25,9 +24,10 @@ from ident.regression import Regression
 # An input is there at a frequency if it has this share of the density that it would have if its power were
 # spread evenly up to Nyquist ...
 _WEAK_INPUT = 1e-2
-# ... or if what the model makes of it stands this far above what the model leaves; never below this share of
-# its largest density, where windows leak.
-_ABOVE_NOISE = 3.0
+# ... or if the response over a third of that frequency can be told to 30 %: the power that the model makes of
+# it, over what the model leaves, times the number of spectral lines there is at least 10; never below this
+# share of its largest density, where windows leak.
+_TOLD = 10.0
 _LEAKAGE = 1e-6
 # A rate of decay within this factor either way (95 %) is known; beyond, the record does not tell it.
 _KNOWN_WITHIN = 2.0
@@ -190,7 +190,7 @@ def _drifting(
             continue
         share = 1 - float(rest @ rest) / power
         worth = effective_samples(rest, np.array([0, residual.size]))
-        if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chi2.isf(_DRIFT_LEVEL, 1):
+        if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chdtri(1, _DRIFT_LEVEL):
             sentences.append(
                 f"{record.label}: output '{record.output_names[0]}' drifts by {2 * slope:+.3g} in all, "
                 f"without a cause in the input ({share:.0%} of what the model leaves): take the trend "
@@ -232,23 +232,39 @@ def excitation_limit_rad_s(
 ) -> float:
     """Highest frequency at which the input of any record is there, rad/s.
 
-    There is: with a hundredth of the density of an evenly spread input of the same power, or, where the
-    model's output spectrum tells, with three times the residual's density in what it drives. A band that only
-    the plant's own roll-off hides is not blamed on the input.
+    There is: with a hundredth of the density of an evenly spread input of the same power, or where what it
+    drives by the model stands so far above the residual that the response can be told to 30 %. A band that
+    only the plant's own roll-off hides is not blamed on the input.
     """
     highest = 0.0
     for index, record in enumerate(records):
         u = record.input[:, 0]
         segment = int(min(u.size, max(64, u.size // 8)))
-        frequency, density = scipy.signal.welch(u - u.mean(), fs=1 / record.dt_s, nperseg=segment)
+        frequency = 2 * np.pi * np.fft.rfftfreq(segment, record.dt_s).astype(np.float64)
+        density = _spectrum(u, segment)
         present = density >= _WEAK_INPUT * density.mean()
         if model is not None and residuals[index].size >= segment:
-            _, noise = scipy.signal.welch(residuals[index], fs=1 / record.dt_s, nperseg=segment)
-            gain = np.abs(model.frequency_response(2 * np.pi * frequency[1:]))
-            seen = gain**2 * density[1:] >= _ABOVE_NOISE * _smooth(noise)[1:]
+            noise = _spectrum(residuals[index], segment)
+            gain = np.abs(model.frequency_response(frequency[1:]))
+            lines = np.maximum(record.n_samples * record.dt_s * frequency[1:] / 3, 1.0)
+            seen = lines * gain**2 * density[1:] >= _TOLD * _smooth(noise)[1:]
             present[1:] |= seen & (density[1:] >= _LEAKAGE * density.max())
-        highest = max(highest, 2 * np.pi * float(frequency[np.flatnonzero(present)[-1]]))
+        highest = max(highest, float(frequency[np.flatnonzero(present)[-1]]))
     return highest
+
+
+def _spectrum(x: RealArray, segment: int) -> RealArray:
+    """Welch's mean periodogram over half-overlapping stretches, without their means, under a Hann window;
+    unscaled, (segment // 2 + 1,).
+
+    scipy.signal.welch gives the same numbers in ten times the time on short records, a tenth of a whole fit.
+    """
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(segment) / segment)
+    pieces = np.lib.stride_tricks.sliding_window_view(x, segment)[:: segment - segment // 2]
+    lines = np.abs(np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window)) ** 2
+    density = lines.mean(axis=0)
+    density[1 : (segment + 1) // 2] *= 2  # one-sided: every line but those at 0 and at the Nyquist frequency
+    return np.asarray(density)
 
 
 def _smooth(density: RealArray) -> RealArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from itertools import combinations_with_replacement, cycle, islice
 
 import numpy as np
@@ -24,7 +24,7 @@ _GAIN = 1e-6
 _ROUNDS = 6
 # Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
 # end.
-_ROUGH = 1e-4
+_ROUGH = 1e-3
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
 _PAIR_EVALUATIONS = 240
 _REAL_GRID = 9
@@ -118,8 +118,6 @@ class PoleSearch:
         space = self.space(0, 1)
         cost = CandidateCost(self.data, space, kept, kept)
         here_now = space.levels(Poles(pairs=best.poles.pairs[here]))
-        omegas, zetas = np.linspace(0, 1, _PAIR_GRID[0]), np.linspace(0, 1, _PAIR_GRID[1] + 2)[1:-1]
-        grid = np.array([[omega, zeta] for omega in omegas for zeta in zetas])
 
         def looks(point: RealArray) -> tuple[Poles, bool]:
             new = space.poles(point)
@@ -128,7 +126,7 @@ class PoleSearch:
             pairs[here] = new.pairs
             return Poles(best.poles.real, pairs), bool(np.all(known))
 
-        return self._descend_from_grid(best, grid, cost, looks, n_starts=1)
+        return self._descend_from_grid(best, _pair_grid(), cost, looks, n_starts=1)
 
     def _descend_from_grid(
         self,
@@ -177,6 +175,14 @@ class PoleSearch:
         return best_apart(points, costs, self.options.starts)
 
 
+@cache
+def _pair_grid() -> RealArray:
+    """Frequencies and dampings of one pair, as points of the unit cube."""
+    omegas, zetas = np.linspace(0, 1, _PAIR_GRID[0]), np.linspace(0, 1, _PAIR_GRID[1] + 2)[1:-1]
+    return np.array([[omega, zeta] for omega in omegas for zeta in zetas])
+
+
+@cache
 def _real_grid(n_poles: int) -> RealArray:
     """Levels of one real pole, or all ordered couples of levels of two, as points of the unit cube."""
     levels = np.linspace(0, 1, _REAL_GRID)

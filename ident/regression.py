@@ -126,7 +126,9 @@ def _legendre(n_samples: int, count: int) -> RealArray:
     """Legendre polynomials of degrees 0 .. count - 1 over a record, (count, T)."""
     if count < 2:
         return np.ones((count, n_samples))
-    return np.polynomial.legendre.legvander(np.linspace(-1, 1, n_samples), count - 1).T
+    return np.asarray(
+        np.polynomial.legendre.legvander(np.linspace(-1, 1, n_samples), count - 1).T, np.float64
+    )
 
 
 def thinned(records: Sequence[Record], limit: int) -> tuple[list[Record], bool]:
