@@ -154,7 +154,11 @@ def residual_advice(
         sentences.append(
             f"the residuals are coloured even behind a noise model of order {noise_order}: the bounds may be "
             "too narrow; "
-            + ("raise max_ar_order" if independence.passed else "cure the dependence on the input first")
+            + (
+                "raise max_ar_order, or take them as lower limits"
+                if independence.passed
+                else "cure the dependence on the input first"
+            )
         )
     elif not whiteness.passed:
         sentences.append(

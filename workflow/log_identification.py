@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ident.closed_loop import two_stage
+from ident.arrays import RealArray
+from ident.closed_loop import TwoStage, two_stage
 from ident.embedding import EmbeddingOptions, tangent
 from ident.identify import Identification, identify
 from ident.model import GobfModel
@@ -39,6 +40,9 @@ from workflow.stages.uncertainty import (
 )
 from workflow.storage import AnyArray
 from workflow.summary import Row, RunSummary, Section, channel_rows, uncertainty_rows
+
+# Largest orders of the noise model that are tried, until the residuals behind it are white.
+_NOISE_ORDERS = (8, 32)
 
 MODEL_SUFFIXES = (".json", ".mat")
 
@@ -147,12 +151,12 @@ def identify_records(
     closed loop. Raises InputError.
     """
     options, progress = options or IdentOptions(), progress or Silence()
-    used, first_stage = list(measured), None
+    used, opened = list(measured), None
     progress.start("identify")
     with naming("identify"):
         if any(record.reference is not None for record in measured):
             opened = two_stage(measured, options)
-            used, first_stage = list(opened.records), opened.verdict
+            used = list(opened.records)
         share = 0.6 if with_plot else 1.0
         found = identify(used, options, progress=lambda f, m: progress.update("identify", share * f, m))
         plot = None
@@ -166,9 +170,7 @@ def identify_records(
         fresh = tuple(fit_on_fresh_data(found.model, record) for record in fresh_records)
         progress.finish("identify", 0.0, taken_up=False)
         progress.start("uncertainty")
-        # White-noise bounds around coloured residuals are far too narrow, so the data decide.
-        coloured = not whiteness_test(found.residuals).passed
-        posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=coloured))
+        posterior, tests = _posterior(used, found)
         omega = display_grid(found.model, used)
         nominal = nominal_of(posterior, found.model.poles, omega)
         frequency = posterior.at(omega, level)
@@ -176,7 +178,7 @@ def identify_records(
             "level": level,
             "report": posterior.report.to_dict() if posterior.report is not None else None,
             "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
-            "tests": residual_tests(posterior, used),
+            "tests": tests,
             "repeat_scatter": None,
             "intervals": intervals_of(posterior, found.model.poles, level),
             "nominal": nominal_row(frequency, nominal),
@@ -190,7 +192,7 @@ def identify_records(
         "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),
         "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
         "fit_repeat_percent": {},
-        "two_stage": first_stage,
+        "two_stage": None if opened is None else opened.verdict,
     }
     return LogIdentification(
         measured=tuple(measured),
@@ -206,8 +208,27 @@ def identify_records(
         plot=plot,
         about=about,
         spread=spread,
-        careful=tuple(_careful(found, spread)),
+        careful=(*_careful(found, spread), *_first_stage_error(opened, omega)),
     )
+
+
+def _posterior(
+    used: Sequence[Record], found: Identification
+) -> tuple[ResponsePosterior, list[dict[str, Any]]]:
+    """Tangent posterior and its residual tests, with as much of a noise model as the residuals ask for.
+
+    White-noise bounds around coloured residuals are far too narrow, so the data decide.
+    """
+    white = whiteness_test(found.residuals).passed
+    for order in (None,) if white else _NOISE_ORDERS:
+        options = EmbeddingOptions()
+        if order is not None:
+            options = EmbeddingOptions(coloured_noise=True, max_ar_order=order)
+        posterior = tangent(used, found.model, options)
+        tests = residual_tests(posterior, used)
+        if tests_by_name(tests)["whiteness"].passed:
+            break
+    return posterior, tests
 
 
 def _careful(found: Identification, spread: Mapping[str, Any]) -> list[str]:
@@ -215,6 +236,18 @@ def _careful(found: Identification, spread: Mapping[str, Any]) -> list[str]:
     tests = tests_by_name(spread["tests"])
     advice = residual_advice(tests["whiteness"], tests["independence"], noise_order=noise_order(spread))
     return [*found.warnings, *advice]
+
+
+def _first_stage_error(opened: TwoStage | None, omega_rad_s: RealArray) -> list[str]:
+    """What the ellipses of a second stage do not hold."""
+    if opened is None:
+        return []
+    error = 100 * float(np.median(opened.relative_error(omega_rad_s)))
+    return [
+        "the logs come from a closed loop: the error of the first stage (reference to input, a standard "
+        f"deviation of {error:.2g} % of the response in the median) is in no ellipse; with four records or "
+        "more, uncertainty.method = 'records' of flexlink run takes it from their scatter"
+    ]
 
 
 def _summary(

@@ -162,12 +162,13 @@ def channel_rows(found: Mapping[str, Any], intervals: Mapping[str, Any] | None =
 
 
 def between(low: float, high: float) -> str:
-    """low to high, with as many digits as tell them apart; 'not known' where an end is open."""
+    """low to high with two digits of what lies between; 'not known' where an end is open."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return "not known"
-    largest, span = max(abs(low), abs(high)), high - low
-    digits = min(2 + math.ceil(math.log10(largest / span)), 9) if span > 0 else 3
-    return f"{low:.{max(digits, 2)}g} to {high:.{max(digits, 2)}g}"
+    if not 1e-7 < high - low < 1e5:
+        return f"{low:.6g} to {high:.6g}"
+    decimals = max(0, 1 - math.floor(math.log10(high - low)))
+    return f"{low:.{decimals}f} to {high:.{decimals}f}"
 
 
 def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:

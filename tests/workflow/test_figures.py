@@ -420,7 +420,7 @@ def test_stabilisation_marks_say_what_the_record_says():
     )
     _, right = figure.axes
     marks = {
-        line.get_label(): line.get_xdata().size
+        line.get_label(): len(line.get_xdata())
         for line in right.lines
         if not line.get_label().startswith("_")
     }

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ident.validation import fit_on_fresh_data
@@ -120,7 +121,8 @@ def _found(result: LogIdentification) -> list[str]:
         known.append(f"a delay of {count(options.input_delay_samples, 'sample')}")
     if known:
         sentences.append(f"Given, not found: {listing(known)}.")
-    return sentences + [sentence(text) for text in about["verdicts"]]
+    # What speaks against the model stands among the things to be careful about.
+    return sentences + [sentence(text) for text in about["verdicts"] if text not in result.careful]
 
 
 def _why_this_order(result: LogIdentification) -> str:
@@ -223,29 +225,33 @@ def _response(result: LogIdentification) -> Section:
 def _order(result: LogIdentification) -> Section:
     blocks: list[Block] = []
     if result.plot is not None and result.found.order_table:
-        blocks += [Plot("order", STABILISATION_CAPTION), Text(stabilisation_sentence(result.plot))]
+        blocks.append(Plot("order", STABILISATION_CAPTION))
     blocks += order_table(result.about, result.options) or [Text(who_chose(result.options))]
     return Section("order", "How many poles", "Order", tuple(blocks))
 
 
 def _poles(result: LogIdentification) -> Section:
     zeros = result.found.model.zeros()
-    outside = zeros[abs(zeros) > 1]
-    text = f"{count(zeros.size, 'zero')}"
-    if outside.size:
+    outside = int(np.count_nonzero(np.abs(zeros) > 1))
+    text = f"The model has {count(zeros.size, 'zero')}"
+    if outside:
         text += (
-            f", {count(outside.size, 'of them', 'of them')} outside the unit circle: the response is of "
-            "non-minimum phase (or was sampled so), which limits the bandwidth of any loop around it"
+            f", {outside} of them outside the unit circle: the response is of non-minimum phase (or its "
+            "samples are), which limits the bandwidth of any loop around it"
         )
-    return Section(
-        "poles",
-        "Poles and zeros",
-        "Poles",
-        (
-            Plot("poles", "Poles (crosses) and zeros (circles) in the z-plane, and near z = 1."),
-            Text(sentence(text[0].upper() + text[1:])),
-        ),
-    )
+    elif zeros.size:
+        text += ", none of them outside the unit circle"
+    blocks: list[Block] = [
+        Plot("poles", "Poles (crosses) and zeros (circles) in the z-plane, and near z = 1."),
+        Text(text + "."),
+    ]
+    log = np.log(zeros[(zeros.imag > 1e-9) & (np.abs(zeros) > 0.05)]) / result.found.model.dt_s
+    pairs = sorted((abs(s), -s.real / abs(s)) for s in log if abs(s.real) < _LIGHT * abs(s))
+    rows = tuple((number(omega / (2 * np.pi), 4), number(omega, 4), number(zeta)) for omega, zeta in pairs)
+    if rows:
+        head = ("zero pair (antiresonance): frequency [Hz]", "[rad/s]", "damping ratio [1]")
+        blocks.append(Table(head, rows))
+    return Section("poles", "Poles and zeros", "Poles", tuple(blocks))
 
 
 def _fresh(result: LogIdentification) -> Section:

@@ -60,6 +60,6 @@ def sentence(text: str) -> str:
     if not text:
         return text
     first = text.split(maxsplit=1)[0]
-    # "hub: ..." starts with a name, and names keep their spelling.
-    start = text if first.endswith(":") else text[0].upper() + text[1:]
+    # "hub: ..." and "n_real = 1 ..." start with a name, and names keep their spelling.
+    start = text if first.endswith(":") or "_" in first else text[0].upper() + text[1:]
     return start + ("" if text[-1] in ".!?" else ".")
