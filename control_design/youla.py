@@ -28,6 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from control_design.ellipses import Complex, Real
 from control_design.frequency_grid import local_maxima
 from control_design.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
+from control_design.orthonormal_basis import basis_response
 from control_design.plant_set import UncertainPlant
 from control_design.problem import Problem
 from control_design.specification import Specification
@@ -36,7 +37,6 @@ from control_design.worst_case import PlantData, worst_of
 from control_design.youla_basis import (
     AffineLoop,
     Factors,
-    basis_response,
     chosen_poles,
     coprime_factors,
     stable_loop,

@@ -1,5 +1,4 @@
-"""All stabilising controllers of one plant: K = (X + M Q)/(Y - N Q), Q stable, expanded in an orthonormal
-basis."""
+"""All controllers that stabilise one plant: K = (X + M Q)/(Y - N Q), Q stable; poles to expand Q in."""
 
 from __future__ import annotations
 
@@ -11,31 +10,6 @@ import scipy.linalg
 
 from control_design.ellipses import Complex, Real
 from control_design.plant_set import UncertainPlant, frequency_response
-
-
-def basis_response(poles_z: Complex, omega_rad_s: Real, dt_s: float) -> Complex:
-    """Constant and orthonormal functions with the given poles at z = e^{j omega dt}: (F, 1 + functions).
-
-    poles_z: real poles, and of each pair the one above the real axis; inside the circle, any order, repeated
-    or
-    not. Functions m: sqrt(1 - a^2)/(z - a) times the all-pass of the poles before it; a pair gives two
-    (Kautz).
-    """
-    z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * dt_s)
-    columns = [np.ones_like(z)]
-    passed = np.ones_like(z)
-    for pole in np.asarray(poles_z, dtype=np.complex128):
-        if pole.imag == 0:
-            columns.append(passed * np.sqrt(1 - pole.real**2) / (z - pole.real))
-            passed = passed * (1 - pole.real * z) / (z - pole.real)
-            continue
-        gamma = abs(pole) ** 2
-        beta = 2 * pole.real / (1 + gamma)
-        below = (z - pole) * (z - pole.conjugate())
-        columns.append(passed * np.sqrt(1 - gamma**2) * (z - beta) / below)
-        columns.append(passed * np.sqrt((1 - gamma**2) * (1 - beta**2)) / below)
-        passed = passed * (1 - pole * z) * (1 - pole.conjugate() * z) / below
-    return np.stack(columns, axis=1)
 
 
 def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Complex:

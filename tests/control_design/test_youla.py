@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from control_design.example_plants import flexible_link, flexible_link_specification
+from control_design.orthonormal_basis import basis_response, basis_state_space
 from control_design.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification
 from control_design.youla import YoulaBracket, YoulaOptions, youla_bracket
-from control_design.youla_basis import basis_response, coprime_factors
+from control_design.youla_basis import coprime_factors
 
 from .plants import RelativeDisc, hub_arm
 
@@ -36,6 +37,11 @@ def test_basis_is_orthonormal_on_the_circle():
     omega = 2 * np.pi * np.arange(4096) / 4096 / _DT_S
     values = basis_response(poles, omega, _DT_S)
     np.testing.assert_allclose(values.conj().T @ values / 4096, np.eye(8), atol=1e-9)
+    a, b = basis_state_space(poles)
+    np.testing.assert_allclose(a @ a.T + b @ b.T, np.eye(7), atol=1e-12)
+    z = np.exp(1j * omega[5:2000:400] * _DT_S)
+    states = np.array([np.linalg.solve(value * np.eye(7) - a, b)[:, 0] for value in z])
+    np.testing.assert_allclose(states, values[5:2000:400, 1:], atol=1e-10)
 
 
 @pytest.mark.parametrize("integrators", [1, 2])
