@@ -206,7 +206,7 @@ def test_error_rates_of_the_verdicts(colour):
     """True priors pass in 95 % of the records at least, wrong ones never; white and AR(1) noise of equal
     power.
 
-    Measured over 40 seeds: white 0 and 0 of 40 true ones refused, AR(1) 0.9 the same.
+    Measured: one of 80 records with a true prior refused in white noise, two in AR(1) 0.9.
     """
     seeds = range(40)
 
