@@ -84,7 +84,7 @@ class IdentOptions(BaseModel):
     search_samples: int = Field(
         20_000, ge=100, description="longer data are searched on a part of them, then polished on all"
     )
-    starts: int = Field(3, ge=1, le=20, description="points of a global search that are polished")
+    starts: int = Field(4, ge=1, le=20, description="points of a global search that are polished")
 
     omega_min_rad_s: float | None = Field(None, gt=0, description="lowest natural frequency of a pair")
     omega_max_rad_s: float | None = Field(None, gt=0, description="highest natural frequency of a pair")
