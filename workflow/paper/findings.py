@@ -21,7 +21,7 @@ _BAND = f"between {JUDGED_BAND_RAD_S[0]:.0f} and {JUDGED_BAND_RAD_S[1]:.0f} rad/
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether the run agrees with what the paper reports, and what it found."""
+    """Whether the run agrees with what the paper reports, by medians and majorities, and what it found."""
 
     agrees: bool
     headline: str
@@ -76,7 +76,7 @@ def _one(results: PaperResults) -> Finding:
 def _two(results: PaperResults) -> Finding:
     shown, recipe = results.simulation, results.recipe_score
     own, many = shown.scores["GOBF"], shown.medians["GOBF"]
-    matched = own.mode_found and own.response_error < _MATCHED
+    matched = _usually(shown, "GOBF") and many["response_error"] < _MATCHED
     found = "finds the mode too" if recipe.mode_found else "misses the mode"
     mode = (
         "no pair"
@@ -104,10 +104,12 @@ def _two(results: PaperResults) -> Finding:
 def _three(results: PaperResults) -> Finding:
     shown = results.simulation
     peers = METHODS[1:]
-    found = [name for name in peers if shown.scores[name].mode_found]
+    found = [name for name in peers if _usually(shown, name)]
     return Finding(
         not found,
-        f"{listing(found)} finds the mode" if found else "none of the three finds the mode",
+        f"the mode is usually found by {listing(found)}"
+        if found
+        else "none of the three usually finds the mode",
         (
             f"{_mode_counts(shown, peers)} RMS error {_BAND} on the drawn record: {_errors(shown, peers)}; "
             f"GOBF {_percent(shown.scores['GOBF'].response_error)}.",
@@ -121,10 +123,12 @@ def _three(results: PaperResults) -> Finding:
 
 def _four(results: PaperResults) -> Finding:
     shown = results.experiment
-    found = [name for name in METHODS if shown.scores[name].mode_found]
+    found = [name for name in METHODS if _usually(shown, name)]
     return Finding(
         set(found) == {"GOBF", "OE"},
-        f"the resonance is found by {listing(found)}" if found else "nobody finds the resonance",
+        f"the resonance is usually found by {listing(found)}"
+        if found
+        else "nobody usually finds the resonance",
         (
             f"The arm's first mode lies at {number(shown.machine.mode[0])} rad/s with damping "
             f"{number(shown.machine.mode[1])}: the motor's back-EMF damps it. "
@@ -145,8 +149,9 @@ def _five(results: PaperResults) -> Finding:
     power = np.abs(np.fft.rfft(residual)) ** 2
     slow = np.fft.rfftfreq(residual.size, shown.trial.fresh.dt_s) < 1.0
     return Finding(
-        own >= shown.ceiling_percent - _CLOSE_TO_BEST,
-        f"fit {number(own)} %, of {number(shown.ceiling_percent)} % that the sensor noise leaves",
+        many["fit_percent"] >= shown.median_ceiling_percent - _CLOSE_TO_BEST,
+        f"median fit {number(many['fit_percent'])} %, of {number(shown.median_ceiling_percent)} % that the "
+        "sensor noise leaves",
         (
             f"Free run from rest on fresh data, nothing taken out: fit {number(own)} % (median of "
             f"{number(many['trials'])} records {number(many['fit_percent'])} %); the true tip without noise "
@@ -160,16 +165,18 @@ def _five(results: PaperResults) -> Finding:
 def _six(results: PaperResults) -> Finding:
     shown = results.experiment
     peers = METHODS[1:]
-    own = shown.scores["GOBF"].fit_percent
-    better = [name for name in peers if shown.scores[name].fit_percent >= own]
+    own = shown.medians["GOBF"]["fit_percent"]
+    adequate = [name for name in peers if shown.medians[name]["fit_percent"] >= own - _CLOSE_TO_BEST]
     return Finding(
-        not better,
-        f"GOBF {number(own)} %, the others {_fits(shown, peers)}",
+        not adequate,
+        "median fits " + listing([_median_fit(shown, name) for name in METHODS]),
         (
-            f"Fit on the same fresh data: {_fits(shown, peers)}; medians over "
+            f"Fit on the fresh data drawn: {_fits(shown, peers)}; medians over "
             f"{number(shown.medians['GOBF']['trials'])} records "
-            + listing([f"{name} {number(shown.medians[name]['fit_percent'])} %" for name in METHODS])
-            + ".",
+            + listing([_median_fit(shown, name) for name in METHODS])
+            + (
+                f". Within {number(_CLOSE_TO_BEST)} points of GOBF: {listing(adequate)}." if adequate else "."
+            ),
             f"From a better start: {_fits(shown, BETTER_STARTS)}. The fit of a free run is won at low "
             "frequency, where the tip moves most: a model without the mode can still score well, so Fig. 4 "
             "says more.",
@@ -231,6 +238,16 @@ def _mode_counts(shown: Comparison, names: Sequence[str]) -> str:
     trials = number(shown.medians[names[0]]["trials"])
     counts = listing([f"{number(shown.medians[name]['mode_found'])} for {name}" for name in names])
     return f"Mode found, of {trials} records: {counts}."
+
+
+def _usually(shown: Comparison, name: str) -> bool:
+    """In more than half of the records: one draw is luck."""
+    return shown.medians[name]["mode_found"] > shown.medians[name]["trials"] / 2
+
+
+def _median_fit(shown: Comparison, name: str) -> str:
+    fit = shown.medians[name]["fit_percent"]
+    return f"{name} {number(fit)} %" if np.isfinite(fit) else f"{name} runs away"
 
 
 def _share(results: PaperResults, problem: str, coordinates: str) -> str:

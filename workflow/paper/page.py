@@ -38,7 +38,13 @@ def page_html(
         settings=settings,
         band=JUDGED_BAND_RAD_S,
         figures=[
-            {"reported": reported, "found": found, "drawing": _embedded(reported, pictures[reported.number])}
+            {
+                "reported": reported,
+                "agrees": found.agrees,
+                "headline": _unbroken(found.headline),
+                "sentences": [_unbroken(words) for words in found.sentences],
+                "drawing": _embedded(reported, pictures[reported.number]),
+            }
             for reported, found in zip(REPORTED, findings, strict=True)
         ],
         choices=OPEN_CHOICES,
@@ -46,6 +52,11 @@ def page_html(
             (REPORTED[number - 1], list(group)) for number, group in groupby(rows, key=lambda row: row.figure)
         ],
     )
+
+
+def _unbroken(words: str) -> str:
+    """A number stays on one line with its per cent sign."""
+    return words.replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _embedded(reported: Reported, picture: Picture) -> Markup:
