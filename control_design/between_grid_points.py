@@ -25,7 +25,7 @@ from control_design.frequency_grid import starting_edges
 from control_design.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.rational_response import RationalResponse
 from control_design.rational_weights import effort_weight, tracking_weight
-from control_design.set_expansion import ExpandableSet, SetExpansion, expandable
+from control_design.set_expansion import ExactSet, ExpandableSet, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.stability import loop_integrators
 from control_design.worst_case import KINDS, WorstCase
@@ -326,6 +326,9 @@ def bound_all_frequencies(
         targets[kind] = target if np.isfinite(most) else np.inf
     found, used = _bisect(loop.bounds, edges, plant.dt_s, targets)
     result = _verdict(found, used, own + plant.n_integrators, unstable)
+    if result.distance > 0:  # the modulus was bisected, the distance only came along
+        nearest = specification.modulus_margin / result.bounds["modulus"]
+        result = replace(result, distance=max(result.distance, nearest))
     if infinite:  # towards zero frequency the weight grows without limit and the loop gain does not
         bounds = result.bounds | {"tracking": float("inf")}
         result = replace(result, gamma=float("inf"), bounds=bounds)
@@ -335,9 +338,9 @@ def bound_all_frequencies(
 def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
     """Largest relative difference of the gain-zero-pole forms from the state spaces at omega (F,)."""
     pairs = [(loop.controller, controller.to_control())]
-    if loop.plant.uncertainty is None:
-        assert hasattr(loop.members, "response")
-        pairs.append((loop.members.response, loop.plant.nominal))
+    for members, channel in ((loop.members, loop.plant.channel), (loop.performance, loop.plant.performance)):
+        if isinstance(members, ExactSet) and channel is not None:
+            pairs.append((members.response, channel.nominal))
     largest = 0.0
     for form, system in pairs:
         value = frequency_response(system, omega)
@@ -400,7 +403,8 @@ def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -
     # Within an interval 1 + L stays in a half-plane, so the principal value of the turn from its start to its
     # end is the turn; at a joint the two estimates of one value differ by less than a quarter turn each.
     turn = float(np.sum(np.angle(end / start)) + np.sum(np.angle(start[1:] / end[:-1])))
-    # (z - 1)^i (1 + L) is real at both ends: what is missing to a multiple of pi is the last remainder.
+    # (z - 1)^i (1 + L) is real at 0 and at Nyquist, and less than a quarter turn from its estimate there.
+    turn += float(np.angle(start[0] * np.sign(start[0].real)) - np.angle(end[-1] * np.sign(end[-1].real)))
     turns = float(np.round(turn / np.pi))
     half_turns = turns - integrators / 2.0
     stable = turns == unstable + integrators
