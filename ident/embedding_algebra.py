@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import qr, solve_triangular, svd
+from scipy.linalg import lapack, qr, solve_triangular, svd
 
 from ident.arrays import RealArray
 
@@ -22,6 +22,8 @@ _NUISANCE_RANK = 1e-10
 # A diagonal entry of R11 (columns of unit length) below this says that these records cannot tell the column
 # from the earlier ones.
 _EXCITATION = 1e-10
+# Share of the largest prior variance below which a tap is none: rounding, even ten orders above the noise.
+_DIED_OUT = 1e-17
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +122,13 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
     for block in blocks:
         p, length = block.regressors.shape[1], block.kernel.shape[1]
         basis = nuisance_basis(block.nuisance)
-        columns = without_nuisance(np.column_stack([block.regressors, block.kernel, block.output]), basis)
-        n_rows += block.output.size - basis.shape[1]
-        stacked = columns if triangle is None else np.vstack([triangle, columns])
-        (upper,) = qr(stacked, mode="r", overwrite_a=True, check_finite=False)
-        triangle = np.asarray(upper[: p + length + 1], dtype=np.float64)
+        # The nuisance as the first columns: below its rows, the triangle is that of everything orthogonal
+        # to it, for the price of a few columns more.
+        rank = basis.shape[1]
+        upper = _triangle(np.column_stack([basis, block.regressors, block.kernel, block.output]))
+        upper = upper[rank : rank + p + length + 1, rank:]
+        n_rows += block.output.size - rank
+        triangle = upper if triangle is None else _triangle(np.vstack([triangle, upper]))
     if triangle is None:
         raise ValueError("need at least one record")
     if n_rows <= p + length + 1:
@@ -135,8 +139,7 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
     kept = _distinguishable(triangle[:p, :p])
     if kept.size < p:
         columns = np.concatenate([kept, np.arange(p, p + length + 1)])
-        (upper,) = qr(triangle[:, columns], mode="r", check_finite=False)
-        triangle = np.asarray(upper[: columns.size], dtype=np.float64)
+        triangle = _triangle(triangle[:, columns])
     q = kept.size
     return ReducedRegression(
         r11=np.triu(triangle[:q, :q]),
@@ -149,6 +152,21 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
         kept=kept,
         n_columns=p,
     )
+
+
+def _triangle(columns: RealArray) -> RealArray:
+    """R (n,n) of the QR decomposition of columns (T,n); rows of zeros where T < n.
+
+    LAPACK called directly: SciPy's qr copies the matrix twice and forms all T rows of R, which costs as much
+    as the decomposition.
+    """
+    n_rows, n = columns.shape
+    packed, _, _, info = lapack.dgeqrf(np.asfortranarray(columns), lwork=64 * n, overwrite_a=1)
+    if info != 0:
+        raise ArithmeticError(f"dgeqrf returned {info}")
+    upper = np.zeros((n, n))
+    upper[: min(n_rows, n)] = np.triu(packed[:n])
+    return upper
 
 
 def _distinguishable(r11: RealArray) -> npt.NDArray[np.intp]:
@@ -176,18 +194,34 @@ def exponential_factor(lam: float, length: int) -> RealArray:
 
 @dataclass(frozen=True, eq=False)
 class KernelSpectrum:
-    """Singular value decomposition of R22 B for one kernel shape: every alpha then costs O(L)."""
+    """Singular value decomposition of R22 B for one kernel shape: every alpha then costs O(L).
+
+    Of the L taps those n are kept that have died out neither; R22 and B are upper triangular, so R22 B has
+    nothing outside its first n rows and columns. axes (n,n) = B V, singular d (n,), projected U^T z (n,), and
+    outside = squared norm of the rest of z.
+    """
 
     lam: float
-    factor: RealArray  # B (L,L)
-    singular: RealArray  # d (L,)
-    projected: RealArray  # U^T z (L,)
-    right: RealArray  # V (L,L), columns
+    length: int
+    axes: RealArray
+    singular: RealArray
+    projected: RealArray
+    outside: float
 
 
 def kernel_spectrum(reduced: ReducedRegression, lam: float, factor: RealArray) -> KernelSpectrum:
-    u, d, vt = svd(reduced.r22 @ factor, full_matrices=False, check_finite=False)
-    return KernelSpectrum(lam=lam, factor=factor, singular=d, projected=u.T @ reduced.z, right=vt.T)
+    """For an upper triangular factor B (L,L) whose columns die out with the tap."""
+    size = np.einsum("ij,ij->j", factor, factor)
+    n = int(np.flatnonzero(size > _DIED_OUT * size.max())[-1]) + 1
+    u, d, vt = svd(reduced.r22[:n, :n] @ factor[:n, :n], full_matrices=False, check_finite=False)
+    return KernelSpectrum(
+        lam=lam,
+        length=factor.shape[0],
+        axes=factor[:n, :n] @ vt.T,
+        singular=d,
+        projected=u.T @ reduced.z[:n],
+        outside=float(reduced.z[n:] @ reduced.z[n:]),
+    )
 
 
 def restricted_log_likelihood(
@@ -199,7 +233,7 @@ def restricted_log_likelihood(
     """
     gain = 1.0 + alpha[:, None] * spectrum.singular**2
     nu = reduced.degrees_of_freedom
-    s2 = (reduced.rest + np.sum(spectrum.projected**2 / gain, axis=1)) / nu
+    s2 = (reduced.rest + spectrum.outside + np.sum(spectrum.projected**2 / gain, axis=1)) / nu
     floor = np.finfo(np.float64).tiny
     return -0.5 * (nu * np.log(np.maximum(s2, floor)) + np.sum(np.log(gain), axis=1) + nu), s2
 
@@ -263,7 +297,7 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
     For one pair: m = Ct R22^T M^-1 z = alpha B V diag(d / (1 + alpha d^2)) U^T z and
     s2 V = s2 alpha B V diag(1 / (1 + alpha d^2)) V^T B^T.
     """
-    length = grid.spectra[0].singular.size
+    length = grid.spectra[0].length
     mean, covariance = np.zeros(length), np.zeros((length, length))
     means: list[tuple[RealArray, RealArray]] = []
     for spectrum, alpha, s2, weight in zip(
@@ -275,12 +309,15 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
             continue
         a, w = alpha[kept, None], weight[kept]
         gain = 1.0 + a * spectrum.singular**2
-        axes = spectrum.factor @ spectrum.right
-        means.append((w, (a * spectrum.singular / gain * spectrum.projected) @ axes.T))
-        mean += w @ means[-1][1]
-        covariance += (axes * ((w * s2[kept]) @ (a / gain))) @ axes.T
-    for w, of_point in means:
-        covariance += (of_point - mean).T @ ((of_point - mean) * w[:, None])
+        n = spectrum.singular.size
+        of_point = np.zeros((w.size, length))
+        of_point[:, :n] = (a * spectrum.singular / gain * spectrum.projected) @ spectrum.axes.T
+        means.append((w, of_point))
+        mean += w @ of_point
+        covariance[:n, :n] += (spectrum.axes * ((w * s2[kept]) @ (a / gain))) @ spectrum.axes.T
+    if means:
+        apart = np.concatenate([np.sqrt(w)[:, None] * (of_point - mean) for w, of_point in means])
+        covariance += apart.T @ apart
     covariance += weight_none * np.outer(mean, mean)
     noise = weight_none * grid.noise_variance_none + float(np.sum(weights * grid.noise_variance))
     best = np.unravel_index(int(np.argmax(weights)), weights.shape)
@@ -300,9 +337,11 @@ def prior_posterior(grid: KernelGrid) -> KernelPosterior:
     best = np.unravel_index(int(np.argmax(grid.log_likelihood)), grid.log_likelihood.shape)
     spectrum = grid.spectra[best[0]]
     s2, alpha = float(grid.noise_variance[best]), float(grid.alpha[best])
+    factor = np.zeros((spectrum.length, spectrum.singular.size))
+    factor[: spectrum.singular.size] = np.sqrt(s2 * alpha) * spectrum.axes  # B V (B V)^T = B B^T
     return KernelPosterior(
-        kernel_mean=np.zeros(spectrum.singular.size),
-        kernel_factor=np.sqrt(s2 * alpha) * spectrum.factor,
+        kernel_mean=np.zeros(spectrum.length),
+        kernel_factor=factor,
         noise_variance=s2,
         alpha=alpha,
         lam=spectrum.lam,

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numba
@@ -23,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
-from ident.arrays import ComplexArray, RealArray
+from ident.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
 from ident.basis import basis_response, block_parameters, run_cascade
 from ident.embedding_algebra import (
     KernelPosterior,
@@ -115,17 +116,21 @@ class PairStatistics:
 
 @dataclass(frozen=True, eq=False)
 class PairEvidence:
-    """log likelihood (J,A) over pairs and scales, on the scale of `embedding_algebra`, prior (A,) of the
-    scales; moments of the amplitudes for each: mean (J,A,2) and covariance (J,A,2,2), noise variance (J,A).
+    """log likelihood (J,A) over pairs and scales, on the scale of `embedding_algebra`.
+
+    energy (A,) are the expected energies of the scales, in noise variances, and prior (A,) their weights;
+    mean (J,A,2), covariance (J,A,2,2) of the amplitudes and noise_variance (J,A) for each.
     """
 
     log_likelihood: RealArray
+    energy: RealArray
     prior: RealArray
     mean: RealArray
     covariance: RealArray
     noise_variance: RealArray
 
 
+@lru_cache(maxsize=16)
 def candidate_pairs(n_samples: int) -> CandidatePairs:
     """Grid of lightly damped pairs, from six periods in the record to nine tenths of the Nyquist frequency.
 
@@ -145,7 +150,7 @@ def candidate_pairs(n_samples: int) -> CandidatePairs:
             omega *= 1 + _SPACING * damping
         poles += group
         prior += [1 / len(group)] * len(group)
-    return CandidatePairs(np.array(poles, dtype=np.complex128), np.array(prior) / np.sum(prior))
+    return CandidatePairs(readonly_complex(poles), readonly_real(np.array(prior) / np.sum(prior)))
 
 
 def pair_statistics(
@@ -230,6 +235,7 @@ def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEv
     log_likelihood = -0.5 * (nu * np.log(s2) + log_det + nu)
     return PairEvidence(
         log_likelihood=np.where(statistics.distinguishable()[:, None], log_likelihood, -np.inf),
+        energy=energy,
         prior=np.repeat([(1 - _VISIBLE_SHARE) / 6, _VISIBLE_SHARE / 6], 6),
         mean=np.einsum("jki,jai->jak", vectors, along[:, None, :] / precision),
         covariance=s2[:, :, None, None] * np.einsum("jki,jai,jli->jakl", vectors, 1 / precision, vectors),

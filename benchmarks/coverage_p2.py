@@ -1,0 +1,317 @@
+"""P2 (three modes): do 95 % ellipses hold the truth 95 % of the time, poles and order from the same data?
+
+    OMP_NUM_THREADS=1 python -m benchmarks.coverage_p2 [--cases main,random] [--seeds 200] [--first-seed 0]
+
+Plants, inputs and noise: `benchmarks.p2_plants`; every run has its own input and noise, and its own plant
+where the case says so. Poles and order by identify([record]) with default options.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.p2_plants import DT_S, Run, Setting, draw
+from benchmarks.results_file import ResultsFile
+from ident import GobfModel, IdentOptions, identify
+from ident.basis import regressor
+from ident.embedding import EmbeddingOptions, classical, tangent
+from ident.nominal import nominal_near
+from ident.posterior import ResponsePosterior
+from ident.uncertainty import FrequencyUncertainty
+
+OMEGA = np.geomspace(0.3, 300.0, 150)
+BANDS = ((0.3, 1), (1, 5), (5, 13), (13, 19), (19, 55), (55, 85), (66, 72), (85, 150), (150, 190), (190, 301))
+LEVEL = 0.95
+RADIUS_REACH = {(13, 19): 1.5, (19, 55): 2.2, (66, 72): 5.0, (190, 301): 32.0}
+
+HEADER = """
+95 % ellipses on P2 at 150 log-spaced frequencies 0.3-300 rad/s, poles and order n from the same record.
+  coverage     share of (run, frequency) with the true response inside the ellipse, per band, in %
+  worst        smallest share over the runs at a single frequency
+  radius       semi-major axis s1 of the 95 % ellipse (the enclosing disc) over |G|, median per band, in %
+  mean radius  the same of sqrt(s1 s2)
+  ratio        median over runs and frequencies of radius over actual error |G - centre|, three readings:
+               mean radius sqrt(s1 s2) (judged), radius in the direction of the error, semi-major axis; an exact
+               circular Gaussian has 2.08 in all, the third grows with elongation however good the ellipse
+  all inside   share of runs with ALL 150 frequencies inside: of the 95 % ellipses, and of the simultaneous
+               bands (`joint_level`: 95 % of 1000 responses drawn from the posterior are inside everywhere;
+               median squared radius beside it, 5.99 for one frequency)
+  order-4 nominal   disc |G - G_nom| <= rho with P = 95 % under the posterior (`offset_disc`), G_nom the least-
+               squares fit with 2 real poles and 1 pair, or that fit's poles placed by `nominal_near`
+  order        how many pole pairs the data gave (pairs x runs)
+  cpu          median process time of the identification and of the posterior, ms; the machine was shared
+"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the study. coverage: (least, largest) share per band in %, None: no requirement."""
+
+    title: str
+    setting: Setting
+    methods: tuple[str, ...] = ("tangent",)
+    coverage: tuple[float, float] | None = None
+    overall: float | None = None
+    worst: float | None = None
+    is_main: bool = False
+    coloured_noise: bool = False
+
+
+CASES = {
+    "main": Case(
+        "fixed plant, N = 2000, 35 dB",
+        Setting(),
+        (
+            "tangent",
+            "no missed mode",
+            "order-4 nominal",
+            "order-4 nominal, placed",
+            "classical, n = 4",
+            "covariance, n = 4",
+        ),
+        coverage=(92, 98),
+        worst=88,
+        is_main=True,
+    ),
+    "random": Case(
+        "random plants, N = 2000, 35 dB", Setting(random_plant=True), ("tangent", "no missed mode"), (91, 99)
+    ),
+    "random-1000": Case(
+        "random plants, N = 1000, 30 dB",
+        Setting(1000, 30.0, random_plant=True),
+        ("tangent", "no missed mode"),
+        (87, 100),
+    ),
+    "fixed-1000": Case(
+        "fixed plant, N = 1000, 30 dB", Setting(1000, 30.0), ("tangent", "no missed mode"), (87, 100)
+    ),
+    "fixed-1000-40": Case("fixed plant, N = 1000, 40 dB", Setting(1000, 40.0)),
+    "fixed-4000-40": Case("fixed plant, N = 4000, 40 dB", Setting(4000, 40.0)),
+    "five": Case("five modes (also 48 and 75 Hz), N = 2000, 35 dB", Setting(n_modes=5)),
+    "five-4000-40": Case("five modes (also 48 and 75 Hz), N = 4000, 40 dB", Setting(4000, 40.0, n_modes=5)),
+    "initial-state": Case(
+        "fixed plant, N = 2000, 35 dB, record cut out of a longer run", Setting(from_rest=False), overall=93
+    ),
+    "ar1": Case(
+        "fixed plant, N = 2000, 35 dB, AR(1) noise with pole 0.9 (coloured_noise on)",
+        Setting(noise_pole=0.9),
+        overall=90,
+        coloured_noise=True,
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One set of ellipses against the truth, all (F,); joint: everything inside the simultaneous bands."""
+
+    inside: np.ndarray
+    major: np.ndarray  # over |G|
+    mean: np.ndarray  # over |G|
+    ratios: np.ndarray  # (3, F): mean radius, radius along the error, semi-major axis, each over the error
+    joint: bool
+    joint_radius2: float
+    cpu_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class RunOutcome:
+    """Everything of one seed."""
+
+    pairs: int
+    cpu_identify_s: float
+    by_method: dict[str, Outcome]
+
+
+def covariance_alone(run: Run, model: GobfModel) -> ResponsePosterior:
+    """Least squares on the poles as if they were known: s2 (Phi^T Phi)^-1 and nothing else."""
+    columns = regressor(model.poles, run.record.input[:, 0])
+    q, r = np.linalg.qr(np.column_stack([columns, np.ones(columns.shape[0])]))
+    inner = q.T @ run.record.output[:, 0]
+    rest = run.record.output[:, 0] - q @ inner
+    s = np.sqrt(rest @ rest / (rest.size - inner.size))
+    inverse = np.linalg.inv(r)
+    order = model.poles.order
+    return ResponsePosterior(model.poles, (inverse @ inner)[:order], s * inverse[:order], DT_S)
+
+
+def judge(run: Run, ellipses: FrequencyUncertainty, truth: np.ndarray, cpu_s: float) -> Outcome:
+    axes = ellipses.ellipse()
+    distance = ellipses.normalised_distance(truth)
+    error = np.abs(truth - ellipses.centre)
+    mean = np.sqrt(axes.semi_major * axes.semi_minor)
+    return Outcome(
+        inside=distance <= 1,
+        major=axes.semi_major / np.abs(truth),
+        mean=mean / np.abs(truth),
+        ratios=np.stack([mean / error, 1 / distance, axes.semi_major / error]),
+        joint=False,
+        joint_radius2=np.nan,
+        cpu_s=cpu_s,
+    )
+
+
+def with_joint(outcome: Outcome, posterior: ResponsePosterior, truth: np.ndarray, seed: int) -> Outcome:
+    level = posterior.joint_level(OMEGA, LEVEL, np.random.default_rng(seed), n_draws=1000)
+    everywhere = bool(np.all(posterior.at(OMEGA, level).contains(truth)))
+    return Outcome(
+        outcome.inside,
+        outcome.major,
+        outcome.mean,
+        outcome.ratios,
+        everywhere,
+        float(-2 * np.log1p(-level)),
+        outcome.cpu_s,
+    )
+
+
+def disc_outcome(nominal: np.ndarray, ellipses: FrequencyUncertainty, truth: np.ndarray) -> Outcome:
+    """The offset disc around the order-4 nominal: |G - G_nom| <= rho."""
+    _, rho = ellipses.offset_disc(nominal)
+    error = np.abs(truth - nominal)
+    relative, ratio = rho / np.abs(truth), rho / error
+    return Outcome(error <= rho, relative, relative, np.stack([ratio] * 3), False, np.nan, np.nan)
+
+
+def one_run(name: str, seed: int) -> RunOutcome:
+    """Draw, identify, embed, judge; everything from one seed."""
+    case = CASES[name]
+    run = draw(case.setting, np.random.default_rng(seed))
+    truth = run.plant.response(OMEGA)
+    begin = time.process_time()
+    model = identify([run.record]).model
+    cpu_identify_s = time.process_time() - begin
+    options = EmbeddingOptions(coloured_noise=case.coloured_noise)
+    alone = options.model_copy(update={"prior_missed_mode": 0.0})
+    begin = time.process_time()
+    posterior = tangent([run.record], model, options)
+    cpu_s = time.process_time() - begin
+    ellipses = posterior.at(OMEGA, LEVEL)
+    found: dict[str, Outcome] = {}
+    low = None
+    for method in case.methods:
+        if method == "tangent":
+            found[method] = with_joint(judge(run, ellipses, truth, cpu_s), posterior, truth, seed)
+            continue
+        if method == "no missed mode":
+            begin = time.process_time()
+            other = tangent([run.record], model, alone)
+            cpu_s = time.process_time() - begin
+            found[method] = with_joint(judge(run, other.at(OMEGA), truth, cpu_s), other, truth, seed)
+            continue
+        if low is None:
+            low = identify([run.record], IdentOptions(n_real=2, n_pairs=1)).model
+        if method.startswith("order-4 nominal"):
+            nominal = nominal_near(posterior, low.poles, OMEGA) if method.endswith("placed") else low
+            found[method] = disc_outcome(nominal.frequency_response(OMEGA), ellipses, truth)
+        elif method == "classical, n = 4":
+            found[method] = judge(run, classical([run.record], low).at(OMEGA), truth, np.nan)
+        else:
+            found[method] = judge(run, covariance_alone(run, low).at(OMEGA), truth, np.nan)
+    return RunOutcome(model.poles.pairs.size, cpu_identify_s, found)
+
+
+def per_band(values: np.ndarray, statistic: Callable[[np.ndarray], float]) -> list[float]:
+    """(runs, F) -> one number per band."""
+    return [statistic(values[:, (low <= OMEGA) & (high > OMEGA)]) for low, high in BANDS]
+
+
+def row(label: str, values: Sequence[float], tail: str = "") -> str:
+    return f"    {label:<22}" + "".join(f"{value:8.1f}" for value in values) + f"   {tail}"
+
+
+def verdict(ok: bool) -> str:
+    return "met" if ok else "NOT MET"
+
+
+def report(out: ResultsFile, case: Case, runs: Sequence[RunOutcome]) -> None:
+    pairs = np.bincount([run.pairs for run in runs])
+    counted = ", ".join(f"{k} x {count}" for k, count in enumerate(pairs) if count)
+    out()
+    out(f"{case.title}: {len(runs)} runs; order: {counted}")
+    out(
+        "    " + " " * 22 + "".join(f"{f'{low:g}-{min(high, 300):g}':>8}" for low, high in BANDS) + "   rad/s"
+    )
+    for method in case.methods:
+        found = [run.by_method[method] for run in runs]
+        inside = np.array([item.inside for item in found])
+        coverage = per_band(100 * inside, np.mean)
+        disc = method.startswith("order-4 nominal")
+        judged = disc or method == "tangent"
+        bounds = (90.0, 98.5) if disc else case.coverage
+        tail = ""
+        if judged and bounds is not None:
+            ok = all(bounds[0] <= value <= bounds[1] for value in coverage)
+            tail = f"reach {bounds[0]:g}-{bounds[1]:g} in every band: {verdict(ok)}"
+        out(f"  {method}")
+        out(row("coverage", coverage, tail))
+        radii = per_band(100 * np.array([item.major for item in found]), np.median)
+        if case.is_main and method == "tangent":
+            wanted = [RADIUS_REACH.get(band) for band in BANDS]
+            ok = all(limit is None or r <= limit for limit, r in zip(wanted, radii, strict=True))
+            out(row("radius", radii, f"reach below: {verdict(ok)}"))
+            out("    " + f"{'  at most':<22}" + "".join(f"{'' if w is None else w:>8}" for w in wanted))
+        else:
+            out(row("radius", radii))
+        if not disc:
+            out(row("mean radius", per_band(100 * np.array([item.mean for item in found]), np.median)))
+        overall, worst = 100 * float(inside.mean()), 100 * float(inside.mean(axis=0).min())
+        text = f"    overall {overall:.1f}"
+        if method == "tangent" and case.overall is not None:
+            text += f" (reach >= {case.overall:g}: {verdict(overall >= case.overall)})"
+        text += f"; worst {worst:.1f}"
+        if method == "tangent" and case.worst is not None:
+            text += f" (reach >= {case.worst:g}: {verdict(worst >= case.worst)})"
+        ratios = np.median(np.array([item.ratios for item in found]), axis=(0, 2))
+        text += f"; ratio {ratios[0]:.2f}"
+        if case.is_main and method == "tangent":
+            text += f" (reach 1.8-2.4: {verdict(bool(1.8 <= ratios[0] <= 2.4))})"
+        text += f", along the error {ratios[1]:.2f}, semi-major {ratios[2]:.2f}"
+        out(text)
+        text = f"    all inside {100 * inside.all(axis=1).mean():.0f}"
+        if method in ("tangent", "no missed mode"):
+            text += (
+                f"; simultaneous bands {100 * np.mean([item.joint for item in found]):.0f}"
+                f" (squared radius {np.median([item.joint_radius2 for item in found]):.1f})"
+                f"; cpu {1e3 * np.median([run.cpu_identify_s for run in runs]):.0f}"
+                f" + {1e3 * np.median([item.cpu_s for item in found]):.0f} ms"
+            )
+        out(text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="coverage of 95 % ellipses on P2")
+    parser.add_argument("--cases", default=",".join(CASES), help="comma-separated; default: all")
+    parser.add_argument("--seeds", type=int, default=200, help="runs per case")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--trial", action="store_true", help="print only, leave the results file alone")
+    arguments = parser.parse_args()
+    names = arguments.cases.split(",")
+    unknown = sorted(set(names) - set(CASES))
+    if unknown:
+        parser.error(f"unknown cases {', '.join(unknown)}; choose from {', '.join(CASES)}")
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    label = f"{seeds.start} to {seeds.stop - 1}"
+    # Processes started afresh: forking after the numerical libraries have started their threads can hang.
+    context = multiprocessing.get_context("spawn")
+    with (
+        ResultsFile("coverage_p2", seeds=label, write=not arguments.trial) as out,
+        ProcessPoolExecutor(max(1, min(2, arguments.processes)), mp_context=context) as pool,
+    ):
+        for line in HEADER.strip().splitlines():
+            out(line)
+        for name in names:
+            runs = list(pool.map(one_run, [name] * len(seeds), seeds, chunksize=5))
+            report(out, CASES[name], runs)
+
+
+if __name__ == "__main__":
+    main()
