@@ -96,7 +96,10 @@ def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
 
 
 def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
-    """Poles whose decay the records do not tell, by the Gauss-Newton covariance for white noise."""
+    """Poles whose decay the records do not tell, by the Gauss-Newton covariance.
+
+    Where the residual is coloured, what counts for a pole is the noise around its own frequency.
+    """
     poles, dt_s = model.poles, model.dt_s
     n_real, n_pairs = fixed.real.size, fixed.pairs.size
     here = linearisation(data, poles)
@@ -113,7 +116,8 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     seconds = data.longest * dt_s
     sentences = []
     for rate, spread in zip(1 - poles.real[n_real:], deviation[:n_free], strict=True):
-        if still < rate < 1 / (_SLOW * data.longest) and 1.96 * spread > np.log(_KNOWN_WITHIN) * rate:
+        slow = still < rate < 1 / (_SLOW * data.longest)
+        if slow and not _is_known(here.residual, data, rate / dt_s, spread / rate):
             sentences.append(
                 f"a real pole decays with a time constant of {dt_s / rate:.0f} s, give or take a factor "
                 f"of two at best, in {seconds:.3g} s of record: record longer, or give it as known "
@@ -122,13 +126,25 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     omegas = poles.omega_rad_s(dt_s)[n_pairs:]
     rates = -np.log(np.abs(poles.pairs[n_pairs:]))
     for omega, rate, spread in zip(omegas, rates, deviation[n_free::2], strict=True):
-        if rate > still and 1.96 * spread > np.log(_KNOWN_WITHIN) * rate:
+        if rate > still and not _is_known(here.residual, data, omega, spread / rate):
             sentences.append(
                 f"the damping of the pole pair at {omega:.4g} rad/s is known to a factor of two at best: "
                 f"record longer than {seconds:.3g} s, drive it harder, or fit one pair less if it is no mode "
                 "of the machine"
             )
     return sentences
+
+
+def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviation: float) -> bool:
+    """Whether a relative deviation, computed for white noise, is small enough with the residual's colour."""
+    allowed = float(np.log(_KNOWN_WITHIN)) / 1.96
+    if deviation < allowed / 5:  # no colour seen so far makes more of it
+        return True
+    segment = int(min(256, np.min(np.diff(data.starts))))
+    density = np.mean([_spectrum(residual[data.segment(i)], segment) for i in range(data.n_records)], axis=0)
+    omega = np.linspace(0, np.pi / data.dt_s, density.size)
+    there = float(np.interp(omega_rad_s, omega, _smooth(density, 3)))
+    return bool(deviation * np.sqrt(there / max(float(density.mean()), 1e-300)) <= allowed)
 
 
 def _weak_input(
@@ -246,7 +262,7 @@ def excitation_limit_rad_s(
         if model is not None and residuals[index].size >= segment:
             noise = _spectrum(residuals[index], segment)
             gain = np.abs(model.frequency_response(frequency[1:]))
-            lines = np.maximum(record.n_samples * record.dt_s * frequency[1:] / 3, 1.0)
+            lines = np.maximum(record.n_samples * record.dt_s * frequency[1:] / (6 * np.pi), 1.0)
             seen = lines * gain**2 * density[1:] >= _TOLD * _smooth(noise)[1:]
             present[1:] |= seen & (density[1:] >= _LEAKAGE * density.max())
         highest = max(highest, float(frequency[np.flatnonzero(present)[-1]]))
@@ -267,9 +283,9 @@ def _spectrum(x: RealArray, segment: int) -> RealArray:
     return np.asarray(density)
 
 
-def _smooth(density: RealArray) -> RealArray:
-    """Mean over 11 neighbouring lines: a noise spectrum of few averages has holes that are chance."""
-    window = np.ones(min(11, density.size))
+def _smooth(density: RealArray, width: int = 11) -> RealArray:
+    """Mean over neighbouring lines: a noise spectrum of few averages has holes that are chance."""
+    window = np.ones(min(width, density.size))
     return np.asarray(
         np.convolve(density, window, "same") / np.convolve(np.ones(density.size), window, "same")
     )

@@ -34,6 +34,8 @@ FREQUENCY_TOLERANCE = 0.01
 DAMPING_TOLERANCE = 0.05
 
 _BEYOND_CHOSEN = 3
+# More samples than this say no more about which modes stay, and a dozen fits of order 20 take their time.
+_MOST_SAMPLES = 10_000
 _MOST_PAIRS = 12
 _FEWEST_ORDERS = 2
 # Below this share of the output's power residuals are rounding, and poles fitted to them mean nothing.
@@ -147,11 +149,10 @@ def stabilisation(
     records and options are those `found` came from; its number of real poles and its structure (offset,
     initial state) are kept throughout. max_pairs: none given means three more than were chosen, twelve at
     most; the data may end the growth earlier (too few samples, nothing left to explain). At the chosen number
-    of pairs the poles are those of the model. Records longer than `options.search_samples` are thinned as for
-    the search.
+    of pairs the poles are those of the model. Long records are thinned as for the search.
     """
     options = options or IdentOptions()
-    part, in_mid_record = thinned(records, options.search_samples)
+    part, in_mid_record = thinned(records, min(options.search_samples, _MOST_SAMPLES))
     structure = found.structure
     if in_mid_record:
         structure = replace(structure, estimate_initial_state=True)
