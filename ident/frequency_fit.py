@@ -180,7 +180,7 @@ def identify_frf(
     ------
     ValueError
         If a frequency has no covariance, there are too few frequencies for the order asked for, or an option
-        asks for an offset or initial state.
+        asks for an offset, an initial state or a relative degree.
 
     Notes
     -----
@@ -192,6 +192,10 @@ def identify_frf(
     options = options or IdentOptions()
     if options.estimate_offset is True or options.estimate_initial_state is True:
         raise ValueError("a frequency response has no offset and no initial state; leave them at 'auto'")
+    if options.relative_degree not in (None, 1):
+        raise ValueError(
+            f"relative_degree = {options.relative_degree} is not imposed on a response: leave it out"
+        )
     data = prepare_response(
         response,
         integrators=options.integrators,

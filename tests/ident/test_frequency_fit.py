@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from control_design.plant_set import UncertainPlant
 from ident.frequency_fit import FrfIdentification, identify_frf
 from ident.frf_polish import from_log, to_log
 from ident.frf_regression import fit_response, pole_directions, prepare_response
@@ -145,6 +146,14 @@ def test_round_trip_is_exact(plant):
         np.testing.assert_array_equal(again.to_arrays()[name], value)
 
 
+def test_control_design_takes_model_and_posterior(plant):
+    found = identify_frf(measured(plant.response(OMEGA), 7), IdentOptions(n_real=2, n_pairs=3))
+    uncertain = UncertainPlant("from a response", found.model.to_control(), found.posterior)
+    np.testing.assert_allclose(
+        uncertain.at(OMEGA).centre, found.posterior.centre(OMEGA), rtol=1e-9, atol=1e-15
+    )
+
+
 def test_bad_input_is_refused(plant):
     response = plant.response(OMEGA)
     good = measured(response, 6)
@@ -153,6 +162,8 @@ def test_bad_input_is_refused(plant):
         identify_frf(exact)
     with pytest.raises(ValueError, match="no offset and no initial state"):
         identify_frf(good, IdentOptions(estimate_offset=True))
+    with pytest.raises(ValueError, match="relative_degree = 2 is not imposed"):
+        identify_frf(good, IdentOptions(relative_degree=2))
     few = FrequencyUncertainty(OMEGA[:6], good.centre[:6], good.covariance[:6], DT_S)
     with pytest.raises(ValueError, match="6 frequencies are too few for order 8"):
         identify_frf(few, IdentOptions(n_real=2, n_pairs=3))
