@@ -133,3 +133,17 @@ def test_advice_says_what_to_do_about_which_test():
     both = residual_advice(whiteness_test([colour]), independence_test([u], [driven]))
     assert len(both) == 2
     assert "first" in both[1]
+
+
+@pytest.mark.parametrize("kind", ["held binary", "sweep"])
+def test_inputs_of_experiments_do_not_fail_the_independence_test_by_themselves(kind):
+    """Neither has white samples; the variance of each lag is that of this input and this residual."""
+    alarms = 0
+    for seed in range(150):
+        rng = np.random.default_rng([9, seed])
+        if kind == "held binary":
+            u = np.repeat(rng.choice([-1.0, 1.0], 50), 20)
+        else:
+            u = signal.chirp(np.arange(1000) * 0.005, 0.1, 5.0, 40.0)
+        alarms += not independence_test([u], [coloured(rng, 1000, 0.9)]).passed
+    assert alarms <= 6  # 1 % of 150 and 4 sd; correlated lags make the shared level (Sidak) cautious
