@@ -40,6 +40,7 @@ from control_design.joint_coverage import gamma_of_draws, joint_coverage
 from control_design.worst_case import worst_case, worst_of
 
 BRUTE = 400_000
+MANY = 20_000
 CALIBRATION_SEED, CHECK_SEED = 11, 12
 
 
@@ -140,6 +141,12 @@ def main() -> None:
             linear = UncertainPlant("linear", plant.nominal, Linear(LinkUncertainty(scenario)))
             out(joint_line(f"{scenario}, parameters", controller, plant, specification, arguments.draws))
             out(joint_line(f"{scenario}, linear", controller, linear, specification, arguments.draws))
+        for scenario, controller in controllers.items():
+            plant, specification = flexible_link(scenario), flexible_link_specification(5)
+            many = gamma_of_draws(
+                controller, plant, specification, np.random.default_rng(CHECK_SEED + 1), MANY
+            )
+            out(f"{scenario}, parameters: {np.count_nonzero(~many.stable)} of {MANY} draws unstable")
         for seed in (0, 1, 3):
             plant, _, specification = random_case(seed)
             controller = synthesise(

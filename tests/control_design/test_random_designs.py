@@ -1,0 +1,59 @@
+"""Random plants of the benchmark are what they claim; a proved loop keeps its sampled plants stable."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from benchmarks.random_designs import (
+    LOW_EFFORT,
+    RADIUS,
+    SAMPLED,
+    random_case,
+    state_space,
+    unstable_samples,
+)
+from control_design import Controller, Specification, certify, synthesise
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_state_space_of_a_draw_is_the_posteriors_response_inside_the_ellipses(seed):
+    plant, posterior, _ = random_case(seed)
+    rng = np.random.default_rng(seed)
+    direction = rng.standard_normal(posterior.covariance_factor.shape[1])
+    direction *= RADIUS / np.linalg.norm(direction)
+    drawn = posterior.mean + posterior.covariance_factor @ direction
+    omega = np.geomspace(1.0, 0.99 * plant.nyquist_rad_s, 200)
+    expected = posterior.response_of(drawn[None, :], omega)[0]
+    system = state_space(posterior, drawn)
+    value = np.asarray(control.frequency_response(system, omega).complex).reshape(-1)
+    # (z - 1)^2 at 1 rad/s is 2.5e-5 of a difference of numbers of size 1
+    np.testing.assert_allclose(value, expected, rtol=1e-7, atol=1e-9 * np.max(np.abs(expected)))
+    # a point of the generators' ball lies in every ellipse; on the boundary of none or some
+    record = posterior.at(omega, 0.95)
+    assert np.max(record.normalised_distance(expected)) <= 1 + 1e-7
+
+
+def test_sampled_plants_of_a_proved_loop_are_stable_and_of_a_bad_one_are_not():
+    seed = 0
+    plant, posterior, _ = random_case(seed)
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    size = 1 / np.max(np.abs(posterior.centre(np.geomspace(0.1, 600, 2000))))
+    gentle, wild = (Controller(*none, [[share * size]], plant.dt_s) for share in (0.3, 100.0))
+    certificate = certify(gentle, [plant], Specification(modulus_margin=0.2), n_dense=1500)
+    assert certificate.plants[0].all_frequencies.proved
+    assert unstable_samples(gentle, posterior, np.random.default_rng(1)) == 0
+    assert unstable_samples(wild, posterior, np.random.default_rng(1)) == SAMPLED
+    assert not certify(wild, [plant], Specification(modulus_margin=0.2), n_dense=1500).certified
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_returned_designs_are_proved_and_their_sampled_plants_stable(seed):
+    plant, posterior, specification = random_case(seed)
+    result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
+    certificate = certify(result.controller, [plant], specification)
+    assert certificate.plants[0].all_frequencies.proved
+    assert certificate.gamma <= certificate.gamma_bound <= 1.005 * certificate.gamma
+    assert unstable_samples(result.controller, posterior, np.random.default_rng(seed)) == 0
