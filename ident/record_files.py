@@ -128,9 +128,10 @@ class Table:
         backwards = np.flatnonzero(~(interval > 0))
         if backwards.size:
             row = int(backwards[0]) + 1
+            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else "split the file there"
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
-                f"{stamps[row]:.9g} s; expected increasing time"
+                f"{stamps[row]:.9g} s; expected increasing time ({what})"
             )
         # The median says what the step is even where samples are lost; the mean over all is the better
         # estimate after.
@@ -138,10 +139,13 @@ class Table:
         uneven = np.flatnonzero(~(np.abs(interval - median) <= TIME_TOLERANCE * median))
         if uneven.size:
             row = int(uneven[0]) + 1
+            # A few wide steps are lost samples; many uneven ones are a clock that was read late now and then.
+            few = uneven.size <= 0.05 * interval.size
+            what = "samples are missing: split the file there" if few else "resample it to a uniform step"
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s "
                 f"where most steps are {median:.6g} s; expected uniform sampling (each step within "
-                f"{TIME_TOLERANCE:.0%})"
+                f"{TIME_TOLERANCE:.0%}; {uneven.size} of {interval.size} are not: {what})"
             )
         mean = float((stamps[-1] - stamps[0]) / interval.size)
         if dt_s is None:

@@ -159,6 +159,20 @@ def test_a_lost_sample_is_named(tmp_path):
     assert "within 1%" in message
 
 
+def test_what_to_do_about_time_stamps_is_said(tmp_path):
+    def said_of(stamps):
+        lines = [f"{t:.6f},{k % 3},{k % 5}" for k, t in enumerate(stamps)]
+        return complaint(write(tmp_path / "log.csv", [f"{T},{U},{Y}", *lines]))
+
+    even = np.arange(200) * 0.01
+    assert "take the repeated row out" in said_of(np.insert(even, 50, even[50]))
+    assert "split the file there" in said_of(np.concatenate([even, even]))
+    lost = said_of(np.delete(even, [70, 71]))
+    assert "1 of 197 are not: samples are missing: split the file there" in lost
+    jitter = said_of(even + 0.001 * np.random.default_rng(0).normal(size=200))
+    assert "resample it to a uniform step" in jitter
+
+
 @pytest.mark.parametrize("content", ["", "\n\n", f"{T},{U},{Y}\n"])
 def test_files_without_rows(tmp_path, content):
     path = tmp_path / "log.csv"
