@@ -38,13 +38,13 @@ HEADER = """
   radius       semi-major axis s1 of the 95 % ellipse (the enclosing disc) over |G|, median per band, in %
   mean radius  the same of sqrt(s1 s2)
   ratio        median over runs and frequencies of radius over actual error |G - centre|, three readings:
-               mean radius sqrt(s1 s2) (judged), radius in the direction of the error, semi-major axis; an exact
+               mean radius sqrt(s1 s2) (judged), radius in the direction of the error, semi-major axis; a
                circular Gaussian has 2.08 in all, the third grows with elongation however good the ellipse
   all inside   share of runs with ALL 150 frequencies inside: of the 95 % ellipses, and of the simultaneous
                bands (`joint_level`: 95 % of 1000 responses drawn from the posterior are inside everywhere;
                median squared radius beside it, 5.99 for one frequency)
-  order-4 nominal   disc |G - G_nom| <= rho with P = 95 % under the posterior (`offset_disc`), G_nom the least-
-               squares fit with 2 real poles and 1 pair, or that fit's poles placed by `nominal_near`
+  order-4 nominal   disc |G - G_nom| <= rho with P = 95 % under the posterior (`offset_disc`), G_nom the
+               fit with 2 real poles and 1 pair, or those poles placed by `nominal_near` as the workflow does
   order        how many pole pairs the data gave (pairs x runs)
   cpu          median process time of the identification and of the posterior, ms; the machine was shared
 """
@@ -61,6 +61,7 @@ class Case:
     overall: float | None = None
     worst: float | None = None
     is_main: bool = False
+    reported_only: bool = False
     coloured_noise: bool = False
 
 
@@ -92,10 +93,12 @@ CASES = {
     "fixed-1000": Case(
         "fixed plant, N = 1000, 30 dB", Setting(1000, 30.0), ("tangent", "no missed mode"), (87, 100)
     ),
-    "fixed-1000-40": Case("fixed plant, N = 1000, 40 dB", Setting(1000, 40.0)),
-    "fixed-4000-40": Case("fixed plant, N = 4000, 40 dB", Setting(4000, 40.0)),
-    "five": Case("five modes (also 48 and 75 Hz), N = 2000, 35 dB", Setting(n_modes=5)),
-    "five-4000-40": Case("five modes (also 48 and 75 Hz), N = 4000, 40 dB", Setting(4000, 40.0, n_modes=5)),
+    "fixed-1000-40": Case("fixed plant, N = 1000, 40 dB", Setting(1000, 40.0), reported_only=True),
+    "fixed-4000-40": Case("fixed plant, N = 4000, 40 dB", Setting(4000, 40.0), reported_only=True),
+    "five": Case("five modes (also 48 and 75 Hz), N = 2000, 35 dB", Setting(n_modes=5), reported_only=True),
+    "five-4000-40": Case(
+        "five modes (also 48 and 75 Hz), N = 4000, 40 dB", Setting(4000, 40.0, n_modes=5), reported_only=True
+    ),
     "initial-state": Case(
         "fixed plant, N = 2000, 35 dB, record cut out of a longer run", Setting(from_rest=False), overall=93
     ),
@@ -309,7 +312,9 @@ def main() -> None:
         for line in HEADER.strip().splitlines():
             out(line)
         for name in names:
-            runs = list(pool.map(one_run, [name] * len(seeds), seeds, chunksize=5))
+            # Cases without a number to reach get half the seeds.
+            some = seeds[: max(1, len(seeds) // 2)] if CASES[name].reported_only else seeds
+            runs = list(pool.map(one_run, [name] * len(some), some, chunksize=5))
             report(out, CASES[name], runs)
 
 

@@ -189,7 +189,7 @@ class ResponsePosterior:
     ) -> FrequencyUncertainty:
         """Ellipses that hold the whole response on omega (F,) at once with probability `level`.
 
-        Those of `at` at the `joint_level`: their squared radius is 12 to 13 where that of single ones is 5.99.
+        Those of `at` at the `joint_level`: their squared radius is 12 to 13 where that of one alone is 5.99.
         """
         return self.at(omega_rad_s, self.joint_level(omega_rad_s, level, rng, n_draws))
 
