@@ -157,6 +157,13 @@ def identify(
     delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
     feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
     level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
+    band: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Fit inside this band only [rad/s, low and high]: leaves out drift and friction below.",
+            show_default=False,
+        ),
+    ] = None,
     export: Annotated[
         Path | None,
         typer.Option(
@@ -190,6 +197,7 @@ def identify(
             validation=validation or [],
             options=options,
             level=level,
+            band_rad_s=band,
             out=out,
             report=report_page,
             export=export,

@@ -16,6 +16,7 @@ from ident.identify import Identification, identify
 from ident.model import GobfModel
 from ident.model_files import ModelFile
 from ident.options import IdentOptions
+from ident.prefilter import band_limited
 from ident.record import Record
 from ident.residual_tests import residual_advice
 from ident.stabilisation import Stabilisation, stabilisation
@@ -27,6 +28,7 @@ from workflow.progress import Progress, Silence
 from workflow.stages.identify import describe_model
 from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.stages.uncertainty import (
+    N_BANDS,
     band_row,
     bands_of,
     display_grid,
@@ -51,10 +53,10 @@ MODEL_SUFFIXES = (".json", ".mat")
 class LogIdentification:
     """Everything that was found in a set of logs.
 
-    `measured` are the records as read, `used` the same as the fit saw them (with the input that the
-    reference explains, where the logs come from a closed loop). `about` and `spread` are plain documents like
-    those of a run's stages; `careful` says what to look at, one sentence each. `plot` is None where nobody
-    asked for it.
+    `measured` are the records as read, `used` the same as the fit saw them (inside the band; with the input
+    that the reference explains, where the logs come from a closed loop). `about` and `spread` are plain
+    documents like those of a run's stages; `careful` says what to look at, one sentence each. `plot` is None
+    where nobody asked for it.
     """
 
     measured: tuple[Record, ...]
@@ -84,6 +86,7 @@ def identify_logs(
     validation: Sequence[Path] = (),
     options: IdentOptions | None = None,
     level: float = 0.95,
+    band_rad_s: tuple[float, float] | None = None,
     out: Path | None = None,
     report: Path | None = None,
     export: Path | None = None,
@@ -93,8 +96,8 @@ def identify_logs(
 
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
     or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
-    logs made in closed loop, for the two-stage method. Raises InputError: one line naming file, column or
-    line.
+    logs made in closed loop, for the two-stage method. band_rad_s: fit inside this band only, friction and
+    drift below it and noise above it left out. Raises InputError: one line naming file, column or line.
     """
     if not 0.5 < level < 1:
         raise InputError(f"--level must lie between 0.5 and 1, got {level}")
@@ -118,6 +121,7 @@ def identify_logs(
         common[len(measured) :],
         options,
         level=level,
+        band_rad_s=band_rad_s,
         with_plot=report is not None,
         progress=progress,
     )
@@ -142,6 +146,7 @@ def identify_records(
     options: IdentOptions | None = None,
     *,
     level: float = 0.95,
+    band_rad_s: tuple[float, float] | None = None,
     with_plot: bool = True,
     progress: Progress | None = None,
 ) -> LogIdentification:
@@ -151,11 +156,14 @@ def identify_records(
     closed loop. Raises InputError.
     """
     options, progress = options or IdentOptions(), progress or Silence()
-    used, opened = list(measured), None
     progress.start("identify")
     with naming("identify"):
+        used, opened = list(measured), None
+        if band_rad_s is not None:
+            used = [band_limited(record, *band_rad_s) for record in measured]
+            fresh_records = [band_limited(record, *band_rad_s) for record in fresh_records]
         if any(record.reference is not None for record in measured):
-            opened = two_stage(measured, options)
+            opened = two_stage(used, options)
             used = list(opened.records)
         share = 0.6 if with_plot else 1.0
         found = identify(used, options, progress=lambda f, m: progress.update("identify", share * f, m))
@@ -172,6 +180,12 @@ def identify_records(
         progress.start("uncertainty")
         posterior, tests = _posterior(used, found)
         omega = display_grid(found.model, used)
+        if band_rad_s is not None:
+            omega = omega[(omega >= band_rad_s[0]) & (omega <= band_rad_s[1])]
+            if omega.size < N_BANDS:
+                raise ValueError(
+                    f"the band {band_rad_s[0]:g} to {band_rad_s[1]:g} rad/s is too narrow to show"
+                )
         nominal = nominal_of(posterior, found.model.poles, omega)
         frequency = posterior.at(omega, level)
         spread = {
@@ -192,6 +206,7 @@ def identify_records(
         "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),
         "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
         "fit_repeat_percent": {},
+        "band_rad_s": band_rad_s,
         "two_stage": None if opened is None else opened.verdict,
     }
     return LogIdentification(
@@ -203,7 +218,9 @@ def identify_records(
         posterior=posterior,
         nominal=nominal,
         frequency=frequency,
-        empirical=empirical_response(used, integrators=found.model.integrators, level=level),
+        empirical=empirical_response(
+            used, integrators=found.model.integrators, level=level, band_rad_s=band_rad_s
+        ),
         fresh=fresh,
         plot=plot,
         about=about,

@@ -213,6 +213,26 @@ def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
     assert "The reference explains" in Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
 
 
+def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
+    """A random walk on the output: its power is at low frequency, below the band."""
+    truth = p2(4)
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(rng.normal(size=2000))
+    y = truth.record.output[:, 0] + 0.02 * walk * truth.clean.std() / walk.std()
+    log = write_log(tmp_path / "log.csv", truth.record.input[:, 0], y)
+    answer = flexlink(
+        *("identify", log, *COLUMNS, "--real", 2, "--pairs", 2, "--band", 8, 300, "--json"),
+        *("--report", tmp_path / "page.html"),
+    )
+    assert answer.code == 0, answer.err
+    numbers = json.loads(answer.out)["numbers"]
+    hertz = [mode["frequency_Hz"] for mode in numbers["modes"]]
+    assert hertz == pytest.approx(P2_HZ[:2], rel=0.01)
+    assert numbers["uncertainty"]["bands"][0]["from_rad_s"] >= 8
+    text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
+    assert "Fitted inside the band from 8 to 300 rad/s" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -223,6 +243,8 @@ def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
         (("--report", "{out}/a", "--out", "{out}/a"), "that is --out already"),
         (("--reference", "r"), "no column 'r'"),
         (("--level", "0.2"), "--level must lie between"),
+        (("--band", "50", "20"), "lower below upper"),
+        (("--band", "50", "2000"), "the band must lie in (0, 628"),
         (("--pairs", "12", "--report", "{out}/page.html"), "too few"),
     ],
 )

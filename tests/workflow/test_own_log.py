@@ -13,6 +13,7 @@ import pytest
 from plant import linear_arm
 from plant.presets import paper_link
 from tests.golden.margins import ROOT
+from workflow.log_identification import read_model
 
 
 @pytest.mark.slow
@@ -23,10 +24,13 @@ def test_readme_walkthrough_from_csv_files_to_a_certified_controller(flexlink, t
     first, second, third = sorted(logs.iterdir())
     columns = ["--input", "voltage_V", "--output", "hub_angle_rad", "--time", "time_s"]
     structure = ["--integrators", 1, "--delay", 1, "--real", 1, "--pairs", 2]
+    written = ["--report", tmp_path / "hub.html", "--export", tmp_path / "hub.mat", "--out", model]
     told = flexlink(
-        "identify", first, second, "--validation", third, *columns, *structure, "--out", model, "--json"
+        "identify", first, second, "--validation", third, *columns, *structure, *written, "--json"
     )
     assert told.code == 0
+    assert (tmp_path / "hub.html").is_file()
+    assert read_model(tmp_path / "hub.mat").model.output_name == "hub_angle_rad"
     # First mode of the arm behind the logs with its hub free, from the physical model alone.
     poles = linear_arm(paper_link()).poles_rad_s()
     flexible = min(abs(pole) for pole in poles if pole.imag > 10) / (2 * np.pi)

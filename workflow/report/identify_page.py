@@ -116,6 +116,12 @@ def _found(result: LogIdentification) -> list[str]:
         sentences.append(text + ".")
     if result.plot is not None:
         sentences.append(stabilisation_sentence(result.plot))
+    if about["band_rad_s"] is not None:
+        low, high = about["band_rad_s"]
+        sentences.append(
+            f"Fitted inside the band from {number(low)} to {number(high)} rad/s; nothing is said about the "
+            "rest."
+        )
     known = [] if options.integrators == 0 else [count(options.integrators, "integrator")]
     if options.input_delay_samples:
         known.append(f"a delay of {count(options.input_delay_samples, 'sample')}")
@@ -158,7 +164,8 @@ def _good(result: LogIdentification) -> list[str]:
     fits = about["fit_validation_percent"]
     if fits:
         each = listing([f"{percent(fit)} ({name})" for name, fit in fits.items()])
-        sentences.append(f"Run freely on fresh records, the model reproduces {each} of the output.")
+        inside = "" if about["band_rad_s"] is None else " inside the band"
+        sentences.append(f"Run freely on fresh records, the model reproduces {each} of the output{inside}.")
     used = listing([f"{percent(fit)} ({name})" for name, fit in about["fit_estimation_percent"].items()])
     sentences.append(f"On the records it was fitted to: {used}.")
     level = percent(100 * spread["level"], 4)
