@@ -154,7 +154,7 @@ def free_response(poles: Poles, n_samples: int) -> RealArray:
     return rows.T
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath={"contract"})
 def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
     """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
     output.
@@ -172,7 +172,7 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
                 v = signal[k]
                 out1[k] = x
                 signal[k] = b * x - a * v
-                x = a * x + b * v
+                x = b * v + a * x
             row += 1
         else:
             gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
@@ -186,7 +186,7 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
                 out1[k] = x1
                 out2[k] = x2
                 signal[k] = c1 * x1 + c2 * x2 + gamma * v
-                x1_next = gb * x1 - gs * x2 + sg * v
+                x1_next = (sg * v - gs * x2) + gb * x1
                 x2 = sb * x1 + beta * x2
                 x1 = x1_next
             row += 2

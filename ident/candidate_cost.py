@@ -57,7 +57,10 @@ class CandidateCost:
 
     def log(self, units: RealArray) -> RealArray:
         """log J (E,) at points (E, D), as DIRECT sees it."""
-        return np.log(np.maximum(self.rss(units), self._floor))
+        values = self.rss(units)
+        np.maximum(values, self._floor, out=values)
+        np.log(values, out=values)
+        return values
 
 
 def _against(frozen: Projection) -> RealArray:

@@ -129,7 +129,9 @@ def candidate_rss(
     gram = np.zeros((size, size))
     b = np.zeros(size)
     on_shared = np.zeros((size, shared_q.shape[0]))
-    _place(gram, _dots(phi, phi, 0, n_total), first, first)
+    for i in range(m):
+        for j in range(i + 1):  # the factorisation looks at the lower triangle only
+            gram[first + i, first + j] = _dot(phi[i], phi[j], 0, n_total)
     _place(on_shared, _dots(phi, shared_q, 0, n_total), first, 0)
     along = _dots(phi, signal, 0, n_total)
     for i in range(m):
