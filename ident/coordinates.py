@@ -69,6 +69,11 @@ class SearchSpace:
     def poles(self, unit: RealArray) -> Poles:
         """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =
         0.95."""
+        if not self.raw:
+            point = np.asarray(_coordinates_of_point(unit, self.n_real, self.low, self.high))
+            real, first, second = point[: self.n_real], point[self.n_real :: 2], point[self.n_real + 1 :: 2]
+            omega, zeta = 10.0**first, 10.0**second
+            return Poles(1 - 10.0**real, np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
         blocks = self.blocks(unit)
         gamma, beta = blocks[self.n_real :, 0], blocks[self.n_real :, 1]
         re = beta * (1 + gamma) / 2

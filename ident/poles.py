@@ -49,14 +49,15 @@ class Poles:
         object.__setattr__(self, "pairs", readonly_complex(self.pairs))
         if self.real.ndim != 1 or self.pairs.ndim != 1:
             raise ValueError(f"poles must be 1-d arrays; got shapes {self.real.shape} and {self.pairs.shape}")
-        for pole in (*self.real, *self.pairs):
-            if not abs(pole) < 1:
+        for poles in (self.real, self.pairs):
+            if not (np.abs(poles) < 1).all():
+                pole = next(pole for pole in poles if not abs(pole) < 1)
                 raise ValueError(
                     f"every pole must lie inside the unit circle; got {pole:.6g} (|p| = {abs(pole):.6g})"
                 )
-        for pole in self.pairs:
-            if not pole.imag > 0:
-                raise ValueError(f"a pair is given by its pole with positive imaginary part; got {pole:.6g}")
+        if not (self.pairs.imag > 0).all():
+            pole = next(pole for pole in self.pairs if not pole.imag > 0)
+            raise ValueError(f"a pair is given by its pole with positive imaginary part; got {pole:.6g}")
 
     @classmethod
     def from_values(cls, values: Iterable[complex]) -> Poles:
