@@ -406,7 +406,7 @@ def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -
     # (z - 1)^i (1 + L) is real at 0 and at Nyquist, and less than a quarter turn from its estimate there.
     turn += float(np.angle(start[0] * np.sign(start[0].real)) - np.angle(end[-1] * np.sign(end[-1].real)))
     turns = float(np.round(turn / np.pi))
-    half_turns = turns - integrators / 2.0
+    half_turns = turns - integrators / 2.0 + 0.0  # no minus sign on zero
     stable = turns == unstable + integrators
     reason = (
         "" if stable else f"1 + K c winds by {half_turns:g} half turns, not {unstable + integrators / 2:g}"
