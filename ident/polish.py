@@ -12,6 +12,7 @@ The unknowns are decay rates and angles, linear, so that a pole can reach the ci
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -75,9 +76,10 @@ class Bounds:
 
     def clip_parameters(self, x: RealArray, n_free_real: int) -> RealArray:
         """Unknowns (1 - a; s, f) inside the bounds."""
-        return np.asarray(clip_parameters(x, n_free_real, self.as_array()))
+        return np.asarray(clip_parameters(x, n_free_real, self.array))
 
-    def as_array(self) -> RealArray:
+    @cached_property
+    def array(self) -> RealArray:
         """In the order of the fields, as `ident.descent` takes them."""
         return np.array([getattr(self, field.name) for field in fields(self)])
 
@@ -113,7 +115,7 @@ def polish(
         pairs,
         n_fixed_real,
         n_fixed_pairs,
-        bounds.as_array(),
+        bounds.array,
         data.u,
         data.y,
         data.y_clear,
@@ -149,7 +151,7 @@ def free_optimality(
     if x.size == 0 or here.rss <= 0:
         return 0.0
     normal, gradient = pole_system(here, poles, n_fixed_real, n_fixed_pairs)
-    free = np.flatnonzero(~blocked(x, gradient, poles.real.size - n_fixed_real, bounds.as_array()))
+    free = np.flatnonzero(~blocked(x, gradient, poles.real.size - n_fixed_real, bounds.array))
     scale = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
     slope = gradient[free] / scale
     share = (
