@@ -160,6 +160,14 @@ def identify_records(
     with naming("identify"):
         used, opened = list(measured), None
         if band_rad_s is not None:
+            # A pair far outside the band could only describe the filter's skirts.
+            options = options.model_copy(
+                update={
+                    "omega_min_rad_s": options.omega_min_rad_s or band_rad_s[0] / 2,
+                    "omega_max_rad_s": options.omega_max_rad_s
+                    or min(2 * band_rad_s[1], 0.9 * np.pi / measured[0].dt_s),
+                }
+            )
             used = [band_limited(record, *band_rad_s) for record in measured]
             fresh_records = [band_limited(record, *band_rad_s) for record in fresh_records]
         if any(record.reference is not None for record in measured):

@@ -123,9 +123,9 @@ def stabilisation_plot() -> Stabilisation:
         chosen=2,
         n_pairs=np.repeat([1, 2, 3, 4], [1, 2, 3, 4]),
         omega_rad_s=np.array([14.1, 14.0, 62.0, 14.0, 40.0, 62.1, 5.0, 14.0, 40.1, 62.0]),
-        zeta=np.array([0.06, 0.05, 0.015, 0.05, 0.01, 0.0151, 0.3, 0.05, 0.02, 0.0149]),
+        zeta=np.array([0.06, 0.05, 0.015, 0.05, 0.01, 0.0151, 0.3, 0.05, 0.01, 0.0149]),
         previous=np.array([-1, 0, -1, 1, -1, 2, -1, 3, 4, 5]),
-        same_damping=np.array([False, False, False, True, False, True, False, True, False, True]),
+        same_damping=np.array([False, False, False, True, False, True, False, True, True, True]),
         needed=np.array([True, True, True, True, False, True, False, True, False, True]),
     )
 
