@@ -25,7 +25,7 @@ def pitch_of(n_samples: int) -> int:
 
 @numba.njit(cache=True)
 def _coefficients(blocks: Any, n_real: int, first: int) -> Any:
-    """Recursions of up to eight blocks (7, WIDTH) flat: x1' = c0 x1 - c1 x2 + c2 v, x2' = c3 x1 + c4 x2,
+    """Recursions of up to eight blocks (8, WIDTH) flat: x1' = c0 x1 - c1 x2 + c2 v, x2' = c3 x1 + c4 x2,
     all-pass output c5 x2 - c6 x1 + c7 v. A real block is one with x2 = 0; lanes without a block stay at 0."""
     c = np.zeros(8 * WIDTH)
     for lane in range(min(WIDTH, blocks.shape[0] - first)):
