@@ -95,8 +95,9 @@ def test_fast_margins_agree_with_the_score(s_length):
         exact = margins(law_of(row, s_length))
         slow = [exact[item] for item in ITEMS if item != "integrator"]
         for item, f, s in zip([i for i in ITEMS if i != "integrator"], fast, slow, strict=True):
-            # Grids: 0.025 Hz against 0.01 Hz; rejection is interpolated, and asked at 0.098,.
-            # so that it may be late by a swing that the score passes over.
+            # Grids: 0.025 Hz against 0.01 Hz. Rejection is interpolated and asked at 0.098, so that it may be
+            # late
+            # by a swing that the score passes over.
             if item == "rejection_s":
                 assert -0.5 < f <= s + 1e-9
                 continue

@@ -1,0 +1,219 @@
+"""Two masses and a spring (Wie and Bernstein): peaks of S and T over the stiffness range, at published gains.
+
+    OMP_NUM_THREADS=1 python -m benchmarks.two_mass [--seeds 1 2 3] [--no-write]
+
+P = k/(s^2 (s^2 + 2 k)), m1 = m2 = 1, k in [0.5, 2]; DC gain of K at least 0.032, high-frequency |s K| at most
+0.08,
+as for Chait's QFT design 0.032 (10 s + 1)/(4 s^2 + 2 s + 1). Direct search of the continuous-time controller
+on 13
+stiffnesses, then the peaks over 100 log-spaced ones, refined between frequencies. The structured synthesis of
+this
+project is discrete-time and has no weight on T; it is not used here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import differential_evolution, minimize
+
+from benchmarks.results_file import ResultsFile
+
+DC_GAIN, HIGH_GAIN = 0.032, 0.08
+STIFFNESS = np.geomspace(0.5, 2.0, 100)
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """K = numerator/denominator, highest power first, denominator monic."""
+
+    numerator: np.ndarray
+    denominator: np.ndarray
+
+    @property
+    def dc_gain(self) -> float:
+        return float(self.numerator[-1] / self.denominator[-1])
+
+    @property
+    def high_gain(self) -> float:
+        """lim |s K|."""
+        short = self.denominator.size - self.numerator.size
+        return float(abs(self.numerator[0])) if short == 1 else 0.0
+
+
+CHAIT = Design(0.032 * np.array([10.0, 1.0]) / 4, np.array([4.0, 2.0, 1.0]) / 4)
+
+
+def peaks(
+    numerator: np.ndarray, denominator: np.ndarray, stiffness: np.ndarray, omega: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(max|S|, max|T|) (P,) over stiffness and omega, numerators (P, m), denominators (P, n); inf if
+    unstable."""
+    count, order = denominator.shape[0], denominator.shape[1] - 1
+    s = 1j * omega
+    n = _polyval(numerator, s)[:, None]
+    d = _polyval(denominator, s)[:, None]
+    k = stiffness[None, :, None]
+    open_part = s**2 * (s**2 + 2 * k) * d
+    closed = open_part + k * n
+    with np.errstate(divide="ignore"):
+        s_peak = np.max(np.abs(open_part / closed), axis=2)
+        t_peak = np.max(np.abs(k * n / closed), axis=2)
+    full = np.zeros((count, stiffness.size, order + 5))
+    full[:, :, : order + 1] += denominator[:, None, :]
+    full[:, :, 2 : order + 3] += 2 * stiffness[None, :, None] * denominator[:, None, :]
+    full[:, :, order + 5 - numerator.shape[1] :] += stiffness[None, :, None] * numerator[:, None, :]
+    companion = np.zeros((count, stiffness.size, order + 4, order + 4))
+    companion[:, :, 0] = -full[:, :, 1:]
+    companion[:, :, np.arange(1, order + 4), np.arange(order + 3)] = 1.0
+    unstable = np.max(np.linalg.eigvals(companion).real, axis=2) >= 0
+    s_peak[unstable] = t_peak[unstable] = np.inf
+    return s_peak, t_peak
+
+
+def dense_peaks(design: Design, stiffness: np.ndarray = STIFFNESS) -> tuple[float, float]:
+    """(max|S|, max|T|) on 4000 frequencies, refined ten times around the largest values of every
+    stiffness."""
+    worst = [0.0, 0.0]
+    omega = np.geomspace(1e-3, 1e3, 4000)
+    for k in stiffness:
+        for which in (0, 1):
+            grid = omega
+            for _ in range(3):
+                value = np.abs(_responses(design, float(k), grid)[which])
+                at = int(np.argmax(value))
+                grid = np.linspace(grid[max(at - 1, 0)], grid[min(at + 1, grid.size - 1)], 41)
+            worst[which] = max(worst[which], float(np.max(value)))
+    stable = np.isfinite(peaks(design.numerator[None], design.denominator[None], stiffness, omega[:2])[0])
+    if not np.all(stable):
+        return np.inf, np.inf
+    return worst[0], worst[1]
+
+
+def design_of(x: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Numerators and denominators (P, .) of search points x (P, 4 or 6).
+
+    x: log frequency and log damping of the pole pair, log DC gain over its limit, leading numerator
+    coefficient as
+    share of its limit; for order 3 also log of the real pole and the middle numerator coefficient.
+    """
+    frequency, damping = np.exp(x[:, 0]), np.exp(x[:, 1])
+    denominator = np.stack([np.ones_like(frequency), 2 * damping * frequency, frequency**2], axis=1)
+    gain = DC_GAIN * np.exp(x[:, 2])
+    lead = HIGH_GAIN * x[:, 3]
+    if order == 2:
+        return np.stack([lead, gain * denominator[:, -1]], axis=1), denominator
+    pole = np.exp(x[:, 4])[:, None]
+    longer = np.pad(denominator, ((0, 0), (0, 1))) + pole * np.pad(denominator, ((0, 0), (1, 0)))
+    return np.stack([lead, x[:, 5], gain * longer[:, -1]], axis=1), longer
+
+
+def optimised(order: int, seed: int) -> Design:
+    """Smallest larger peak by differential evolution, polished by SLSQP."""
+    stiffness, omega = np.geomspace(0.5, 2.0, 13), np.geomspace(0.02, 20, 220)
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        points = np.atleast_2d(x.T)
+        s_peak, t_peak = peaks(*design_of(points, order), stiffness, omega)
+        return np.minimum(np.max(np.maximum(s_peak, t_peak), axis=1), 1e3)
+
+    bounds = [(np.log(0.05), np.log(5)), (np.log(0.05), np.log(3)), (0.0, 1.0), (-1.0, 1.0)]
+    if order == 3:
+        bounds += [(np.log(0.1), np.log(10)), (-0.5, 0.5)]
+    found = differential_evolution(
+        cost,
+        bounds,
+        vectorized=True,
+        updating="deferred",
+        popsize=12,
+        maxiter=120,
+        polish=False,
+        tol=0.0,
+        atol=1e-5,
+        rng=np.random.default_rng(seed),
+    )
+    low, high = np.array(bounds).T
+    fine = np.geomspace(0.02, 20, 1500)
+
+    def all_peaks(x: np.ndarray) -> np.ndarray:
+        """(P, 26) of x (P, n)."""
+        both = peaks(*design_of(np.clip(x, low, high), order), stiffness, fine)
+        return np.minimum(np.concatenate(both, axis=1), 1e3)
+
+    def room(v: np.ndarray) -> np.ndarray:
+        return v[-1] - all_peaks(v[None, :-1])[0]
+
+    def room_slope(v: np.ndarray) -> np.ndarray:
+        step = 1e-6 * np.eye(v.size - 1)
+        moved = all_peaks(np.concatenate([v[:-1] + step, v[:-1] - step]))
+        slope = (moved[: v.size - 1] - moved[v.size - 1 :]).T / 2e-6
+        return np.hstack([-slope, np.ones((slope.shape[0], 1))])
+
+    # Smallest bound over all 26 peaks: smooth constraints, where the largest peak itself has kinks. Several
+    # members
+    # of the last population, because the valley of order 3 is long and has more than one end.
+    order_of = np.argsort(found.population_energies)
+    candidates = [found.population[i] for i in order_of[:: max(1, order_of.size // 12)][:6]]
+    for start in list(candidates):
+        answer = minimize(
+            lambda v: v[-1],
+            np.append(start, cost(start[:, None])[0]),
+            jac=lambda v: np.append(np.zeros(v.size - 1), 1.0),
+            method="SLSQP",
+            bounds=[*bounds, (1.0, 1e3)],
+            constraints={"type": "ineq", "fun": room, "jac": room_slope},
+            options={"maxiter": 120, "ftol": 1e-9},
+        )
+        candidates.append(np.clip(answer.x[:-1], low, high))
+    best = candidates[int(np.argmin(np.max(all_peaks(np.stack(candidates)), axis=1)))]
+    numerator, denominator = design_of(best[None], order)
+    return Design(numerator[0], denominator[0])
+
+
+def _polyval(coefficients: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Rows (P, n), highest power first, at s (F,): (P, F)."""
+    value = np.zeros((coefficients.shape[0], s.size), complex)
+    for column in coefficients.T:
+        value = value * s + column[:, None]
+    return value
+
+
+def _responses(design: Design, k: float, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    s = 1j * omega
+    n, d = np.polyval(design.numerator, s), np.polyval(design.denominator, s)
+    open_part = s**2 * (s**2 + 2 * k) * d
+    return open_part / (open_part + k * n), k * n / (open_part + k * n)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--no-write", action="store_true")
+    arguments = parser.parse_args()
+    with ResultsFile(
+        "two_mass", seeds=" ".join(map(str, arguments.seeds)), write=not arguments.no_write
+    ) as out:
+        s_peak, t_peak = dense_peaks(CHAIT)
+        out("Peaks over 100 log-spaced k in [0.5, 2]; DC gain >= 0.032, high-frequency |s K| <= 0.08.")
+        out(f"Chait: max|S| {s_peak:.3f} (published 2.191), max|T| {t_peak:.3f} (published 1.618)")
+        out("order  seed  max|S|  max|T|  larger  reach    DC gain  |s K|   CPU s  numerator / denominator")
+        for order, reach in ((2, 1.79), (3, 1.62)):
+            for seed in arguments.seeds:
+                begin = time.process_time()
+                design = optimised(order, seed)
+                spent = time.process_time() - begin
+                s_peak, t_peak = dense_peaks(design)
+                out(
+                    f"{order:>5}  {seed:>4}  {s_peak:>6.3f}  {t_peak:>6.3f}  {max(s_peak, t_peak):>6.4f}"
+                    f"  <= {reach:.2f}  {design.dc_gain:.5f}  {design.high_gain:.5f}  {spent:>5.1f}"
+                    f"  {np.round(design.numerator, 6).tolist()} / {np.round(design.denominator, 6).tolist()}"
+                )
+
+
+if __name__ == "__main__":
+    main()
