@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from ident.arrays import RealArray
-from ident.least_squares import fit, linearisation
+from ident.least_squares import linearisation
 from ident.model import GobfModel
 from ident.order_selection import effective_samples
 from ident.poles import Poles
@@ -225,7 +225,7 @@ def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
     without = Poles(np.delete(poles.real, index), poles.pairs)
     if not data.n_samples > with_lines.n_parameters(without.order):
         return False
-    return fit(with_lines, without).rss <= _AS_WELL * fit(data, poles).rss
+    return linearisation(with_lines, without).rss <= _AS_WELL * linearisation(data, poles).rss
 
 
 def _far_from_zero(records: Sequence[Record], data: Regression) -> list[str]:
