@@ -25,7 +25,7 @@ from control_design.frequency_grid import starting_edges
 from control_design.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.rational_response import RationalResponse
 from control_design.rational_weights import effort_weight, tracking_weight
-from control_design.set_expansion import ExactSet, ExpandableSet, SetExpansion, expandable
+from control_design.set_expansion import ExpandableSet, OwnGridSet, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.stability import loop_integrators
 from control_design.worst_case import KINDS, WorstCase
@@ -275,8 +275,8 @@ def bound_all_frequencies(
     Notes
     -----
     Neglected: rounding errors of double precision, also those of the zeros and poles computed from the state
-    spaces (the responses so represented are compared with the state spaces on the first partition, and the
-    proof is refused beyond a relative difference of 1e-6).
+    spaces (the responses and ellipses so represented are compared with those of the dense check on the first
+    partition, and the proof is refused beyond a relative difference of 1e-6).
     """
     own, unstable = loop_integrators(controller, plant)
     own -= plant.n_integrators
@@ -315,7 +315,7 @@ def bound_all_frequencies(
     difference = _model_error(loop, controller, edges[1:])
     if difference > _MODEL_ERROR:
         return AllFrequencies.nothing(
-            f"zeros and poles reproduce the responses only to {difference:.1e} (ill-conditioned state space)"
+            f"zeros, poles and generators reproduce responses and ellipses only to {difference:.1e}"
         )
     targets = {}
     for kind in KINDS:
@@ -336,18 +336,27 @@ def bound_all_frequencies(
 
 
 def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
-    """Largest relative difference of the gain-zero-pole forms from the state spaces at omega (F,)."""
-    pairs = [(loop.controller, controller.to_control())]
+    """Largest relative difference at omega (F,) of the forms used here from the state spaces and from the
+    ellipses the dense check uses (centre by its size, shape by its trace and the centre)."""
+    largest = _difference(loop.controller.at(omega), frequency_response(controller.to_control(), omega))
     for members, channel in ((loop.members, loop.plant.channel), (loop.performance, loop.plant.performance)):
-        if isinstance(members, ExactSet) and channel is not None:
-            pairs.append((members.response, channel.nominal))
-    largest = 0.0
-    for form, system in pairs:
-        value = frequency_response(system, omega)
-        difference = np.abs(form.at(omega) - value)
-        scale = np.maximum(np.abs(value), 1e-9 * np.max(np.abs(value)) + 1e-300)
-        largest = max(largest, float(np.max(difference / scale)))
+        if members is None or channel is None or isinstance(members, OwnGridSet):
+            continue
+        given = channel.at(omega)
+        expansion = members.expand(Intervals(omega, np.zeros(omega.size), loop.plant.dt_s), 0)
+        largest = max(largest, _difference(expansion.centre.value, given.centre))
+        major, minor = given.direction * given.semi_major, 1j * given.direction * given.semi_minor
+        rows = np.stack([[major.real, minor.real], [major.imag, minor.imag]]).transpose(2, 0, 1)
+        shape = rows @ np.swapaxes(rows, 1, 2)
+        size = np.trace(shape, axis1=1, axis2=2) + 1e-12 * np.abs(given.centre) ** 2 + 1e-300
+        off = np.max(np.abs(expansion.gram() - shape), axis=(1, 2))
+        largest = max(largest, float(np.max(off / size)))
     return largest
+
+
+def _difference(form: Complex, value: Complex) -> float:
+    scale = np.maximum(np.abs(value), 1e-9 * np.max(np.abs(value)) + 1e-300)
+    return float(np.max(np.abs(form - value) / scale))
 
 
 def _bisect(

@@ -221,6 +221,20 @@ def test_what_cannot_be_bounded_says_so_and_stands_on_the_grid():
     assert assumed.gamma * (1 - 1e-12) <= proof.gamma
 
 
+def test_generators_that_are_not_those_of_the_ellipses_are_refused():
+    class Wrong(RationalDisc):
+        def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+            centre, generators = super().first_order(intervals, cleared)
+            return centre, generators.scaled(0.9)
+
+    system = hub_arm()
+    plant = UncertainPlant("wrong", system, Wrong(system, 1, 0.02, 60.0))
+    certificate = certify(_controller(0.0, 0.0, 0.0, 0.3), [plant], Specification(modulus_margin=0.3))
+    proof = certificate.plants[0].all_frequencies
+    assert not proof.possible
+    assert "reproduce responses and ellipses only to" in proof.reason
+
+
 def test_exact_plants_are_bounded_and_unstable_loops_are_refuted():
     system = hub_arm()
     plant, spec = UncertainPlant("exact", system), Specification(modulus_margin=0.3)
