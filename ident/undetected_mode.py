@@ -25,7 +25,7 @@ import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
 from ident.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
-from ident.basis import basis_response, block_parameters, run_cascade
+from ident.basis import basis_response, block_parameters
 from ident.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
@@ -54,7 +54,8 @@ _LARGEST_ENERGY = 1e6
 _LEAST_PROBABILITY = 0.05
 _NEGLIGIBLE = 1e-4
 _MOST_PAIRS = 12
-_CHUNK = 64
+# Samples that are held at a time: a few megabytes, whatever the length of the records.
+_BLOCK = 512
 # Shares of a pair's columns (in energy) that are rounding, and that make it a hypothesis of its own.
 _ROUNDING = 1e-9
 _DISTINGUISHABLE = 1e-6
@@ -156,9 +157,9 @@ def candidate_pairs(n_samples: int) -> CandidatePairs:
 def pair_statistics(
     blocks: Iterable[PairBlock], reduced: ReducedRegression, poles: ComplexArray
 ) -> PairStatistics:
-    """One pass over the records; memory that of a few columns, time O(N J (p + n))."""
+    """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs."""
     q = reduced.n_regressors
-    gram = np.zeros((poles.size, 3))
+    gram = np.zeros((3, poles.size))
     inner, size = np.zeros((2 * poles.size, q + 1)), np.zeros(poles.size)
     parameters = block_parameters(Poles(np.zeros(0), poles))
     scale = np.linalg.norm(reduced.r11, axis=0)
@@ -171,49 +172,62 @@ def pair_statistics(
         q1 = solve_triangular((reduced.r11 / scale).T, (regressors / scale).T, lower=True).T
         others = np.ascontiguousarray(np.column_stack([basis, q1, output - q1 @ reduced.r1]))
         n = basis.shape[1]
-        for start in range(0, poles.size, _CHUNK):
-            part = slice(start, min(start + _CHUNK, poles.size))
-            rows = _pair_rows(parameters[part], block.signal)
-            if block.head.size:
-                rows[:, : block.head.size] = _pair_rows(parameters[part], block.head) @ block.first.T
-            products = rows @ others
-            size[part] += np.sum(rows.reshape(-1, 2 * rows.shape[1]) ** 2, axis=1)
-            gram[part] += _pair_gram(rows, np.ascontiguousarray(products[:, :n]))
-            inner[2 * part.start : 2 * part.stop] += products[:, n:]
+        products = np.zeros((others.shape[1], 2 * poles.size))
+        gram_here, states = np.zeros((3, poles.size)), np.zeros((2, poles.size))
+        for start in range(0, block.signal.size, _BLOCK):
+            part = slice(start, start + _BLOCK)
+            x1, x2 = _pair_rows(parameters, np.ascontiguousarray(block.signal[part]), states)
+            if start == 0 and block.head.size:
+                plain = _pair_rows(parameters, block.head, np.zeros((2, poles.size)))
+                x1[: block.head.size], x2[: block.head.size] = (block.first @ x for x in plain)
+            gram_here += _pair_gram(x1, x2)
+            products[:, 0::2] += others[part].T @ x1
+            products[:, 1::2] += others[part].T @ x2
+        size += gram_here[0] + gram_here[2]
+        first, second = products[:n, 0::2], products[:n, 1::2]
+        gram += gram_here - np.stack([np.sum(first**2, 0), np.sum(first * second, 0), np.sum(second**2, 0)])
+        inner += products[n:].T
     onto = inner[:, :q].reshape(-1, 2, q).transpose(0, 2, 1)
-    matrices = gram[:, [0, 1, 1, 2]].reshape(-1, 2, 2) - onto.transpose(0, 2, 1) @ onto
+    matrices = gram[[0, 1, 1, 2]].T.reshape(-1, 2, 2) - onto.transpose(0, 2, 1) @ onto
     residual = reduced.rest + float(reduced.z @ reduced.z)
     return PairStatistics(matrices, inner[:, q].reshape(-1, 2), onto, residual, size)
 
 
-@numba.njit(cache=True)
-def _pair_rows(parameters: Any, signal: Any) -> Any:
-    """Two basis functions of every pair alone, driven by the signal (T,): rows (2 J, T)."""
-    rows = np.empty((2 * parameters.shape[0], signal.size))
-    work = np.empty(signal.size)
-    for i in range(parameters.shape[0]):
-        work[:] = signal
-        run_cascade(parameters[i : i + 1], 0, work, rows, 2 * i, 0, signal.size)
-    return rows
+@numba.njit(cache=True, fastmath=True)
+def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
+    """The two basis functions of every pair alone, driven by the signal (T,): two arrays (T,J).
+
+    states (2,J) is where the pairs start, and afterwards where they stand. All pairs advance together, sample
+    by sample: neighbours in memory, which the processor takes four or eight at a time.
+    """
+    n_pairs = parameters.shape[0]
+    gb, gs = parameters[:, 0] * parameters[:, 1], parameters[:, 0] * parameters[:, 3]
+    beta, sg, sb = parameters[:, 1].copy(), parameters[:, 2].copy(), parameters[:, 3].copy()
+    out1, out2 = np.empty((signal.size, n_pairs)), np.empty((signal.size, n_pairs))
+    a, b = states[0], states[1]
+    for k in range(signal.size):
+        v = signal[k]
+        row1, row2 = out1[k], out2[k]
+        for i in range(n_pairs):
+            p, q = a[i], b[i]
+            row1[i] = p
+            row2[i] = q
+            a[i] = gb[i] * p - gs[i] * q + sg[i] * v
+            b[i] = sb[i] * p + beta[i] * q
+    return out1, out2
 
 
 @numba.njit(cache=True, fastmath=True)
-def _pair_gram(rows: Any, on_nuisance: Any) -> Any:
-    """Entries (0,0), (0,1), (1,1) of X^T X for every pair, the nuisance part taken off; (J, 3)."""
-    out = np.empty((rows.shape[0] // 2, 3))
-    for i in range(out.shape[0]):
-        a, b = rows[2 * i], rows[2 * i + 1]
-        aa, ab, bb = 0.0, 0.0, 0.0
-        for k in range(a.size):
-            aa += a[k] * a[k]
-            ab += a[k] * b[k]
-            bb += b[k] * b[k]
-        for k in range(on_nuisance.shape[1]):
-            c, d = on_nuisance[2 * i, k], on_nuisance[2 * i + 1, k]
-            aa -= c * c
-            ab -= c * d
-            bb -= d * d
-        out[i, 0], out[i, 1], out[i, 2] = aa, ab, bb
+def _pair_gram(x1: Any, x2: Any) -> Any:
+    """Entries (0,0), (0,1), (1,1) of X^T X for every pair; (3, J)."""
+    out = np.zeros((3, x1.shape[1]))
+    aa, ab, bb = out[0], out[1], out[2]
+    for k in range(x1.shape[0]):
+        p, q = x1[k], x2[k]
+        for i in range(p.size):
+            aa[i] += p[i] * p[i]
+            ab[i] += p[i] * q[i]
+            bb[i] += q[i] * q[i]
     return out
 
 
