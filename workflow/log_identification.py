@@ -46,6 +46,9 @@ from workflow.summary import Row, RunSummary, Section, channel_rows, uncertainty
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
 
+# A first stage that explains less of the input than this has gone wrong.
+_EXPLAINED_PERCENT = 50.0
+
 MODEL_SUFFIXES = (".json", ".mat")
 
 
@@ -171,7 +174,13 @@ def identify_records(
             used = [band_limited(record, *band_rad_s) for record in measured]
             fresh_records = [band_limited(record, *band_rad_s) for record in fresh_records]
         if any(record.reference is not None for record in measured):
-            opened = two_stage(used, options)
+            # The first stage runs its model from rest, so it has to be fitted as from rest: free responses
+            # that it estimated would be missing in the input it makes.
+            opened = two_stage(
+                used,
+                options.model_copy(update={"estimate_initial_state": False}),
+                EmbeddingOptions(estimate_initial_state=False),
+            )
             used = list(opened.records)
         share = 0.6 if with_plot else 1.0
         found = identify(used, options, progress=lambda f, m: progress.update("identify", share * f, m))
@@ -268,10 +277,16 @@ def _first_stage_error(opened: TwoStage | None, omega_rad_s: RealArray) -> list[
     if opened is None:
         return []
     error = 100 * float(np.median(opened.relative_error(omega_rad_s)))
+    explained = min(opened.fit_percent)
+    lost = [
+        f"the reference explains only {explained:.3g} % of the input: what is made of it is not to be relied "
+        "on; check the reference column, start the records at rest, or fit within a band"
+    ]
     return [
+        *(lost if explained < _EXPLAINED_PERCENT else []),
         "the logs come from a closed loop: the error of the first stage (reference to input, a standard "
         f"deviation of {error:.2g} % of the response in the median) is in no ellipse; with four records or "
-        "more, uncertainty.method = 'records' of flexlink run takes it from their scatter"
+        "more, uncertainty.method = 'records' of flexlink run takes it from their scatter",
     ]
 
 
