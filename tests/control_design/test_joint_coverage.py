@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from control_design import Certificate, Controller, Specification, UncertainPlant, certify
-from control_design.example_plants import flexible_link, flexible_link_specification
+from control_design import Certificate, Channel, Controller, Specification, UncertainPlant, certify
+from control_design.example_plants import ResponseRecord, flexible_link, flexible_link_specification
+from control_design.first_order import FirstOrder, Intervals
 from control_design.joint_coverage import JointCoverage, gamma_of_draws, joint_coverage
+from control_design.rational_response import RationalResponse
+from control_design.set_expansion import stacked
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
 
-from .plants import RelativeDisc, hub_arm
+from .plants import RelativeDisc, hub_arm, tip_acceleration
 
 _DT = 0.005
 
@@ -100,6 +103,50 @@ def test_certificate_uses_the_calibrated_level_and_says_so():
     # A level under the given one changes gamma's statement, not the ellipses that are checked.
     low = certify(_gain(6.0), [plant], spec, joint_coverage=0.6, rng=np.random.default_rng(0))
     assert low.gamma == plain.gamma > low.joint.gamma
+
+
+def test_performance_channel_and_several_plants_are_drawn_together():
+    system, tip = hub_arm(), tip_acceleration()
+    measured, performed = (GaussianGain(g, n, 0.05) for g, n in ((system, 1), (tip, 0)))
+    arm = UncertainPlant("arm", system, measured, performance=Channel(tip, performed))
+    spec = Specification(modulus_margin=0.3, mode_peak_ratio=0.9)
+    controller = _gain(0.3)
+    one = joint_coverage(controller, [arm], spec, rng=np.random.default_rng(3), draws=3000)
+    fresh = gamma_of_draws(controller, arm, spec, np.random.default_rng(4), 3000)
+    # binomial, both sides: 0.56 %; four of it
+    assert np.mean(fresh.gamma <= one.gamma) == pytest.approx(0.95, abs=0.023)
+    # The damping weight rules: gamma is W4 |Gp| |S| at the peak, Gp drawn apart from G.
+    centre = gamma_of_draws(
+        controller,
+        UncertainPlant("exact", system, performance=Channel(tip)),
+        spec,
+        np.random.default_rng(0),
+        1,
+    )
+    assert one.gamma > centre.gamma[0]
+    # Twice the same plant, drawn independently: P(max <= q) = P(gamma <= q)^2, so the quantile moves up.
+    two = joint_coverage(controller, [arm, arm], spec, rng=np.random.default_rng(3), draws=3000)
+    wanted = np.quantile(fresh.gamma, np.sqrt(0.95))
+    # the density of gamma near its 97 % quantile: 0.3 % of gamma is 0.5 % of probability
+    assert two.gamma == pytest.approx(wanted, rel=5e-3)
+    assert two.gamma > one.gamma
+
+
+class GaussianGain:
+    """G (1 + std x), x normal: one generator."""
+
+    def __init__(self, system: control.StateSpace, integrators: int, std: float) -> None:
+        self.system, self.std = system, std
+        self.form = RationalResponse.from_state_space(system, integrators)
+
+    def at(self, omega_rad_s: np.ndarray, level: float) -> ResponseRecord:
+        centre = self.form.at(omega_rad_s)
+        row = np.stack([centre.real, centre.imag], axis=1) * self.std
+        return ResponseRecord(omega_rad_s, centre, row[:, :, None] * row[:, None, :], level)
+
+    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+        centre = self.form.expand(intervals, cleared)
+        return centre, stacked([centre.scaled(self.std)])
 
 
 def test_what_cannot_be_drawn_from_is_refused():
