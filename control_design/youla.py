@@ -51,14 +51,16 @@ class YoulaOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
-    pairs_per_mode: int = Field(default=12, ge=1, le=50, description="pole pairs of the basis at every mode")
+    pairs_per_mode: int = Field(
+        default=12, ge=1, le=50, description="pole pairs of the basis at every mode and light zero"
+    )
     grid_points: int = Field(default=200, ge=20, le=2000, description="logarithmic points of the programme")
     mode_points: int = Field(
         default=100, ge=0, le=1000, description="points spread around the flexible modes"
     )
     dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
     omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
-    exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")
+    exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
     ellipse_rounds: int = Field(default=20, ge=1, le=100, description="turns of angles and Q for the ellipse")
 
 
@@ -202,13 +204,13 @@ class _Bracket:
             max(2, self.options.real_poles // 2),
             max(1, self.options.pairs_per_mode // 2),
         )
-        lean = self.problem.lean()[0]
-        half = smallest_ratio(self._basis(lean, coarse), self._rows(lean, "enclosing"))
         enclosing, _, x = self._exchanged("enclosing", None)
         # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
         # inscribed.
         inscribed, grid_value, x_inscribed = self._exchanged("inscribed", None)
         ellipse, _, _ = self._exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
+        lean = self.problem.lean()[0]  # with all frequencies that the exchange has added
+        half = smallest_ratio(self._basis(lean, coarse), self._rows(lean, "enclosing"))
         offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
         exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
         ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region

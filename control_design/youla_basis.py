@@ -9,25 +9,29 @@ import numpy as np
 import scipy.linalg
 
 from control_design.ellipses import Complex, Real
-from control_design.plant_set import UncertainPlant, frequency_response
+from control_design.plant_set import UncertainPlant, frequency_response, modes_of
 
 
 def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Complex:
-    """Poles that reach everywhere the answer may need them: real ones spread logarithmically from the slowest
-    corner of the plant to the Nyquist frequency, pairs at every flexible mode with damping from its own to
-    0.7.
+    """Poles that reach everywhere the answer may need them.
 
-    pairs: per mode; more than three modes share three times as many.
+    Real ones spread logarithmically from the slowest corner of the plant to the Nyquist frequency; pairs at
+    every
+    flexible mode and at every lightly damped zero (where Q inverts the plant), damping from their own to 0.7.
+    pairs: for each; more than three of them share three times as many.
     """
     dt = plant.dt_s
     decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt
     slow = decay[(decay > 1e-3 * scale_rad_s)]
     lowest = min(float(np.min(slow, initial=np.inf)), 0.02 * scale_rad_s)
     poles = [np.exp(-dt * np.geomspace(lowest, 0.95 * plant.nyquist_rad_s, real_poles)).astype(complex)]
-    each = max(2, min(pairs, 3 * pairs // max(len(plant.modes), 1)))
-    for mode in plant.modes:
-        zeta = np.geomspace(np.clip(1.3 * mode.zeta, 0.005, 0.3), 0.7, each)
-        poles.append(np.exp(dt * mode.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+    resonances = [*plant.modes, *modes_of(plant.zeros, dt)]
+    resonances = [each for each in resonances if each.omega_rad_s < plant.nyquist_rad_s]
+    count = max(2, min(pairs, 3 * pairs // max(len(resonances), 1)))
+    for each in resonances:
+        least = np.clip(1.3 * abs(each.zeta), 0.005, 0.3)
+        zeta = np.geomspace(least, 0.7, count)
+        poles.append(np.exp(dt * each.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
     return np.concatenate(poles)
 
 
