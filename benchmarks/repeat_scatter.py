@@ -54,10 +54,10 @@ OUTLIER = 6.0
 SLFR_READING = """
 Reading. The interval is what honest noise bounds give with three repeats of two amplitudes (chi-square,
 degrees of freedom from the joint covariance of the posterior). Noise bounds leave out what changes between
-runs: the frequency of the second mode differs between sweeps and falls with amplitude (line above), and one
-sweep's noise says nothing about that; nor is the first stage's error in them. 'Amplitudes apart' is the
-same seen between 50 and 75 counts. For a controller, bounds with the scatter between runs in them (last
-column: predicted by five sweeps, met by the sixth) are the ones to use.
+runs: the frequency of the second mode differs between sweeps and, seen at the tip, falls with amplitude
+(line above), and one sweep's noise says nothing about that; nor is the first stage's error in them.
+'Amplitudes apart' is the same seen between 50 and 75 counts. For a controller, bounds with the scatter
+between runs in them (last column: predicted by five sweeps, met by the sixth) are the ones to use.
 """
 
 
