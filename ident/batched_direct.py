@@ -44,10 +44,13 @@ def minimise_in_batches(
     boxes[0, _CENTRE : _CENTRE + dimension] = 0.5
     boxes[0, _CENTRE + dimension : _CENTRE + 2 * dimension] = 1.0
     points[0] = 0.5
-    costs[0] = boxes[0, _COST] = cost(points[:1])[0]
     hull = np.empty(_LEVELS, dtype=np.int64)
     proposed = np.empty((_LEVELS * 2 * dimension, dimension))
-    n_boxes, n_points, age = 1, 1, 1
+    # The first box is divided whatever its cost: its centre is asked for together with its sides.
+    n_hull, n_proposed = _choose(boxes, 1, hull, proposed)
+    values = cost(np.concatenate([points[:1], proposed[:n_proposed]]))
+    costs[0] = boxes[0, _COST] = values[0]
+    n_boxes, n_points, age = _divide(boxes, 1, 1, hull[:n_hull], values[1:], points, costs, 1)
     while n_points < evaluations:
         n_hull, n_proposed = _choose(boxes, n_boxes, hull, proposed)
         if n_hull == 0:  # every box is as small as rounding
