@@ -13,7 +13,7 @@ import time
 
 from benchmarks.results_file import ResultsFile
 from control_design.example_plants import flexible_link, flexible_link_specification
-from control_design.youla import YoulaOptions, youla_bracket
+from control_design.youla import BracketProblem, YoulaOptions, youla_bracket
 
 PUBLISHED = {"A": (0.912, 0.931, 0.945), "B": (0.916, 1.065, 1.205), "C": (0.916, 1.268, 1.705)}
 OURS_BY_ORDER = {"A": (0.9368, 0.9307), "B": (1.0851, 1.0819), "C": (1.3346, 1.2771)}
@@ -56,6 +56,15 @@ def main() -> None:
                     f"{scenario:>8}  {name:<7}  {one.functions:>9}  {cells}  "
                     f"{excess[0]:>6.1f} / {excess[1]:.1f}  {spent:>7.1f}"
                 )
+        if arguments.fine:
+            out()
+            out("The ellipse problem is not convex: its value from five starts between the discs' answers.")
+            for scenario in arguments.scenarios:
+                problem = BracketProblem(
+                    flexible_link(scenario), flexible_link_specification(5), YoulaOptions()
+                )
+                values = problem.other_ellipse_values((0.0, 0.25, 0.5, 0.75, 1.0))
+                out(f"{scenario:>8}  " + "  ".join(f"{value:.4f}" for value in values))
 
 
 if __name__ == "__main__":

@@ -169,12 +169,12 @@ def youla_bracket(
     results = []
     for number, plant in enumerate(listed):
         tell(number / len(listed), f"Youla bracket of {plant.name}")
-        results.append(_Bracket(plant, specification, options).solve())
+        results.append(BracketProblem(plant, specification, options).solve())
     tell(1.0, "Youla bracket")
     return YoulaBracket(tuple(results))
 
 
-class _Bracket:
+class BracketProblem:
     """One plant: parametrisation, grids and the three problems."""
 
     def __init__(self, plant: UncertainPlant, specification: Specification, options: YoulaOptions) -> None:
@@ -224,6 +224,15 @@ class _Bracket:
             int(self.dense_basis.shape[1]),
             exact,
         )
+
+    def other_ellipse_values(self, shares: Sequence[float]) -> list[float]:
+        """Ellipse values from other starts: a share of the inscribed answer, the rest of the enclosing one.
+
+        A check of the one problem that is not convex: values that differ are different local optima.
+        """
+        _, _, outer = self._exchanged("enclosing", None)
+        _, _, inner = self._exchanged("inscribed", None)
+        return [self._exchanged("ellipse", (1 - f) * outer + f * inner)[0] for f in shares]
 
     def _exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
         """Optimum with violated frequencies added: (value on the dense grid, on the programme's, x)."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from control_design.closed_loop import LinearMachine, simulate
 from control_design.controller import Controller
 from control_design.ellipses import Ellipses
 from control_design.plant_set import UncertainPlant
@@ -116,6 +117,17 @@ def test_round_trips_and_filtering(tmp_path):
     reference = np.random.default_rng(1).standard_normal(200)
     expected = control.forced_response(prefilter.to_control(), inputs=reference).outputs
     np.testing.assert_allclose(prefilter.filtered(reference), expected, atol=1e-12)
+
+
+def test_simulated_step_is_the_response_of_prefilter_and_loop():
+    controller, plant = _hub_loop()
+    prefilter = design_prefilter(controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (2.0,)}))
+    step = np.ones(600)
+    run = simulate(controller, LinearMachine(plant.nominal), prefilter.filtered(step))
+    loop = control.series(controller.to_control(include_delay=True), plant.nominal)
+    whole = control.series(prefilter.to_control(), control.feedback(loop, 1))
+    expected = control.forced_response(whole, inputs=step).outputs
+    np.testing.assert_allclose(run.output[:, 0], expected, atol=1e-9)
 
 
 def test_bad_input_is_one_clear_line():
