@@ -4,7 +4,7 @@
 Its ellipses do not cover: poles chosen from the same data are treated as known, and the kernel keeps its
 prior variance at frequencies that the data know well. `tangent` is the default: every pole twice (which spans
 the first-order effect of moving the poles), initial state and offset as nuisance, a short kernel for what is
-left, everything conditioned on the data.
+left, everything conditioned on the data, averaged over one mode that the search may have missed.
 """
 
 from __future__ import annotations
@@ -107,6 +107,11 @@ def tangent(
     records: SISO, same sampling time as the model, each with its own initial state and offset; model gives
     poles, integrators and delay (its coefficients are not used). Raises ValueError when the records are too
     short, have another sampling time, or do not excite the poles at all.
+
+    The posterior's poles are the model's, twice; then, twice each, modes so plain that an order selection
+    would have kept them (after whitening, or in a model whose order was given); then, once each, pairs of one
+    further mode that has a probability worth counting (`ident.undetected_mode`). A mode that is not seen in
+    these records at all stays outside the ellipses at its peak: no data speak of it.
     """
     options = options or EmbeddingOptions()
     return _embed(records, model, model.poles.doubled(), options, classical_recipe=False)
