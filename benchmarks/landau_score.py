@@ -2,8 +2,7 @@
 100.
 
 Control law R u = T r - S y with polynomials in q^-1, Ts = 0.05 s, 5 s records, step reference. Every item
-counts
-for the worst load; the score is their mean, and 0 if any load is unstable.
+counts for the worst load; the score is their mean, and 0 if any load is unstable.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@
 cost.
 
 R = (1 - q^-1)(1 + r_1 q^-1 + ...), S of the given length, T = S(1): the reference enters by its static gain.
-The
-margins are those of `landau_score`, on a coarser frequency grid and vectorised over laws; the score of the
-result
-is always taken from `landau_score` itself.
+The margins are those of `landau_score`, on a coarser frequency grid and vectorised over laws; the score of
+the result is always taken from `landau_score` itself.
 """
 
 from __future__ import annotations
@@ -139,8 +137,7 @@ def _last(flag: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 def _settled(size: np.ndarray) -> np.ndarray:
     """Time after which every row (P, T) stays below the threshold, interpolated between samples so that
-    searches see a
-    slope.
+    searches see a slope.
 
     It lies up to one sample after the last sample above, which is what the score counts.
     """

@@ -4,9 +4,8 @@ specification.
     OMP_NUM_THREADS=1 python -m benchmarks.landau_transmission [--seed 1] [--no-write]
 
 Six free parameters. First our synthesis for the three loads at once from the frequency-domain items (order 3
-with
-integrator: six parameters), then a direct search from its controller, because four items are read off step
-responses. The second part searches on for the largest smallest margin, for three ways to split the six
+with integrator: six parameters), then a direct search from its controller, because four items are read off
+step responses. The second part searches on for the largest smallest margin, for three ways to split the six
 parameters.
 """
 

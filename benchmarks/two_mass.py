@@ -3,12 +3,9 @@
     OMP_NUM_THREADS=1 python -m benchmarks.two_mass [--seeds 1 2 3] [--no-write]
 
 P = k/(s^2 (s^2 + 2 k)), m1 = m2 = 1, k in [0.5, 2]; DC gain of K at least 0.032, high-frequency |s K| at most
-0.08,
-as for Chait's QFT design 0.032 (10 s + 1)/(4 s^2 + 2 s + 1). Direct search of the continuous-time controller
-on 13
-stiffnesses, then the peaks over 100 log-spaced ones, refined between frequencies. The structured synthesis of
-this
-project is discrete-time and has no weight on T; it is not used here.
+0.08, as for Chait's QFT design 0.032 (10 s + 1)/(4 s^2 + 2 s + 1). Direct search of the continuous-time
+controller on 13 stiffnesses, then the peaks over 100 log-spaced ones, refined between frequencies. The
+structured synthesis of this project is discrete-time and has no weight on T; it is not used here.
 """
 
 from __future__ import annotations
@@ -97,8 +94,8 @@ def design_of(x: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Numerators and denominators (P, .) of search points x (P, 4 or 6).
 
     x: log frequency and log damping of the pole pair, log DC gain over its limit, leading numerator
-    coefficient as
-    share of its limit; for order 3 also log of the real pole and the middle numerator coefficient.
+    coefficient as share of its limit; for order 3 also log of the real pole and the middle numerator
+    coefficient.
     """
     frequency, damping = np.exp(x[:, 0]), np.exp(x[:, 1])
     denominator = np.stack([np.ones_like(frequency), 2 * damping * frequency, frequency**2], axis=1)
@@ -153,8 +150,7 @@ def optimised(order: int, seed: int) -> Design:
         return np.hstack([-slope, np.ones((slope.shape[0], 1))])
 
     # Smallest bound over all 26 peaks: smooth constraints, where the largest peak itself has kinks. Several
-    # members
-    # of the last population, because the valley of order 3 is long and has more than one end.
+    # members of the last population, because the valley of order 3 is long and has more than one end.
     order_of = np.argsort(found.population_energies)
     candidates = [found.population[i] for i in order_of[:: max(1, order_of.size // 12)][:6]]
     for start in list(candidates):

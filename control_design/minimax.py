@@ -4,10 +4,8 @@ prefilter.
 Every row looks at one complex number y_k = sum_i basis_ki x_i, taken as a vector of the plane, and asks
     |A y + a| <= gamma (e + E y - |C y + c|).
 For fixed gamma that is convex in x, so the smallest feasible gamma has no local minima. Dinkelbach's
-iteration
-solves it: gamma_j = worst ratio at x_j, then x_{j+1} minimises the largest (|A y + a| - gamma_j m(y))/m(y_j),
-a
-convex programme, by an interior point. gamma falls in every step, superlinearly near the end.
+iteration solves it: gamma_j = worst ratio at x_j, then x_{j+1} minimises the largest (|A y + a| - gamma_j
+m(y))/m(y_j), a convex programme, by an interior point. gamma falls in every step, superlinearly near the end.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ _ROUND_NUMERATOR = 1e-3
 _ROUND_REACH = 1e-4
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
 _GAP = 1e-5  # relative accuracy of gamma
-_MOST_STEPS = 200  # of the interior point in one round; 15 to 60 are usual
+_MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
 _KEPT = 1e-10  # singular values of the scaled basis below this fraction are no directions of the search
 
 
@@ -175,8 +173,7 @@ class _Scaled:
         Primal-dual interior point for min v, h - v + slack = 0, with predictor and corrector. The slacks are
         variables of their own: with h < v kept throughout, one early row at its boundary stopped all others.
         Ends when the gap is below a twentieth of what was gained (the next round begins from there anyway) or
-        at
-        full accuracy.
+        at full accuracy.
         """
         weight = 0.0 if feasibility else 1.0
         factor = 1.0 if feasibility else gamma
@@ -214,15 +211,15 @@ class _Scaled:
                 primal_length = _to_boundary(slack, slack_step)
                 dual_length = _to_boundary(dual, dual_step)
                 if not corrector:
-                    reached = float(
-                        np.mean((slack + primal_length * slack_step) * (dual + dual_length * dual_step))
-                    )
+                    ahead = slack + min(1.0, primal_length) * slack_step
+                    reached = float(np.mean(ahead * (dual + min(1.0, dual_length) * dual_step)))
                     share = min(1.0, max(reached / gap, 0.0)) ** 3
                     target = max(share, 1e-3) * gap - slack_step * dual_step
+            if not np.all(np.isfinite(step)):
+                break  # the system has become singular to working precision: the best point stands
             length = min(1.0, 0.99 * min(primal_length, dual_length))
             # Rows are convex: what they lie above their linearisation after the step is its error. Far from
-            # the
-            # kinks the model is nearly flat and steps would run away.
+            # the kinks the model is nearly flat and steps would run away.
             allowed, rise = float(np.max(slack)), by_row @ step[:n]
             h_new = self._values(z + length * step[:n], weight, factor, scale)
             while np.max(h_new - h - length * rise) > allowed and length > 1e-8:
@@ -265,18 +262,16 @@ class _Scaled:
         return np.asarray((weight * size_p - gamma * (level - size_q)) / scale)
 
     def _derivatives(
-        self, z: Real, weight: float, gamma: float, scale: Real, dual: Real | None
+        self, z: Real, weight: float, gamma: float, scale: Real, dual: Real
     ) -> tuple[Real, Real]:
-        """Gradient of h by row (R, m), and sum of dual times the Hessians of h (m, m; zero without dual).
+        """Gradient of h by row (R, m), and sum of dual times the Hessians of h (m, m).
 
         The Hessian of sqrt(|p|^2 + r^2) is (w w^T + (r/size)^2 u u^T)/size, u along p and w across it.
         """
         rounding = _ROUND_NUMERATOR * gamma * scale
         p, q, size_p, size_q, _ = self._parts(z, rounding)
-        share = None if dual is None else dual / scale
-        gradient, hessian = _norm_derivatives(
-            self._numerators, p, size_p, rounding, None if share is None else weight * share
-        )
+        share = dual / scale
+        gradient, hessian = _norm_derivatives(self._numerators, p, size_p, rounding, weight * share)
         gradient *= (weight / scale)[:, None]
         if not self.constant:
             reach, curved = _norm_derivatives(
@@ -284,7 +279,7 @@ class _Scaled:
                 q,
                 size_q,
                 np.full(size_q.size, self._reach_rounding),
-                None if share is None else gamma * share,
+                gamma * share,
             )
             gradient += (gamma / scale)[:, None] * (reach - self._levels)
             hessian += curved
@@ -298,7 +293,7 @@ def _to_boundary(value: Real, step: Real) -> float:
 
 
 def _norm_derivatives(
-    forms: Real, vector: Real, size: Real, rounding: Real, weight: Real | None
+    forms: Real, vector: Real, size: Real, rounding: Real, weight: Real
 ) -> tuple[Real, Real]:
     """Gradient (R, m) of the rounded norms of vector = forms z, and sum of weight times their Hessians (m,
     m)."""
@@ -306,8 +301,6 @@ def _norm_derivatives(
     u = np.where(length[:, None] > 0, vector, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
     along = u[:, 0, None] * forms[:, 0] + u[:, 1, None] * forms[:, 1]
     gradient = along * (length / size)[:, None]
-    if weight is None:
-        return gradient, np.zeros((forms.shape[2], forms.shape[2]))
     across = u[:, 0, None] * forms[:, 1] - u[:, 1, None] * forms[:, 0]
     hessian = (across * (weight / size)[:, None]).T @ across
     hessian += (along * (weight * (rounding / size) ** 2 / size)[:, None]).T @ along

@@ -2,10 +2,9 @@
 
 The error of a member G is W (F T - T_ref), T = G K/(1 + G K), affine in F: with chosen poles the coefficients
 that make its worst case smallest are a convex minimax. T maps each ellipse (free of poles by robust
-stability) to
-a region whose worst point lies on the boundary, so boundary samples suffice for the design; the certified
-error is
-exact at every frequency of a dense grid: |a G + b| <= h |1 + k G| is a disc or the outside of one.
+stability) to a region whose worst point lies on the boundary, so boundary samples suffice for the design; the
+certified error is exact at every frequency of a dense grid: |a G + b| <= h |1 + k G| is a disc or the outside
+of one.
 """
 
 from __future__ import annotations
@@ -73,10 +72,8 @@ class Prefilter:
     """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable.
 
     A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. error_before, error_after: largest weighted
-    model-matching
-    error over all plants and their ellipses with F = 1 and with F, exact at every frequency of the dense
-    grid;
-    worst_rad_s: where the second occurs.
+    model-matching error over all plants and their ellipses with F = 1 and with F, exact at every frequency of
+    the dense grid; worst_rad_s: where the second occurs.
     """
 
     A: Real
@@ -191,10 +188,8 @@ def worst_matching_error(
 
     loop_gain k, follow F, model T_ref: (F,). Exact: with alpha = (F - T_ref) k and beta = -T_ref the error is
     |alpha G + beta|/|1 + k G|; it is <= h on the disc |G - g0| <= r for |alpha| > h |k| and outside it
-    otherwise,
-    g0 = (h^2 conj(k) - conj(alpha) beta)/A, r = h |alpha - k beta|/|A|, A = |alpha|^2 - h^2 |k|^2. h by
-    bisection
-    between the centre's error and |T_ref| + |F - T_ref| max|G k| / min|1 + G k|.
+    otherwise, g0 = (h^2 conj(k) - conj(alpha) beta)/A, r = h |alpha - k beta|/|A|, A = |alpha|^2 - h^2 |k|^2.
+    h by bisection between the centre's error and (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G|.
     """
     k = np.asarray(loop_gain, dtype=np.complex128)
     alpha, beta = (follow - model) * k, -np.asarray(model)

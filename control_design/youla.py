@@ -7,12 +7,12 @@ q = K S of the centre the worst case is at most gamma where
     |W1 S| <= gamma m,  |W3 q| <= gamma m,  m = smallest |1 + D q| over the ellipse.
 
 For a disc of radius r, m = 1 - r |q| and the problem is convex: the disc inscribed in the ellipse gives a
-value
-that no controller goes below, the enclosing one a value some controller reaches. For the ellipse itself
+value that no controller goes below, the enclosing one a value some controller reaches. For the ellipse itself
 m = max over t of Re(e^{-jt}) - |half-axes of e^{-jt} q|: convex in Q for fixed t. From the enclosing disc's
 answer, t and Q in turn lead down to a local optimum, which is a controller's value again. All three minimise
-over
-the same basis, so inscribed <= ellipse <= enclosing.
+over the same basis, so inscribed <= ellipse <= enclosing; a larger basis lowers all three a little (0.1 % on
+the
+example link from 57 to 91 functions), which is what a lower bound from a finite basis is worth.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class YoulaBracket:
         else:
             reach = f"a controller of any order is known to reach {self.ellipse:.4g}"
         word = f"{share:.2g} % above" if share >= 0 else f"{-share:.2g} % below"
-        return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; none goes below {self.inscribed:.4g}"
+        return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; none goes below about {self.inscribed:.3g}"
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; inf as None."""
@@ -154,8 +154,7 @@ def youla_bracket(
     Of the specification count tracking, modulus margin, effort and damping of the modes; structure, order,
     controller damping and the delay margin do not, so the values stay lower bounds for designs that are asked
     for these as well. Damping (W4 G S of the measured output) enters the inscribed value by the centre alone
-    and
-    the other two by the largest |G|: on its safe side in each.
+    and the other two by the largest |G|: on its safe side in each.
 
     Raises
     ------

@@ -16,9 +16,8 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pai
     """Poles that reach everywhere the answer may need them.
 
     Real ones spread logarithmically from the slowest corner of the plant to the Nyquist frequency; pairs at
-    every
-    flexible mode and at every lightly damped zero (where Q inverts the plant), damping from their own to 0.7.
-    pairs: for each; more than three of them share three times as many.
+    every flexible mode and at every lightly damped zero (where Q inverts the plant), damping from their own
+    to 0.7. pairs: for each; more than three of them share three times as many.
     """
     dt = plant.dt_s
     decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt

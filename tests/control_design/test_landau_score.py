@@ -20,9 +20,8 @@ _GOOD = np.array(
 
 def test_deadbeat_integrator_by_hand():
     # A = 1, B = q^-1, R = 1 - q^-1, S = T = 1: closed loop 1, y one sample late, disturbance gone after one
-    # sample.
-    # S = 1 - z^-1: |S| = 2 sin(w/2) exceeds 1 from a sixth of 20 Hz on, largest 2. |L| = 1 there with phase
-    # -120 degrees: delay margin one sample. K S = 1.
+    # sample. S = 1 - z^-1: |S| = 2 sin(w/2) exceeds 1 from a sixth of 20 Hz on, largest 2. |L| = 1 there with
+    # phase -120 degrees: delay margin one sample. K S = 1.
     v = values(Law(np.array([1.0, -1.0]), np.array([1.0]), np.array([1.0])), ((1.0,), (0.0, 1.0)))
     assert v is not None
     assert v["rise_s"] == pytest.approx(0.0 - 0.15)
@@ -96,8 +95,7 @@ def test_fast_margins_agree_with_the_score(s_length):
         slow = [exact[item] for item in ITEMS if item != "integrator"]
         for item, f, s in zip([i for i in ITEMS if i != "integrator"], fast, slow, strict=True):
             # Grids: 0.025 Hz against 0.01 Hz. Rejection is interpolated and asked at 0.098, so that it may be
-            # late
-            # by a swing that the score passes over.
+            # late by a swing that the score passes over.
             if item == "rejection_s":
                 assert -0.5 < f <= s + 1e-9
                 continue
