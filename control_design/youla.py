@@ -11,8 +11,7 @@ value that no controller goes below, the enclosing one a value some controller r
 m = max over t of Re(e^{-jt}) - |half-axes of e^{-jt} q|: convex in Q for fixed t. From the enclosing disc's
 answer, t and Q in turn lead down to a local optimum, which is a controller's value again. All three minimise
 over the same basis, so inscribed <= ellipse <= enclosing; a larger basis lowers all three a little (0.1 % on
-the
-example link from 57 to 91 functions), which is what a lower bound from a finite basis is worth.
+the example link from 57 to 91 functions): that is how far the lower bound of a finite basis can be trusted.
 """
 
 from __future__ import annotations
@@ -113,13 +112,18 @@ class YoulaBracket:
 
     def sentence(self, gamma: float, order: int) -> str:
         """One line for a design of this gamma and order."""
+        floor = f"none goes below about {self.inscribed:.3g}"
+        if not (np.isfinite(self.ellipse) and np.isfinite(gamma)):
+            return (
+                f"order {order}: gamma {gamma:.4g}, any order is known to reach {self.ellipse:.4g}; {floor}"
+            )
         share = 100.0 * self.excess(gamma)
         if len(self.plants) > 1:
             reach = f"the hardest plant alone allows {self.ellipse:.4g}"
         else:
             reach = f"a controller of any order is known to reach {self.ellipse:.4g}"
         word = f"{share:.2g} % above" if share >= 0 else f"{-share:.2g} % below"
-        return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; none goes below about {self.inscribed:.3g}"
+        return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; {floor}"
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; inf as None."""
