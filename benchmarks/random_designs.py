@@ -4,7 +4,7 @@
 
 Runs in parts (a results file each). A case draws one to three flexible modes, up to two integrators, up to
 two samples of delay, a first-order lag, and a posterior over coefficients from spreads of gain, lag, mode
-frequencies and dampings plus a short impulse response; a specification; designs with low effort; certifies.
+frequencies and dampings plus a short impulse response; a specification; designs with low effort (the default options where that finds nothing stable); certifies.
 Stability is then checked without any frequency response: plants drawn from inside the ellipses (a point of
 the generators' ball lies in the ellipse of every frequency) and the closed-loop poles by python-control.
 """
@@ -216,7 +216,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=50)
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.count)
-    counts = dict.fromkeys(("designs", "met", "proved", "unstable", "refused", "not converged", "silent"), 0)
+    counts = dict.fromkeys(
+        ("designs", "met", "proved", "unstable", "refused", "full effort", "not converged", "silent"), 0
+    )
     name = f"random_designs_{seeds[0]:03d}_{seeds[-1]:03d}"
     with ResultsFile(name, seeds=f"{seeds[0]} to {seeds[-1]}") as out:
         out("seed int modes delay order  outcome        gamma  bound/dense  proved  certify s  unstable")
@@ -233,6 +235,10 @@ def main() -> None:
                 counts["silent"] += "rad/s" not in str(error) and "delay" not in str(error)
                 out(f"{head}refused before optimising: {str(error).split(':', 1)[1].strip()}")
                 continue
+            if result.outcome is Outcome.NOT_CONVERGED:
+                counts["full effort"] += 1
+                out(f"{head}no stable design with low effort; with the default options:")
+                result = synthesise([plant], specification, rng=np.random.default_rng(seed))
             if result.outcome is Outcome.NOT_CONVERGED:
                 counts["not converged"] += 1
                 counts["silent"] += 1
