@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import control
 import numpy as np
@@ -177,11 +177,11 @@ class Controller:
             raise ValueError(f"controller JSON must be an object; got {type(data).__name__}")
         return cls.from_dict(data)
 
-    def save_mat(self, path: str | PathLike[str]) -> None:
-        """MATLAB 5 file with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
+    def save_mat(self, file: str | PathLike[str] | BinaryIO) -> None:
+        """MATLAB 5 file (path or stream) with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
         none = float("inf")
         scipy.io.savemat(
-            Path(path),
+            Path(file) if isinstance(file, (str, PathLike)) else file,  # type: ignore[arg-type]  # streams, too
             {
                 "A": self.A,
                 "B": self.B,

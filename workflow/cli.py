@@ -156,6 +156,14 @@ def identify(
     integrators: Annotated[int, typer.Option(min=0, max=3, help="Known poles at z = 1.")] = 0,
     delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
     feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
+    relative_degree: Annotated[
+        str | None,
+        typer.Option(
+            help="Known excess of poles over zeros of the continuous plant, 1 to 6, or 'auto': the largest "
+            "of 1 to 3 that the data do not refuse.",
+            show_default=False,
+        ),
+    ] = None,
     level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
     band: Annotated[
         tuple[float, float] | None,
@@ -184,8 +192,13 @@ def identify(
     from workflow.log_identification import identify_logs
     from workflow.settings import check
 
-    chosen = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "feedthrough": feedthrough}
-    options = check(IdentOptions, {**chosen, "input_delay_samples": delay}, source="options")
+    chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators}
+    chosen |= {
+        "feedthrough": feedthrough,
+        "input_delay_samples": delay,
+        "relative_degree": _degree(relative_degree),
+    }
+    options = check(IdentOptions, chosen, source="options")
     with TerminalProgress() as progress:
         summary = identify_logs(
             log,
@@ -224,7 +237,10 @@ def design(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Write the controller here (JSON: discrete state space).", show_default=False),
+        typer.Option(
+            help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99).",
+            show_default=False,
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
     as_json: Json = False,
@@ -276,6 +292,11 @@ def paper(
         _print_json(summary.to_document())
     else:
         print_summary(summary)
+
+
+def _degree(text: str | None) -> int | str | None:
+    """A number where one was given, so that the settings' own complaint names what is allowed."""
+    return int(text) if text is not None and text.isdigit() else text
 
 
 def _print_json(document: Mapping[str, Any]) -> None:

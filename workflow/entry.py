@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from importlib import resources
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from control_design.c_code import c_source
 from control_design.certificate import Certificate, certify
+from control_design.controller import Controller
 from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis import SynthesisOptions, synthesise
@@ -142,17 +146,32 @@ def load_plant_file(path: Path) -> UncertainPlant:
     return UncertainPlant(model.output_name, model.to_control(), posterior, level=level)
 
 
+def _mat_bytes(controller: Controller) -> bytes:
+    stream = BytesIO()
+    controller.save_mat(stream)
+    return stream.getvalue()
+
+
+_CONTROLLER_FILES: dict[str, Callable[[Controller], bytes]] = {
+    ".json": lambda controller: controller.to_json().encode(),
+    ".mat": _mat_bytes,
+    ".c": lambda controller: c_source(controller).encode("ascii"),
+}
+
+
 def design_controller(
     source: Path, specification_path: Path | None, *, out: Path | None = None, seed: int = 2006
 ) -> RunSummary:
     """Design and certify a controller for a run's identified plant, or for a file of `flexlink identify
     --out`.
 
-    With `out` the controller is written as JSON. A specification that no controller can meet is a result (not
-    certified, the reason in `verdict`), as in a run. Raises InputError.
+    With `out` the controller is written, by its ending as JSON, MAT file or C source. A specification that no
+    controller can meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
     """
     source = Path(source)
     if out is not None:
+        if out.suffix.lower() not in _CONTROLLER_FILES:
+            raise InputError(f"--out {out}: the ending must be one of {', '.join(_CONTROLLER_FILES)}")
         storage.check_writable(out)
     if source.is_dir():
         run = RunDirectory.open(source)
@@ -181,7 +200,7 @@ def design_controller(
             if result.outcome is not Outcome.NOT_CONVERGED:
                 certificate = certify(result.controller, [plant], specification)
                 if out is not None:
-                    storage.write_text(out, result.controller.to_json())
+                    storage.write_bytes(out, _CONTROLLER_FILES[out.suffix.lower()](result.controller))
     certified = certificate is not None and certificate.certified
     if certificate is not None and not certified:
         missed = [item.sentence() for item in certificate.items if not item.met]

@@ -32,7 +32,7 @@ from workflow import storage
 from workflow.errors import InputError
 from workflow.storage import AnyArray
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2  # 2: identifications with tests of priors
 _INPUT_HASH = "_input_hash"
 _DOCUMENT = "_document"
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")

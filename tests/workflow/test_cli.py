@@ -315,6 +315,20 @@ def test_design_from_a_run_directory(flexlink, fast_run, tmp_path):
     assert (tmp_path / "controller.json").is_file()
 
 
+def test_design_writes_what_the_ending_asks_for(flexlink, fast_run, tmp_path):
+    from control_design.controller import Controller
+
+    for ending in (".mat", ".c"):
+        assert flexlink("design", fast_run[0], "--out", tmp_path / f"controller{ending}").code == 0
+    assert flexlink("design", fast_run[0], "--out", tmp_path / "controller.json").code == 0
+    same = Controller.from_json((tmp_path / "controller.json").read_text())
+    assert np.array_equal(Controller.load_mat(tmp_path / "controller.mat").A, same.A)
+    assert f"{float(same.C[0, 0])!r}" in (tmp_path / "controller.c").read_text()
+    refused = flexlink("design", fast_run[0], "--out", tmp_path / "controller.txt")
+    assert refused.code == 2
+    assert ".json, .mat, .c" in refused.err
+
+
 def test_version_and_module_entry():
     process = start_flexlink("--version")
     out, err = process.communicate()
