@@ -1,4 +1,4 @@
-"""Results as they are committed: printed while they come, written whole at the end, with command, seeds, date."""
+"""Results as committed: printed as they come, written whole at the end, with command, seeds and date."""
 
 from __future__ import annotations
 
