@@ -4,9 +4,10 @@
 
 Runs in parts (a results file each). A case draws one to three flexible modes, up to two integrators, up to
 two samples of delay, a first-order lag, and a posterior over coefficients from spreads of gain, lag, mode
-frequencies and dampings plus a short impulse response; a specification; designs with low effort (the default options where that finds nothing stable); certifies.
-Stability is then checked without any frequency response: plants drawn from inside the ellipses (a point of
-the generators' ball lies in the ellipse of every frequency) and the closed-loop poles by python-control.
+frequencies and dampings plus a short impulse response; a specification; designs with low effort (with the
+default options where that finds nothing stable); certifies. Stability is then checked without any frequency
+response: plants drawn from inside the ellipses (a point of the generators' ball lies in the ellipse of every
+frequency) and the closed-loop poles by python-control.
 """
 
 from __future__ import annotations
