@@ -40,6 +40,7 @@ from control_design.youla_basis import (
     coprime_factors,
     stable_loop,
 )
+from control_design.youla_hull import hull_bound
 
 Region = Literal["inscribed", "ellipse", "enclosing"]
 
@@ -60,6 +61,10 @@ class YoulaOptions(BaseModel):
     dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
     omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
     exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
+    hull: bool = Field(
+        default=False,
+        description="also bound from below by hulls of what every frequency allows; some seconds",
+    )
     ellipse_rounds: int = Field(default=20, ge=1, le=100, description="turns of angles and Q for the ellipse")
 
 
@@ -72,6 +77,7 @@ class PlantBracket:
     however coarse the grid. coarse_enclosing: the enclosing value with about half the basis; close to
     `enclosing` means that the basis is large enough. exact_centre: the parametrisation is about the ellipses'
     centres themselves (stable plants, or centre = nominal); otherwise `inscribed` is a local optimum too.
+    hull: the tighter lower bound of `youla_hull`, None if not asked for or without exact_centre.
     """
 
     plant: str
@@ -82,6 +88,7 @@ class PlantBracket:
     coarse_enclosing: float
     functions: int
     exact_centre: bool
+    hull: float | None = None
 
 
 @dataclass(frozen=True)
@@ -106,13 +113,18 @@ class YoulaBracket:
     def enclosing(self) -> float:
         return max(plant.enclosing for plant in self.plants)
 
+    @property
+    def floor(self) -> float:
+        """The best lower bound: of the hulls where they were asked for, else of the inscribed discs."""
+        return max(plant.inscribed if plant.hull is None else plant.hull for plant in self.plants)
+
     def excess(self, gamma: float) -> float:
         """How far gamma lies above the ellipse value, relative: 0.02 = a higher order could buy about 2 %."""
         return gamma / self.ellipse - 1.0
 
     def sentence(self, gamma: float, order: int) -> str:
         """One line for a design of this gamma and order."""
-        floor = f"none goes below about {self.inscribed:.3g}"
+        floor = f"none goes below about {self.floor:.3g}"
         if not (np.isfinite(self.ellipse) and np.isfinite(gamma)):
             return (
                 f"order {order}: gamma {gamma:.4g}, any order is known to reach {self.ellipse:.4g}; {floor}"
@@ -226,7 +238,14 @@ class BracketProblem:
             half.gamma,
             int(self.dense_basis.shape[1]),
             exact,
+            self._hull(inscribed_grid=grid_value, ellipse=ellipse) if self.options.hull and exact else None,
         )
+
+    def _hull(self, *, inscribed_grid: float, ellipse: float) -> float:
+        if not np.isfinite(ellipse):
+            return inscribed_grid
+        lean = self.problem.lean()[0]
+        return hull_bound(lean, self._loop(lean), self._basis(lean, self.poles), inscribed_grid, ellipse)
 
     def other_ellipse_values(self, shares: Sequence[float]) -> list[float]:
         """Ellipse values from other starts: a share of the inscribed answer, the rest of the enclosing one.
