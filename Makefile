@@ -46,3 +46,4 @@ check: test lint types
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info
+	find . -name "*.nb[ic]" -delete
