@@ -49,13 +49,17 @@ class PoleSearch:
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self.options)
 
+    def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
+        """The cost that global searches and rescans look at (`ident.miso_search` has another)."""
+        return CandidateCost(self.data, space, shared, local)
+
     def joint(self, n_real: int, n_pairs: int) -> Polished:
         """Best poles of a joint global search over n_real real poles and n_pairs pairs."""
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
-        cost = CandidateCost(self.data, space, self.fixed, self.fixed)
+        cost = self.candidate_cost(space, self.fixed, self.fixed)
         points = self._global(title, cost, self.options.evaluations)
         return self._best_descent([self.fixed.appended(space.poles(point)) for point in points], title)
 
@@ -63,14 +67,14 @@ class PoleSearch:
         """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
-        cost = CandidateCost(self.data, space, poles.doubled(), poles)
+        cost = self.candidate_cost(space, poles.doubled(), poles)
         points = self._global(title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations))
         return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
 
     def add_real(self, poles: Poles) -> Polished:
         """Best descent from the given poles and one more real pole."""
         space = self.space(1, 0)
-        cost = CandidateCost(self.data, space, poles.doubled(), poles)
+        cost = self.candidate_cost(space, poles.doubled(), poles)
         grid = np.linspace(0, 1, 2 * _REAL_GRID)[:, np.newaxis]
         points = best_apart(grid, cost.rss(grid), 2)
         self.evaluations += cost.evaluations
@@ -101,7 +105,7 @@ class PoleSearch:
         count = here.stop - here.start
         kept = Poles(np.delete(best.poles.real, here), best.poles.pairs)
         space = self.space(count, 0)
-        cost = CandidateCost(self.data, space, kept, kept)
+        cost = self.candidate_cost(space, kept, kept)
         here_now = np.sort(space.levels(Poles(best.poles.real[here])))
 
         def looks(point: RealArray) -> tuple[Poles, bool]:
@@ -116,7 +120,7 @@ class PoleSearch:
     def _rescan_pair(self, best: Polished, here: slice) -> Polished:
         kept = Poles(best.poles.real, np.delete(best.poles.pairs, here))
         space = self.space(0, 1)
-        cost = CandidateCost(self.data, space, kept, kept)
+        cost = self.candidate_cost(space, kept, kept)
         here_now = space.levels(Poles(pairs=best.poles.pairs[here]))
 
         def looks(point: RealArray) -> tuple[Poles, bool]:

@@ -1,0 +1,133 @@
+"""The result of an identification with several inputs: model, residuals, order table, search, verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ident.arrays import RealArray, readonly_real
+from ident.miso_model import MisoModel
+from ident.order_selection import OrderStep
+from ident.search_trace import SearchTrace
+from ident.structure import Structure
+
+
+@dataclass(frozen=True, eq=False)
+class MisoIdentification:
+    """A fitted model of several inputs and how well it fits.
+
+    Attributes
+    ----------
+    model : MisoModel
+    structure : Structure
+        What the fit assumed around the basis, after the data decided what was left to them.
+    record_names : tuple of str
+    residuals : tuple of (T - delay,) arrays
+        Output minus fitted output (nuisances included) of each record, from sample `input_delay_samples` on.
+    fit_percent : (K,) array
+        100 (1 - |residual| / |y - mean y|) of each record.
+    rss : float
+        Residual sum of squares over all records.
+    noise_std : float
+        sqrt(rss / (N - number of unknowns)), in units of the output.
+    tangent_optimality : float
+        Share of the residual (0..1) along first-order changes of the free poles: 0 at an optimum.
+    order_table : tuple of OrderStep
+        Every structure that was tried; its criterion counts 1 + U numbers per pole.
+    n_fixed : (int, int)
+        Numbers of real poles and pairs that were given (integrators counted); they come first of each type.
+    verdicts : tuple of str
+        One sentence for each question that was left to the data.
+    search : SearchTrace
+    """
+
+    model: MisoModel
+    structure: Structure
+    record_names: tuple[str, ...]
+    residuals: tuple[RealArray, ...]
+    fit_percent: RealArray
+    rss: float
+    noise_std: float
+    tangent_optimality: float
+    order_table: tuple[OrderStep, ...]
+    n_fixed: tuple[int, int]
+    verdicts: tuple[str, ...]
+    search: SearchTrace
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
+        object.__setattr__(self, "fit_percent", readonly_real(self.fit_percent))
+        if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
+            raise ValueError("residuals, record_names and fit_percent must have one entry per record")
+        if not (self.rss >= 0 and self.noise_std >= 0 and self.tangent_optimality >= 0):
+            raise ValueError(
+                "rss, noise_std and tangent_optimality must not be negative; got "
+                f"{self.rss}, {self.noise_std}, {self.tangent_optimality}"
+            )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to look at before trusting the model, one sentence each."""
+        return self.search.warnings
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        structure = self.structure
+        arrays: dict[str, np.ndarray[Any, Any]] = {
+            "structure": np.array(
+                [
+                    structure.integrators,
+                    structure.input_delay_samples,
+                    structure.feedthrough,
+                    structure.estimate_offset,
+                    structure.estimate_initial_state,
+                ],
+                dtype=np.int64,
+            ),
+            "record_names": np.array(self.record_names, dtype=np.str_),
+            "fit_percent": self.fit_percent,
+            "rss": np.array(self.rss),
+            "noise_std": np.array(self.noise_std),
+            "tangent_optimality": np.array(self.tangent_optimality),
+            "order_counts": np.array(
+                [(s.n_real, s.n_pairs) for s in self.order_table], dtype=np.int64
+            ).reshape(-1, 2),
+            "order_values": np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2),
+            "n_fixed": np.array(self.n_fixed, dtype=np.int64),
+            "verdicts": np.array(self.verdicts, dtype=np.str_),
+        }
+        arrays |= {f"residual{i}": residual for i, residual in enumerate(self.residuals)}
+        arrays |= {f"model_{key}": value for key, value in self.model.to_arrays().items()}
+        arrays |= {f"search_{key}": value for key, value in self.search.to_arrays().items()}
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> MisoIdentification:
+        """Inverse of `to_arrays`."""
+        integrators, delay, feedthrough, offset, initial_state = (int(item) for item in arrays["structure"])
+        names = tuple(str(item) for item in arrays["record_names"])
+        steps = zip(arrays["order_counts"], arrays["order_values"], strict=True)
+        return cls(
+            model=MisoModel.from_arrays(_under("model_", arrays)),
+            structure=Structure(integrators, delay, bool(feedthrough), bool(offset), bool(initial_state)),
+            record_names=names,
+            residuals=tuple(arrays[f"residual{i}"] for i in range(len(names))),
+            fit_percent=arrays["fit_percent"],
+            rss=float(arrays["rss"]),
+            noise_std=float(arrays["noise_std"]),
+            tangent_optimality=float(arrays["tangent_optimality"]),
+            order_table=tuple(
+                OrderStep(int(n_real), int(n_pairs), float(rss), float(criterion))
+                for (n_real, n_pairs), (rss, criterion) in steps
+            ),
+            n_fixed=(int(arrays["n_fixed"][0]), int(arrays["n_fixed"][1])),
+            verdicts=tuple(str(item) for item in arrays["verdicts"]),
+            search=SearchTrace.from_arrays(_under("search_", arrays)),
+        )
+
+
+def _under(prefix: str, arrays: Mapping[str, np.ndarray[Any, Any]]) -> dict[str, np.ndarray[Any, Any]]:
+    return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
