@@ -316,6 +316,22 @@ def test_uncertainty_with_fixed_poles_is_that_of_linear_least_squares():
     np.testing.assert_allclose(bands[1].covariance, expected, rtol=1e-6, atol=1e-12)
 
 
+def test_two_link_example(tmp_path):
+    from examples import two_link_arm  # here: it draws
+
+    result, truth, bands = two_link_arm.run(n_samples=5000)
+    # One integrator (its pole at z = 0 is counted), two real poles and the modes.
+    assert result.model.poles.real.size == 3
+    found = result.model.poles.omega_rad_s(two_link_arm.DT_S)
+    np.testing.assert_allclose(found[:2], [132.19, 141.42], rtol=0.01)
+    low = two_link_arm.OMEGA <= 200
+    error = np.abs(result.model.frequency_response(two_link_arm.OMEGA) / truth - 1)[low]
+    assert np.all(np.sqrt(np.mean(error**2, axis=0)) < [0.03, 0.01])
+    picture = tmp_path / "bode.png"
+    two_link_arm.figure(result, truth, bands).savefig(picture)
+    assert picture.stat().st_size > 10_000
+
+
 @pytest.mark.slow
 def test_ellipses_cover_the_truth():
     seeds, omega = 100, np.geomspace(0.5, 150.0, 20)
