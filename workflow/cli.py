@@ -229,11 +229,22 @@ def identify(
 @app.command()
 def design(
     source: Annotated[
-        Path, typer.Argument(help="Run directory, or npz written by `flexlink identify --out`.")
+        list[Path],
+        typer.Argument(
+            help="Run directory; npz of `flexlink identify --out`; JSON or MAT of its --export, or with A, "
+            "B, C, D, dt_s of your own model; CSV with a measured frequency response. Several: one "
+            "controller for all of them.",
+        ),
     ],
     specification: Annotated[
         Path | None,
-        typer.Option(help="TOML with the keys of [specification]; for a run directory its own if left out."),
+        typer.Option(
+            "--spec",
+            "--specification",
+            help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis] where "
+            "needed; for a run directory its own if left out.",
+            show_default=False,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -245,7 +256,7 @@ def design(
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
     as_json: Json = False,
 ) -> None:
-    """Design and certify a controller for an identified plant."""
+    """Design and certify one controller for one or several plants, identified here or brought along."""
     from workflow.console import print_summary
     from workflow.entry import design_controller
 
