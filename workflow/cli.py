@@ -305,6 +305,39 @@ def paper(
         print_summary(summary)
 
 
+@app.command(short_help="Many designs for one plant: table, Pareto plot.")
+def study(
+    config: Annotated[Path, typer.Option(help="TOML file of the study (see examples/study.toml).")],
+    out: Annotated[Path, typer.Option(help="Directory of the study, new or empty.")],
+    jobs: Annotated[
+        int | None,
+        typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Compute the points on a Dask cluster, e.g. tcp://host:8786 (extra 'distributed').",
+            show_default=False,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the study in --out; finished points are taken up.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
+    from workflow.console import TerminalProgress, print_summary
+    from workflow.study.run import run_study
+
+    with TerminalProgress() as progress:
+        summary = run_study(config, out, jobs=jobs, scheduler=scheduler, resume=resume, progress=progress)
+    if as_json:
+        _print_json(summary.to_document())
+    else:
+        print_summary(summary)
+    _leave(summary.certified, summary.verdict)
+
+
 def _degree(text: str | None) -> int | str | None:
     """A number where one was given, so that the settings' own complaint names what is allowed."""
     return int(text) if text is not None and text.isdigit() else text
@@ -350,7 +383,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _interrupted(arguments: Sequence[str]) -> int:
-    hint = "; `flexlink run --out DIR --resume` continues" if arguments[0] == "run" else ""
+    command = arguments[0]
+    hint = f"; `flexlink {command} --out DIR --resume` continues" if command in ("run", "study") else ""
     return _complain(f"interrupted{hint}", _EXIT_INTERRUPTED)
 
 

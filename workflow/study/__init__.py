@@ -1,0 +1,1 @@
+"""`flexlink study`: many controllers for one identified plant, compared by their certificates."""

@@ -1,0 +1,143 @@
+"""Tasks on the workers of a Dask cluster that is already there (extra `distributed`)."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import uuid
+import warnings
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from types import TracebackType
+from typing import Any, Self
+
+from workflow.errors import InputError, StageError, one_line
+from workflow.study.task import Done, Task, failed, run_task
+
+CONNECT_S = 10.0
+WITHOUT_WORKERS_S = 60.0
+_LOST_S = 5.0  # how long a broken connection may stay so before the scheduler counts as lost
+_LOOK_S = 0.5
+
+# CasADi and numba's caches are used by one thread at a time, whatever a worker was started with.
+_ONE_AT_A_TIME = threading.Lock()
+
+
+def run_on_worker(task: Task) -> tuple[Done, ...]:
+    """`run_task`, one at a time in each worker."""
+    with _ONE_AT_A_TIME:
+        return run_task(task)
+
+
+class DaskCluster:
+    """The workers behind a scheduler's address. Use as a context manager.
+
+    A worker that dies is the scheduler's business: its task goes to another one. A scheduler that dies ends
+    the study with one line.
+
+    Raises InputError when the extra is not installed, nobody answers, or there are no workers.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            dask: Any = import_module("dask")
+            distributed: Any = import_module("distributed")
+        except ImportError as error:
+            raise InputError(
+                "--scheduler needs the extra 'distributed': pip install 'flexlink[distributed]'"
+            ) from error
+        self._distributed = distributed
+        self.address = address
+        # Its own reports of lost connections would bury our one line.
+        self._loggers = [logging.getLogger(name) for name in ("distributed", "tornado")]
+        self._levels = [logger.level for logger in self._loggers]
+        for logger in self._loggers:
+            logger.setLevel(logging.CRITICAL + 1)
+        self._settings = dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECT_S:.0f}s"})
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # differing versions of packages: the code digest is checked
+                self._client: Any = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
+            self._restore()
+            raise InputError(f"--scheduler {address}: no Dask scheduler answers there") from error
+        try:
+            self._client.wait_for_workers(1, timeout=WITHOUT_WORKERS_S)
+        except (TimeoutError, OSError) as error:
+            self.__exit__(None, None, None)
+            raise InputError(
+                f"--scheduler {address}: no worker within {WITHOUT_WORKERS_S:.0f} s; start one with "
+                f"`dask worker {address}`"
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._client.close(timeout=2)
+        except (OSError, TimeoutError, RuntimeError):
+            pass  # gone already
+        finally:
+            self._restore()
+
+    @property
+    def width(self) -> int:
+        """How many tasks run at once, as far as is known."""
+        return max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+
+    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[int, tuple[Done, ...]]]:
+        """Position and result of every task, as they finish. Raises StageError when the scheduler is lost."""
+        distributed = self._distributed
+        name = uuid.uuid4().hex  # results of another study on the same cluster are not ours
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # a large plant travels with its task: nothing is lost with a worker
+            futures = {
+                self._client.submit(run_on_worker, task, key=f"flexlink-{name}-{index}", pure=False): index
+                for index, task in enumerate(tasks)
+            }
+        alive = time.monotonic()
+        while futures:
+            try:
+                finished = distributed.wait(
+                    list(futures), timeout=_LOOK_S, return_when="FIRST_COMPLETED"
+                ).done
+            except (TimeoutError, distributed.TimeoutError):
+                finished = set()
+            except (OSError, RuntimeError, distributed.client.FuturesCancelledError):
+                raise self._lost() from None
+            if self._client.status == "running":
+                alive = time.monotonic()
+            elif time.monotonic() - alive > _LOST_S or self._client.status == "closed":
+                raise self._lost()
+            for future in finished:
+                if future.status == "cancelled":
+                    raise self._lost()
+                index = futures.pop(future)
+                yield index, self._result(future, tasks[index])
+
+    def _result(self, future: Any, task: Task) -> tuple[Done, ...]:
+        try:
+            done: tuple[Done, ...] = future.result(timeout=CONNECT_S)
+        except self._distributed.KilledWorker:
+            return failed(task, "every worker computing it died (out of memory?)")
+        except (self._distributed.client.FutureCancelledError, TimeoutError, OSError):
+            raise self._lost() from None
+        except Exception as error:
+            # run_task catches everything of its own: this is a worker that cannot even load it.
+            reason = f"{type(error).__name__}: {one_line(error)}"
+            return failed(task, f"the worker cannot run flexlink ({reason})")
+        return done
+
+    def _lost(self) -> StageError:
+        return StageError(f"the Dask scheduler at {self.address} was lost; --resume continues the study")
+
+    def _restore(self) -> None:
+        self._settings.__exit__(None, None, None)
+        for logger, level in zip(self._loggers, self._levels, strict=True):
+            logger.setLevel(level)

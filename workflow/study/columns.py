@@ -1,0 +1,113 @@
+"""What the table says about a point, and which way is better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Number = float | int | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number of the table. `better` None: it is stated, not judged."""
+
+    name: str
+    label: str
+    unit: str = ""
+    better: Literal["larger", "smaller"] | None = None
+
+    @property
+    def heading(self) -> str:
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    def badness(self, value: float) -> float:
+        """Smaller is better. Only for columns that are judged."""
+        return -value if self.better == "larger" else value
+
+
+# Margins without further word are the worst over the ellipses, as the certificate states them.
+_ALL = (
+    Column("worst_gamma", "worst-case gamma", "", "smaller"),
+    Column("modulus_margin", "modulus margin", "", "larger"),
+    Column("gain_margin_dB", "gain margin", "dB", "larger"),
+    Column("phase_margin_deg", "phase margin", "deg", "larger"),
+    Column("delay_margin_ms", "delay margin", "ms", "larger"),
+    Column("bandwidth_rad_s", "bandwidth", "rad/s", "larger"),
+    Column("mode_damping", "mode damping", "", "larger"),
+    Column("mode_omega_rad_s", "of the mode at", "rad/s"),
+    Column("settling_time_s", "settling time", "s", "smaller"),
+    Column("rise_time_s", "rise time", "s", "smaller"),
+    Column("overshoot_percent", "overshoot", "%", "smaller"),
+    Column("peak_command", "peak command", "", "smaller"),
+    Column("disturbance_peak", "disturbance peak", "", "smaller"),
+    Column("settled_draws", "runs that settle"),
+    Column("draws", "runs"),
+    Column("design_gamma", "gamma of the design", "", "smaller"),
+    Column("nominal_modulus_margin", "modulus margin, nominal", "", "larger"),
+    Column("nominal_gain_margin_dB", "gain margin, nominal", "dB", "larger"),
+    Column("nominal_phase_margin_deg", "phase margin, nominal", "deg", "larger"),
+    Column("nominal_delay_margin_ms", "delay margin, nominal", "ms", "larger"),
+)
+COLUMNS: Mapping[str, Column] = {column.name: column for column in _ALL}
+
+
+def numbers_of(
+    design: Mapping[str, Any],
+    certify: Mapping[str, Any],
+    loop: Mapping[str, Any],
+    mode_band_rad_s: tuple[float, float] | None,
+) -> dict[str, Number]:
+    """Numbers of a point from the documents of its stages; None where there is none.
+
+    Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
+    loop, inside the band of the specification where it names one.
+    """
+    found: dict[str, Number] = dict.fromkeys(COLUMNS)
+    if design["synthesis"] is not None:
+        found["design_gamma"] = design["synthesis"]["gamma"]
+    certificate = certify["certificate"]
+    if certificate is not None:
+        verdict = certificate["plants"][0]
+        gamma = certificate["gamma_bound"]
+        found["worst_gamma"] = _finite(certificate["gamma"] if gamma is None else gamma)
+        found["bandwidth_rad_s"] = verdict["bandwidth_rad_s"]
+        found |= _margins("", verdict["worst_margins"]) | _margins("nominal_", verdict["nominal_margins"])
+        low, high = mode_band_rad_s or (0.0, math.inf)
+        modes = [mode for mode in verdict["closed_loop_modes"] if low <= mode["omega_rad_s"] <= high]
+        if modes:
+            least = min(modes, key=lambda mode: float(mode["zeta"]))
+            found["mode_damping"], found["mode_omega_rad_s"] = least["zeta"], least["omega_rad_s"]
+    if loop["skipped"] is None:
+        found["settled_draws"], found["draws"] = loop["settled_draws"], loop["draws"]
+        for name in (
+            "settling_time_s",
+            "rise_time_s",
+            "overshoot_percent",
+            "peak_command",
+            "disturbance_peak",
+        ):
+            values = [row[name] for row in loop["achieved"]]
+            # A run that never gets there has no time: neither has the point.
+            found[name] = None if None in values else max(values)
+    return found
+
+
+def _margins(prefix: str, margins: Mapping[str, Any]) -> dict[str, Number]:
+    """Margins of a certificate's document, where infinite ones are None."""
+    up, down = margins["gain_up"], margins["gain_down"]
+    sides = ([] if up is None else [float(up)]) + ([1.0 / down] if down else [])
+    phase, delay = margins["phase_rad"], margins["delay_s"]
+    return {
+        f"{prefix}modulus_margin": margins["modulus"],
+        f"{prefix}gain_margin_dB": 20 * math.log10(min(sides)) if sides and min(sides) > 0 else None,
+        f"{prefix}phase_margin_deg": None if phase is None else math.degrees(phase),
+        f"{prefix}delay_margin_ms": None if delay is None else 1e3 * delay,
+    }
+
+
+def _finite(value: Any) -> float | None:
+    number = float(value)  # "inf" in the certificate's document
+    return number if math.isfinite(number) else None

@@ -1,0 +1,183 @@
+"""The study's page: what is best, the Pareto plots, every point, and why some are not certified."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from workflow.figures.study import Mark, Panel, draw_pareto
+from workflow.figures.style import Picture, render
+from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text
+from workflow.report.rendering import page
+from workflow.study.columns import COLUMNS, Number
+from workflow.study.points import short
+from workflow.study.rows import PointRow, State
+from workflow.study.settings import Axis, ParetoPlot, StudyConfig
+
+_SHOWN = (
+    "worst_gamma",
+    "modulus_margin",
+    "gain_margin_dB",
+    "phase_margin_deg",
+    "delay_margin_ms",
+    "bandwidth_rad_s",
+    "mode_damping",
+    "settling_time_s",
+    "overshoot_percent",
+    "peak_command",
+)
+_MOST_REASONS = 60
+
+
+def study_pictures(
+    plots: Sequence[ParetoPlot], rows: Sequence[PointRow], fronts: Sequence[Sequence[int]]
+) -> dict[str, Picture]:
+    """The Pareto plots as one picture."""
+    panels = [_panel(plot, rows, front) for plot, front in zip(plots, fronts, strict=True)]
+    return {"pareto": render(draw_pareto(panels))}
+
+
+def study_page(
+    title: str,
+    config: StudyConfig,
+    text: str,
+    base: str,
+    rows: Sequence[PointRow],
+    fronts: Sequence[Sequence[int]],
+    pictures: dict[str, Picture],
+    units: dict[str, str],
+) -> str:
+    """The page as HTML. units: those of columns whose unit the rig decides (peak_command ...)."""
+    sections = [
+        Section("pareto", "What can be had together", "Pareto", _pareto_blocks(config, rows, fronts)),
+        Section("points", "All points", "Points", (_table(config.axes, rows, units), *_points_words())),
+        *_reasons(rows),
+        Section("study", "How it was made", "Made", _made(config, text, base)),
+    ]
+    return page(
+        "study.html.j2",
+        title=title,
+        sections=sections,
+        pictures=pictures,
+        headline=headline(rows),
+        good=any(row.good for row in rows),
+        found=findings(config.axes, rows),
+    )
+
+
+def headline(rows: Sequence[PointRow]) -> str:
+    """One line: how many points, how many certified."""
+    counts = Counter(row.state for row in rows)
+    others = [f"{counts[state]} {state}" for state in _OTHER_STATES if counts[state]]
+    first = f"{counts['certified']} of {len(rows)} points certified"
+    return ", ".join([first, *others])
+
+
+_OTHER_STATES: tuple[State, ...] = ("not certified", "does not settle", "impossible", "failed")
+
+
+def findings(axes: Sequence[Axis], rows: Sequence[PointRow]) -> list[str]:
+    """The best certified point by each of the columns one asks for first."""
+    found = []
+    for name in ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "settling_time_s"):
+        column = COLUMNS[name]
+        placed = [(column.badness(float(v)), row) for row in rows if row.good and (v := row.numbers[name])]
+        if placed:
+            _, best = min(placed, key=lambda item: (item[0], item[1].number))
+            word = "Largest" if column.better == "larger" else "Smallest"
+            value = f"{_cell(best.numbers[name])} {column.unit}".rstrip()
+            asked = ", ".join(f"{axis.name} {short(best.values[axis.key])}" for axis in axes)
+            found.append(f"{word} {column.label}: {value}, point {best.number} ({asked}).")
+    return found
+
+
+def _panel(plot: ParetoPlot, rows: Sequence[PointRow], front: Sequence[int]) -> Panel:
+    x, y = COLUMNS[plot.x], COLUMNS[plot.y]
+    marks = []
+    for row in rows:
+        a, b = row.numbers[plot.x], row.numbers[plot.y]
+        if a is not None and b is not None:
+            marks.append(Mark(row.number, float(a), float(b), row.good, row.number in front))
+    return Panel(
+        x.heading, y.heading, str(x.better), str(y.better), tuple(marks), missing=len(rows) - len(marks)
+    )
+
+
+def _pareto_blocks(
+    config: StudyConfig, rows: Sequence[PointRow], fronts: Sequence[Sequence[int]]
+) -> tuple[Block, ...]:
+    words = [
+        f"{COLUMNS[plot.y].label} against {COLUMNS[plot.x].label}: "
+        + (f"points {', '.join(str(n) for n in front)} are on the front." if front else "no certified point.")
+        for plot, front in zip(config.pareto, fronts, strict=True)
+    ]
+    caption = (
+        "Filled: certified, and every run in closed loop settles; coloured and numbered as in the table: no "
+        "other certified point is better in one and as good in the other. Grey: dominated. Hollow: not "
+        "certified, or some run does not settle; nothing is promised there."
+    )
+    return (Plot("pareto", caption), Remarks(tuple(words), "note"))
+
+
+def _table(axes: Sequence[Axis], rows: Sequence[PointRow], units: dict[str, str]) -> Table:
+    heads = []
+    for name in _SHOWN:
+        unit = COLUMNS[name].unit or units.get(name, "")
+        heads.append(f"{COLUMNS[name].label} [{unit}]" if unit else COLUMNS[name].label)
+    cells = []
+    for row in rows:
+        asked = [short(row.values[axis.key]) for axis in axes]
+        numbers = [_cell(row.numbers[name]) for name in _SHOWN]
+        settled = row.numbers["settled_draws"]
+        runs = "" if settled is None else f"{settled} of {row.numbers['draws']}"
+        cells.append((str(row.number), *asked, *numbers, runs, row.state))
+    return Table(
+        ("point", *(axis.name for axis in axes), *heads, "settle", "state"),
+        tuple(cells),
+        caption="Left of the worst-case gamma what was asked, right of it what came of it: margins and "
+        "bandwidth are the worst over the ellipses, closed-loop numbers the worst over the runs.",
+        met=tuple(row.good for row in rows),
+    )
+
+
+def _points_words() -> tuple[Block, ...]:
+    return (
+        Text(
+            "table.csv and table.json have these numbers with every digit and more of them. Every point is a "
+            "run directory: flexlink report DIR/points/NAME writes its page, and its config.toml can be run "
+            "by itself."
+        ),
+    )
+
+
+def _reasons(rows: Sequence[PointRow]) -> tuple[Section, ...]:
+    missed = [row for row in rows if not row.good]
+    if not missed:
+        return ()
+    listed = [f"Point {row.number} ({row.state}): {row.why}" for row in missed[:_MOST_REASONS]]
+    if len(missed) > _MOST_REASONS:
+        listed.append(f"{len(missed) - _MOST_REASONS} more: see table.csv.")
+    return (Section("why", "Why not certified", "Why not", (Remarks(tuple(listed), "warning"),)),)
+
+
+def _made(config: StudyConfig, text: str, base: str) -> tuple[Block, ...]:
+    how = (
+        "every combination of the axes"
+        if config.search.method == "grid"
+        else f"a Parzen search for {', '.join(COLUMNS[name].label for name in config.search.objectives)}, "
+        f"{config.search.trials} trials in batches of {config.search.batch}"
+    )
+    return (
+        Text(
+            f"Base: {base}. Points: {how}. Records, model and ellipses are shared by all points that leave "
+            "them as they are; all points use the same random streams, so that differences between them are "
+            "not luck."
+        ),
+        Code("The study's file", text),
+    )
+
+
+def _cell(value: Number) -> str:
+    if value is None:
+        return "–"
+    return str(value) if isinstance(value, int) else f"{value:.4g}"

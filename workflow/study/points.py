@@ -1,0 +1,206 @@
+"""From base and axes to points: a name, a checked configuration, and what it shares with other points."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from workflow import storage
+from workflow.config import RunConfig, load_config
+from workflow.entry import built_in_config
+from workflow.errors import InputError
+from workflow.pipeline import config_of
+from workflow.run_directory import RunDirectory, hash_of
+from workflow.settings import check
+from workflow.stages import STAGES, Stage
+from workflow.study.keys import last_name, with_values
+from workflow.study.settings import Axis, StudyConfig
+
+PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
+POINT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("design", "certify", "closed_loop"))
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """What every point starts from: a configuration, and the run whose plant is used where one was given."""
+
+    config: RunConfig
+    inputs: Mapping[str, str]
+    run: RunDirectory | None
+    folder: Path
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of the stage files taken from a given run."""
+        if self.run is None:
+            return {}
+        return {stage.name: self.run.stage_digest(stage.name) for stage in PLANT_STAGES}
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """One combination of values.
+
+    config None: the combination contradicts itself, `refusal` says how. Points of equal `plant_key` share
+    records, model and ellipses; of equal `design_key` the controller as well.
+    """
+
+    number: int
+    name: str
+    values: Mapping[str, Any]
+    config: RunConfig | None
+    refusal: str | None = None
+    inputs: Mapping[str, str] | None = None
+    plant_key: str = ""
+    design_key: str = ""
+    given: tuple[str, ...] = ()
+
+
+def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
+    """The base with the study's `changes` and seed applied. Raises InputError."""
+    run: RunDirectory | None = None
+    if base is None:
+        config, _ = built_in_config()
+    elif base.is_dir():
+        run = RunDirectory.open(base)
+        config = config_of(run)
+        for stage in PLANT_STAGES:
+            run.stage_digest(stage.name)
+    else:
+        config, _ = load_config(base)
+    values = dict(study.changes)
+    if study.study.seed is not None:
+        values["run.seed"] = study.study.seed
+    folder = study_path.absolute().parent
+    changed = _checked(config.to_document(), values, f"{study_path}: changes", folder, gone=run is not None)
+    inputs = run.manifest()["inputs"] if run is not None else _input_hashes(changed)
+    return Base(changed, inputs, run, folder)
+
+
+class PointMaker:
+    """Makes the points of a study, numbered in the order they are asked for."""
+
+    def __init__(self, study: StudyConfig, study_path: Path, base: Base) -> None:
+        self._axes, self._path, self._base = study.axes, study_path, base
+        self._document = base.config.to_document()
+        self._original = None if base.run is None else config_of(base.run)
+        self._digests = base.digests
+        self._made = 0
+        for index, axis in enumerate(self._axes):
+            self._refuse_bad_values(index, axis)
+
+    def make(self, values: Mapping[str, Any]) -> Point:
+        """The point of these values, one per axis. A contradiction is a result and stands in `refusal`."""
+        self._made += 1
+        source = "the configuration contradicts itself"
+        try:
+            config = _checked(
+                self._document, values, source, self._base.folder, gone=self._base.run is not None
+            )
+        except InputError as error:
+            name = self._name(values, hash_of({"base": self._document, "values": values}))
+            return Point(self._made, name, dict(values), None, refusal=str(error))
+        inputs = self._base.inputs if self._base.run is not None else _input_hashes(config)
+        given = self._given(config)
+        plant_key = hash_of(
+            {
+                "given": {name: self._digests[name] for name in given},
+                "seed": None if len(given) == len(PLANT_STAGES) else config.run.seed,
+                "files": dict(inputs),
+                "settings": {stage.name: stage.settings(config) for stage in PLANT_STAGES},
+            }
+        )
+        design_key = hash_of(
+            {"plant": plant_key, "seed": config.run.seed, "settings": POINT_STAGES[0].settings(config)}
+        )
+        name = self._name(values, hash_of({"plant": plant_key, "config": config.to_document()}))
+        return Point(self._made, name, dict(values), config, None, inputs, plant_key, design_key, given)
+
+    def grid(self) -> list[Point]:
+        """Every combination, the last axis fastest."""
+        keys = [axis.key for axis in self._axes]
+        combinations = itertools.product(*(axis.grid() for axis in self._axes))
+        return [self.make(dict(zip(keys, values, strict=True))) for values in combinations]
+
+    def base_point(self) -> Point:
+        """The base itself, whose plant the others begin with; it is no point of the study."""
+        self._made -= 1
+        return self.make({})
+
+    def _given(self, config: RunConfig) -> tuple[str, ...]:
+        """Stages taken over from a given run: those before the first whose settings differ there."""
+        if self._original is None:
+            return ()
+        given = []
+        for stage in PLANT_STAGES:
+            if hash_of(stage.settings(config)) != hash_of(stage.settings(self._original)):
+                break
+            given.append(stage.name)
+        return tuple(given)
+
+    def _name(self, values: Mapping[str, Any], digest: str) -> str:
+        labels = {axis.key: axis.name for axis in self._axes}
+        words = [f"{labels[key]}-{short(value)}" for key, value in values.items()]
+        readable = re.sub(r"[^A-Za-z0-9_.-]+", "_", "_".join(words))[:90]
+        return f"{readable or 'base'}_{digest[:10]}"
+
+    def _refuse_bad_values(self, index: int, axis: Axis) -> None:
+        """A value no combination can make right is an error of the study, named with file and key."""
+        ends: list[tuple[str, Any]]
+        if axis.values is not None:
+            ends = [(f"values[{place}]", value) for place, value in enumerate(axis.values)]
+        else:
+            ends = [("from", axis.from_), ("to", axis.to)]
+        for where, value in ends:
+            source = f"{self._path}: axes[{index}].{where}"
+            gone = self._base.run is not None
+            try:
+                document = with_values(self._document, {axis.key: value})
+                RunConfig.model_validate(document, context=_context(self._base.folder, gone))
+            except ValidationError as error:
+                if all(_only_a_contradiction(detail, axis.key) for detail in error.errors()):
+                    continue
+            except ValueError:
+                pass
+            _checked(self._document, {axis.key: value}, source, self._base.folder, gone=gone)
+
+
+def short(value: Any) -> str:
+    """A value as it stands in names and tables."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(short(item) for item in value) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {short(item)}" for key, item in value.items()) + "}"
+    return str(value)
+
+
+def _only_a_contradiction(detail: Any, key: str) -> bool:
+    """True for what sections say about values that are each right by themselves."""
+    named = detail["loc"] and detail["loc"][-1] == last_name(key)
+    return detail["type"] == "value_error" and not named
+
+
+def _context(folder: Path, gone: bool) -> dict[str, Any]:
+    return {"base": folder, "may_be_gone": gone}
+
+
+def _checked(
+    document: Mapping[str, Any], values: Mapping[str, Any], source: str, folder: Path, *, gone: bool
+) -> RunConfig:
+    try:
+        changed = with_values(document, values)
+    except ValueError as error:
+        raise InputError(f"{source}: {error}") from error
+    return check(RunConfig, changed, source=source, context=_context(folder, gone))
+
+
+def _input_hashes(config: RunConfig) -> dict[str, str]:
+    return {str(path): storage.sha256_of_file(path) for path in config.input_files}

@@ -1,0 +1,108 @@
+"""One row per point: what was asked, what came of it, and why."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from workflow.run_directory import RunDirectory
+from workflow.study.columns import COLUMNS, Number, numbers_of
+from workflow.study.points import Point, short
+from workflow.study.settings import Axis, ParetoPlot
+from workflow.summary import verdict_of
+
+State = Literal["certified", "does not settle", "not certified", "impossible", "failed"]
+
+
+@dataclass(frozen=True, eq=False)
+class PointRow:
+    """A point in the table. `numbers` has every column, None where there is no number."""
+
+    number: int
+    name: str
+    values: Mapping[str, Any]
+    state: State
+    why: str
+    numbers: Mapping[str, Number]
+
+    @property
+    def good(self) -> bool:
+        """Certified, and every run in closed loop settles."""
+        return self.state == "certified"
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "number": self.number,
+            "name": self.name,
+            "values": dict(self.values),
+            "state": self.state,
+            "why": self.why,
+            "numbers": dict(self.numbers),
+        }
+
+
+def row_of(point: Point, run: RunDirectory) -> PointRow:
+    """The row of a finished point."""
+    assert point.config is not None
+    design, certify, loop = (run.load_stage(name).document for name in ("design", "certify", "closed_loop"))
+    state: State
+    if design["synthesis"] is None:
+        state = "impossible"
+    elif not certify["certified"]:
+        state = "not certified"
+    elif loop["skipped"] is not None or loop["settled_draws"] != loop["draws"]:
+        state = "does not settle"
+    else:
+        state = "certified"
+    numbers = numbers_of(design, certify, loop, point.config.specification.mode_band_rad_s)
+    # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
+    why = certify["reason"]
+    if certify["certified"]:
+        why = verdict_of({**design, "met": True}, certify, loop)
+    return PointRow(point.number, point.name, point.values, state, why, numbers)
+
+
+def row_without_run(point: Point, state: State, why: str) -> PointRow:
+    """The row of a point that contradicts itself or failed."""
+    return PointRow(point.number, point.name, point.values, state, why, dict.fromkeys(COLUMNS))
+
+
+def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Sequence[int]]) -> str:
+    """The table; numbers with every digit, nothing where there is none.
+
+    front: numbers of the points on each Pareto front; a column each.
+    """
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    keys = [axis.key for axis in axes]
+    fronts = [f"front_{index + 1}" for index in range(len(front))]
+    writer.writerow(["number", "name", *keys, "state", *COLUMNS, *fronts, "why"])
+    for row in rows:
+        numbers = ["" if row.numbers[name] is None else repr(row.numbers[name]) for name in COLUMNS]
+        asked = [_cell(row.values[key]) for key in keys]
+        on = ["yes" if row.number in members else "no" for members in front]
+        writer.writerow([row.number, row.name, *asked, row.state, *numbers, *on, row.why])
+    return stream.getvalue()
+
+
+def _cell(value: Any) -> str:
+    return repr(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else short(value)
+
+
+def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
+    """Numbers of the good points that no other good point beats in one column without losing in the other."""
+    x, y = COLUMNS[plot.x], COLUMNS[plot.y]
+    placed = []
+    for row in rows:
+        a, b = row.numbers[plot.x], row.numbers[plot.y]
+        if row.good and a is not None and b is not None:
+            placed.append((row.number, x.badness(a), y.badness(b)))
+    return [
+        number
+        for number, a, b in placed
+        if not any(c <= a and d <= b and (c < a or d < b) for _, c, d in placed)
+    ]

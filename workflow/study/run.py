@@ -1,0 +1,307 @@
+"""A whole study as one library call."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Protocol
+
+from workflow import storage
+from workflow.code_version import code_digest
+from workflow.errors import InputError, StageError
+from workflow.progress import Progress, Silence
+from workflow.run_directory import RunDirectory
+from workflow.study.cluster import DaskCluster
+from workflow.study.columns import COLUMNS
+from workflow.study.directory import StudyDirectory, stage_files
+from workflow.study.local import LocalProcesses
+from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point, PointMaker, load_base
+from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_without_run
+from workflow.study.search import Grid, ParzenSearch, Strategy
+from workflow.study.settings import StudyConfig, load_study
+from workflow.study.task import Done, Job, Task
+from workflow.summary import Row, RunSummary, Section
+
+_PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
+
+
+class Executor(Protocol):
+    """Runs tasks somewhere; results come as they finish."""
+
+    @property
+    def width(self) -> int:
+        """How many tasks run at once."""
+
+    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[int, tuple[Done, ...]]]:
+        """Position and result of every task."""
+
+
+def run_study(
+    config_path: Path,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> RunSummary:
+    """Compute every point of a study into `out`, then table and page; the table's numbers in the summary.
+
+    jobs: processes of this machine (default: one per processor). scheduler: address of a Dask scheduler whose
+    workers compute the points; what the points share is still computed here. A point that cannot be certified
+    is a result.
+
+    Raises InputError (one line) for anything wrong with what the user gave, StageError when points failed
+    (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
+    """
+    progress = progress or Silence()
+    if jobs is not None and jobs < 1:
+        raise InputError(f"--jobs must be at least 1, got {jobs}")
+    if jobs is not None and scheduler is not None:
+        raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
+    study, text, base_path = load_study(config_path)
+    base = load_base(study, config_path, base_path)
+    maker = PointMaker(study, config_path, base)
+    strategy: Strategy
+    if study.search.method == "grid":
+        strategy = Grid(maker)
+    else:
+        strategy = ParzenSearch(study, maker, base.config.run.seed)
+    processes = jobs or os.cpu_count() or 1
+    # A cluster that does not answer is found out before anything is written.
+    points_on: AbstractContextManager[Executor] = (
+        LocalProcesses(processes) if scheduler is None else DaskCluster(scheduler)
+    )
+    with points_on as executor:
+        directory = StudyDirectory.begin(out, text=text, base=base, resume=resume)
+        with directory.locked():
+            work = _Work(directory, base, executor, processes, progress)
+            rows = work.compute(strategy, maker.base_point())
+            progress.start("page")
+            started = time.monotonic()
+            summary = _write_up(directory, study, text, base, rows)
+            progress.finish("page", time.monotonic() - started, taken_up=False)
+    broken = [row for row in rows if row.state == "failed"]
+    if broken:
+        raise StageError(
+            f"{len(broken)} of {len(rows)} points failed (table and page are written, --resume tries them "
+            f"again); point {broken[0].number}: {broken[0].why}"
+        )
+    return summary
+
+
+class _Work:
+    """The points of one study on one executor, with the plants they share made before them."""
+
+    def __init__(
+        self,
+        directory: StudyDirectory,
+        base: Base,
+        executor: Executor,
+        processes: int,
+        progress: Progress,
+    ) -> None:
+        self._directory, self._base, self._executor = directory, base, executor
+        self._processes, self._progress = processes, progress
+        self._broken_plants: dict[str, str] = {}
+        self._count = self._finished = self._good = 0
+
+    def compute(self, strategy: Strategy, base_point: Point) -> list[PointRow]:
+        """All rows, in the order of the points."""
+        self._count = strategy.count
+        share = _POINT_S * self._count / self._executor.width
+        self._progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
+        started = time.monotonic()
+        self._progress.start("plant")
+        taken_up = self._make_base_plant(base_point)
+        self._progress.finish("plant", time.monotonic() - started, taken_up=taken_up)
+        started = time.monotonic()
+        self._progress.start("points")
+        rows: list[PointRow] = []
+        for points in strategy.batches():
+            found = self._batch(points, base_point)
+            strategy.learn(found)
+            rows += found
+        self._progress.finish("points", time.monotonic() - started, taken_up=False)
+        return rows
+
+    def _make_base_plant(self, base_point: Point) -> bool:
+        if self._directory.has_plant(base_point):
+            return True
+        self._plants([(base_point, self._from_run(base_point))])
+        reason = self._broken_plants.get(base_point.plant_key)
+        if reason is not None:
+            raise InputError(f"the base cannot be identified: {reason}")
+        return False
+
+    def _batch(self, points: Sequence[Point], base_point: Point) -> list[PointRow]:
+        """The points of a batch: what is finished is taken up, what shares a controller goes together."""
+        rows: dict[str, PointRow] = {}
+        valid = [point for point in points if point.config is not None]
+        for point in points:
+            if point.config is None:
+                rows[point.name] = row_without_run(point, "impossible", str(point.refusal))
+        lacking = {point.plant_key: point for point in valid if not self._directory.has_plant(point)}
+        self._plants([(point, self._given(point, base_point)) for point in lacking.values()])
+        groups: dict[str, list[Point]] = {}
+        for point in {point.name: point for point in valid}.values():
+            if point.plant_key in self._broken_plants:
+                rows[point.name] = row_without_run(point, "failed", self._broken_plants[point.plant_key])
+            elif self._directory.has_point(point):
+                rows[point.name] = row_of(point, self._directory.point(point))
+            else:
+                groups.setdefault(point.design_key, []).append(point)
+        self._report(rows.values())
+        tasks, members = [], list(groups.values())
+        for group in members:
+            given = self._directory.plant_files(group[0])
+            tasks.append(_task(group, given, [stage.name for stage in POINT_STAGES]))
+        for index, results in self._executor.run(tasks):
+            fresh = []
+            for point, done in zip(members[index], results, strict=True):
+                if done.failure is not None:
+                    rows[point.name] = row_without_run(point, "failed", done.failure)
+                else:
+                    self._directory.save_point(point, done)
+                    rows[point.name] = row_of(point, self._directory.point(point))
+                fresh.append(rows[point.name])
+            self._report(fresh)
+        # The same point may be asked for twice by a search: each time under its own number.
+        return [_numbered(rows[point.name], point.number) for point in points]
+
+    def _plants(self, wanted: Sequence[tuple[Point, Mapping[str, bytes]]]) -> None:
+        """Records, models and ellipses, on this machine: the logs are here."""
+        if not wanted:
+            return
+        tasks = []
+        for point, given in wanted:
+            there = {name.partition(".")[0] for name in given}
+            lacking = [stage.name for stage in PLANT_STAGES if stage.name not in there]
+            tasks.append(_task([point], given, lacking))
+        with LocalProcesses(min(self._processes, len(tasks))) as here:
+            for index, (done,) in here.run(tasks):
+                point, given = wanted[index]
+                if done.failure is not None:
+                    self._broken_plants[point.plant_key] = done.failure
+                else:
+                    self._directory.save_plant(point, given, done)
+
+    def _given(self, point: Point, base_point: Point) -> Mapping[str, bytes]:
+        """What a plant begins with: stages of a given run, else those it shares with the base's plant."""
+        if self._base.run is not None:
+            return self._from_run(point)
+        assert point.config is not None
+        assert base_point.config is not None
+        shared = []
+        if point.config.run.seed == base_point.config.run.seed and point.inputs == base_point.inputs:
+            for stage in PLANT_STAGES:
+                if stage.settings(point.config) != stage.settings(base_point.config):
+                    break
+                shared.append(stage.name)
+        return stage_files(self._directory.plant(base_point), shared)
+
+    def _from_run(self, point: Point) -> Mapping[str, bytes]:
+        return {} if self._base.run is None else stage_files(self._base.run, point.given)
+
+    def _report(self, rows: Any) -> None:
+        for row in rows:
+            self._finished += 1
+            self._good += row.good
+        message = f"{self._finished} of {self._count}, {self._good} certified"
+        self._progress.update("points", self._finished / self._count, message)
+
+
+def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[str]) -> Task:
+    jobs = []
+    for point in points:
+        assert point.config is not None
+        jobs.append(Job(point.name, point.config.to_document(), point.inputs or {}))
+    return Task(tuple(jobs), given, tuple(stages), code_digest())
+
+
+def _numbered(row: PointRow, number: int) -> PointRow:
+    return PointRow(number, row.name, row.values, row.state, row.why, row.numbers)
+
+
+def _write_up(
+    directory: StudyDirectory, study: StudyConfig, text: str, base: Base, rows: Sequence[PointRow]
+) -> RunSummary:
+    """Table, picture and page, the page last."""
+    from workflow.study.page import findings, headline, study_page, study_pictures
+
+    fronts = [pareto_front(rows, plot) for plot in study.pareto]
+    title = study.study.title or base.config.run.title or base.config.run.name
+    document = {
+        "title": title,
+        "columns": {
+            name: {"label": column.label, "unit": column.unit, "better": column.better}
+            for name, column in COLUMNS.items()
+        },
+        "fronts": [
+            {"x": plot.x, "y": plot.y, "points": front}
+            for plot, front in zip(study.pareto, fronts, strict=True)
+        ],
+        "points": [row.to_document() for row in rows],
+    }
+    storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, fronts))
+    table = json.dumps(storage.strict_json(storage.encode(document)), indent=1, ensure_ascii=False)
+    storage.write_text(directory.path / "table.json", table + "\n")
+    pictures = study_pictures(study.pareto, rows, fronts)
+    for name, picture in pictures.items():
+        storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)
+    where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
+    storage.write_text(
+        directory.page_path,
+        study_page(title, study, text, where, rows, fronts, pictures, _units(directory, rows)),
+    )
+    return RunSummary(
+        title=title,
+        sections=(
+            Section("study", (Row("points", headline(rows)),)),
+            *(
+                (Section("best", tuple(Row("", words) for words in best)),)
+                if (best := findings(study.axes, rows))
+                else ()
+            ),
+            Section("points", tuple(_line(study, row) for row in rows)),
+        ),
+        numbers=document,
+        certified=any(row.good for row in rows),
+        verdict=headline(rows) if any(row.good for row in rows) else f"no point is certified: {rows[0].why}",
+        report_path=str(directory.page_path),
+    )
+
+
+def _line(study: StudyConfig, row: PointRow) -> Row:
+    from workflow.study.points import short
+
+    asked = ", ".join(f"{axis.name} {short(row.values[axis.key])}" for axis in study.axes)
+    words = [row.state]
+    for name in ("worst_gamma", "modulus_margin", "bandwidth_rad_s"):
+        value = row.numbers[name]
+        if value is not None:
+            words.append(f"{COLUMNS[name].label} {value:.4g} {COLUMNS[name].unit}".rstrip())
+    return Row(f"{row.number}: {asked}", ", ".join(words))
+
+
+def _units(directory: StudyDirectory, rows: Sequence[PointRow]) -> dict[str, str]:
+    """Units that the rig decides, from the records of any finished point."""
+    for row in rows:
+        run = RunDirectory(directory.points_path / row.name)
+        if run.stage_file("records") is not None:
+            config = run.config_document()
+            units = run.load_stage("records").document["records"][0]["units"]
+            control = next(
+                c
+                for i, c in enumerate(config["channels"])
+                if (c["purpose"] or ("control" if i == 0 else "")) == "control"
+            )
+            return {
+                "peak_command": units.get(control["input"], ""),
+                "disturbance_peak": units.get(control["output"], ""),
+            }
+    return {}

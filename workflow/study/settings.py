@@ -1,0 +1,201 @@
+"""`StudyConfig`: base, axes and search of a study, from one TOML file."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from workflow.config import Section
+from workflow.errors import InputError
+from workflow.settings import check, expand, read_toml
+from workflow.study.columns import COLUMNS
+from workflow.study.keys import last_name, parse_key
+
+MOST_POINTS = 10_000
+_DIGITS = 6  # of a number in a range: enough for any tuning, and short in names and tables
+
+
+def _key(text: str) -> str:
+    parse_key(text)
+    return text
+
+
+def _judged(name: str) -> str:
+    column = COLUMNS.get(name)
+    if column is None or column.better is None:
+        known = ", ".join(key for key, item in COLUMNS.items() if item.better is not None)
+        raise ValueError(f"no column {name!r} to compare by; known: {known}")
+    return name
+
+
+DottedKey = Annotated[str, AfterValidator(_key)]
+Judged = Annotated[str, AfterValidator(_judged)]
+
+
+class Axis(Section):
+    """One key and the values it takes."""
+
+    key: DottedKey = Field(
+        description="dotted key of the run's configuration, e.g. specification.bandwidth_rad_s"
+    )
+    label: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$", max_length=24)] | None = Field(
+        None, description="short name in the table and in the names of points; default: last name of the key"
+    )
+    values: tuple[Any, ...] | None = Field(None, min_length=1, description="list of values")
+    from_: int | float | None = Field(None, alias="from", description="lower end of a range")
+    to: int | float | None = Field(None, description="upper end of a range")
+    points: int | None = Field(None, ge=2, le=1000, description="points of the range in a grid")
+    log: bool = Field(False, description="range in equal ratios")
+
+    @model_validator(mode="after")
+    def _list_or_range(self) -> Self:
+        ranged = self.from_ is not None or self.to is not None
+        if (self.values is not None) == ranged:
+            raise ValueError("give values, or from and to")
+        if self.values is not None:
+            if self.points is not None or self.log:
+                raise ValueError("points and log go with from and to")
+            texts = [repr(value) for value in self.values]
+            twice = next((text for text in texts if texts.count(text) > 1), None)
+            if twice is not None:
+                raise ValueError(f"the value {twice} is listed twice")
+        elif self.from_ is None or self.to is None:
+            raise ValueError("a range needs from and to")
+        elif not self.from_ < self.to:
+            raise ValueError(f"a range needs from below to; got {self.from_} and {self.to}")
+        elif self.log and not self.from_ > 0:
+            raise ValueError(f"a range in equal ratios starts above 0; got {self.from_}")
+        return self
+
+    @property
+    def name(self) -> str:
+        return self.label or last_name(self.key)
+
+    @property
+    def whole(self) -> bool:
+        """A range of whole numbers: both ends are written as such."""
+        return isinstance(self.from_, int) and isinstance(self.to, int)
+
+    def grid(self) -> tuple[Any, ...]:
+        """The values of the axis; of a range its `points` (whole numbers: all between, without `points`)."""
+        if self.values is not None:
+            return self.values
+        assert self.from_ is not None
+        assert self.to is not None
+        if self.points is None:
+            return tuple(range(int(self.from_), int(self.to) + 1))
+        spread = np.geomspace if self.log else np.linspace
+        numbers = [tidy(float(value)) for value in spread(self.from_, self.to, self.points)]
+        if self.whole:
+            return tuple(dict.fromkeys(round(number) for number in numbers))
+        return tuple(numbers)
+
+
+def tidy(value: float) -> float:
+    """The number to six digits."""
+    return float(f"{value:.{_DIGITS}g}")
+
+
+class Search(Section):
+    """How the points are chosen."""
+
+    method: Literal["grid", "optuna"] = Field(
+        "grid", description="grid: every combination; optuna: a tree-structured Parzen search (extra optuna)"
+    )
+    trials: int = Field(30, ge=1, le=MOST_POINTS, description="points of a search")
+    batch: int = Field(
+        4, ge=1, le=200, description="points chosen at a time; how many run at once changes no number"
+    )
+    startup_trials: int = Field(8, ge=1, description="points drawn at random before the search learns")
+    objectives: tuple[Judged, ...] = Field(
+        ("worst_gamma",), min_length=1, max_length=3, description="columns of the table to make better"
+    )
+
+
+class ParetoPlot(Section):
+    """Two columns to plot against each other."""
+
+    x: Judged
+    y: Judged
+
+    @model_validator(mode="after")
+    def _two_columns(self) -> Self:
+        if self.x == self.y:
+            raise ValueError(f"x and y are the same column, {self.x!r}")
+        return self
+
+
+_DEFAULT_PLOTS = (
+    ParetoPlot(x="bandwidth_rad_s", y="modulus_margin"),
+    ParetoPlot(x="peak_command", y="settling_time_s"),
+)
+
+
+class StudySection(Section):
+    title: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$", max_length=120)] = Field(
+        "", description="headline of the page; default: that of the base"
+    )
+    base: str | None = Field(
+        None,
+        min_length=1,
+        description="run configuration (TOML) or run directory, relative to this file; default: built-in arm",
+    )
+    seed: int | None = Field(
+        None, ge=0, description="root of every random stream of every point; default: that of the base"
+    )
+
+
+class StudyConfig(Section):
+    """A whole study. Load with `load_study`."""
+
+    study: StudySection = Field(default_factory=StudySection)
+    changes: Mapping[DottedKey, Any] = Field(
+        default_factory=dict, description="dotted keys of the base set to other values for every point"
+    )
+    axes: tuple[Axis, ...] = Field(min_length=1, max_length=12)
+    search: Search = Field(default_factory=Search)
+    pareto: tuple[ParetoPlot, ...] = Field(_DEFAULT_PLOTS, min_length=1, max_length=4)
+
+    @model_validator(mode="after")
+    def _axes_differ(self) -> Self:
+        for kind, names in (
+            ("keys", [axis.key for axis in self.axes]),
+            ("labels", [axis.name for axis in self.axes]),
+        ):
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"two axes have the same {kind[:-1]} {name!r}: give different {kind}")
+        if self.study.seed is not None and any(axis.key == "run.seed" for axis in self.axes):
+            raise ValueError("study.seed and an axis over run.seed contradict each other")
+        if self.search.method == "grid":
+            for index, axis in enumerate(self.axes):
+                if axis.values is None and axis.points is None and not axis.whole:
+                    raise ValueError(f"axes[{index}] ({axis.key}): a grid over a range needs points")
+            count = math.prod(len(axis.grid()) for axis in self.axes)
+            if count > MOST_POINTS:
+                raise ValueError(f"the grid has {count} points, more than {MOST_POINTS}")
+        return self
+
+
+def load_study(path: Path) -> tuple[StudyConfig, str, Path | None]:
+    """Study, its text, and the base (a file or a directory; None: the built-in arm).
+
+    Raises InputError: one line naming file, key and what was expected.
+    """
+    text, document = read_toml(path)
+    config = check(StudyConfig, document, source=str(path))
+    if config.study.base is None:
+        return config, text, None
+    try:
+        base = Path(os.path.normpath(path.absolute().parent / expand(config.study.base)))
+    except ValueError as error:
+        raise InputError(f"{path}: study.base: {error}") from error
+    if not base.exists():
+        raise InputError(f"{path}: study.base: no such file or run directory: {base}")
+    return config, text, base

@@ -1,0 +1,124 @@
+"""What a worker does: bytes in, bytes out, in a directory of its own that is gone afterwards.
+
+Nothing here knows where it runs. A worker that dies leaves nothing behind, and the same task gives the same
+bytes anywhere: streams are keyed by the seed in the configuration and the stage, never by worker or order.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from workflow import storage
+from workflow.code_version import code_digest
+from workflow.config import RunConfig
+from workflow.errors import InputError, StageError, one_line
+from workflow.pipeline import stage_input_hash
+from workflow.progress import Silence
+from workflow.run_directory import RunDirectory
+from workflow.stages import STAGES, StageInput
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One directory to fill: a configuration (`RunConfig.to_document`) and its input files' hashes."""
+
+    name: str
+    config: Mapping[str, Any]
+    inputs: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Jobs for one worker, one after the other: a result two of them share is computed once.
+
+    given: stage files (name to content) that every job starts from. stages: names of those to compute.
+    code: digest of the code of whoever asks.
+    """
+
+    jobs: tuple[Job, ...]
+    given: Mapping[str, bytes]
+    stages: tuple[str, ...]
+    code: str
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """What became of a job: stage files by name, seconds and input hash by stage; or why it failed.
+
+    bad_input: the failure is about what the user gave, not about the computation.
+    """
+
+    name: str
+    files: Mapping[str, bytes]
+    seconds: Mapping[str, float]
+    hashes: Mapping[str, str]
+    failure: str | None = None
+    bad_input: bool = False
+
+
+def run_task(task: Task) -> tuple[Done, ...]:
+    """Compute a task. Whatever goes wrong inside a job is that job's failure and nobody else's."""
+    if task.code != code_digest():
+        return failed(
+            task, "the code of the worker is not that of the study: another version, or edited meanwhile"
+        )
+    done = []
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        earlier: list[RunDirectory] = []
+        for job in task.jobs:
+            run = RunDirectory(Path(folder) / str(len(earlier)))
+            try:
+                seconds, hashes = _fill(run, job, task, earlier)
+                files = {path.name: path.read_bytes() for path in map(run.stage_file, task.stages) if path}
+                done.append(Done(job.name, files, seconds, hashes))
+            except InputError as error:
+                done.append(Done(job.name, {}, {}, {}, str(error), bad_input=True))
+            except StageError as error:
+                done.append(Done(job.name, {}, {}, {}, str(error)))
+            except Exception as error:
+                reason = f"internal error: {type(error).__name__}: {one_line(error)}"
+                done.append(Done(job.name, {}, {}, {}, reason))
+            earlier.append(run)
+    return tuple(done)
+
+
+def failed(task: Task, reason: str) -> tuple[Done, ...]:
+    """Every job of the task failed for the same reason."""
+    return tuple(Done(job.name, {}, {}, {}, reason) for job in task.jobs)
+
+
+def _fill(
+    run: RunDirectory, job: Job, task: Task, earlier: list[RunDirectory]
+) -> tuple[dict[str, float], dict[str, str]]:
+    run.stages_path.mkdir(parents=True)
+    for name, content in task.given.items():
+        storage.write_bytes(run.stages_path / name, content)
+    config = RunConfig.from_document(job.config, source=job.name)
+    seconds, hashes = {}, {}
+    for stage in STAGES:
+        if stage.name not in task.stages:
+            continue
+        started = time.monotonic()
+        wanted = stage_input_hash(stage, config, run, job.inputs)
+        if not _take_over(run, stage.name, wanted, earlier):
+            data = stage.run(StageInput(config, run, Silence()))
+            run.save_stage(stage.name, data, wanted)
+        seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
+    return seconds, hashes
+
+
+def _take_over(run: RunDirectory, stage: str, wanted: str, earlier: list[RunDirectory]) -> bool:
+    for other in earlier:
+        path = other.stage_file(stage)
+        if path is not None and other.is_done(stage, wanted):
+            shutil.copyfile(path, run.stages_path / path.name)
+            return True
+    return False
