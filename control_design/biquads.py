@@ -127,26 +127,33 @@ def imaginary_axis(omega_rad_s: Real, dt_s: float) -> Complex:
 
 
 def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real, Real, Real, Real]:
-    """Balanced companion of numerator/denominator in p, mapped by the trapezoidal rule with step 2 h."""
+    """Balanced companion of numerator/denominator in p, mapped by the trapezoidal rule with step 2 h.
+
+    The rule needs (I - h F)^-1; for one or two states it is written out, since searches build many loops.
+    The symmetric split sqrt(2h) on input and output keeps both of one size.
+    """
     direct = float(numerator[0])
-    tail = numerator[1:] - direct * denominator[1:]
+    tail = [float(value) for value in numerator[1:] - direct * denominator[1:]]
+    root = float(np.sqrt(2.0 * h))
     if denominator.size == 2:
-        f = np.array([[-denominator[1]]])
-        g = np.ones((1, 1))
-        row = tail.reshape(1, 1)
-    else:
-        # States (w0 x, x') with w0 = sqrt(e^b): both of one size around the section's own frequency.
-        w0 = float(np.sqrt(denominator[2]))
-        f = np.array([[0.0, w0], [-w0, -denominator[1]]])
-        g = np.array([[0.0], [1.0]])
-        row = np.array([[tail[1] / w0, tail[0]]])
-    identity = np.eye(f.shape[0])
-    left = identity - h * f
-    a = np.linalg.solve(left, identity + h * f)
-    # Trapezoidal rule with the symmetric split sqrt(2h) on input and output keeps both of one size.
-    root = np.sqrt(2.0 * h)
-    b = root * np.linalg.solve(left, g)
-    c = root * np.linalg.solve(left.T, row.T).T
-    d = np.array([[direct]]) + h * row @ np.linalg.solve(left, g)
-    matrices = [np.asarray(matrix, dtype=np.float64) for matrix in (a, b, c, d)]
-    return matrices[0], matrices[1], matrices[2], matrices[3]
+        f = -float(denominator[1])
+        inverse = 1.0 / (1.0 - h * f)
+        return (
+            np.array([[(1.0 + h * f) * inverse]]),
+            np.array([[root * inverse]]),
+            np.array([[root * tail[0] * inverse]]),
+            np.array([[direct + h * tail[0] * inverse]]),
+        )
+    # States (w0 x, x') with w0 = sqrt(e^b): both of one size around the section's own frequency.
+    # F = [[0, w0], [-w0, -d]], g = (0, 1)', row = (tail1/w0, tail0).
+    w0, d = float(np.sqrt(denominator[2])), float(denominator[1])
+    v = h * w0
+    scale = 1.0 / (1.0 + h * d + v * v)  # 1/det(I - h F)
+    inverse_2 = np.array([[(1.0 + h * d) * scale, v * scale], [-v * scale, scale]])
+    row = np.array([[tail[1] / w0, tail[0]]])
+    through = row @ inverse_2
+    # (I - hF)^-1 (I + hF) = 2 (I - hF)^-1 - I
+    a = 2.0 * inverse_2
+    a[0, 0] -= 1.0
+    a[1, 1] -= 1.0
+    return a, root * inverse_2[:, 1:], root * through, np.array([[direct + h * float(through[0, 1])]])

@@ -1,14 +1,14 @@
-"""Descent on the worst case itself: from any stable controller to near a local minimum, stable at every
-step.
+"""Descent on the worst case itself: from any stable controller to a local minimum, stable at every step.
 
-gamma(x) is a maximum of smooth functions, one per frequency and requirement. Each step linearises their
-logarithms at the worst member of the ellipse (by the envelope theorem that member may be held fixed), solves
-the linear programme "smallest largest value within a box" and accepts the step only where the true value
-falls and all nominal loops stay stable. The interior-point programme converges faster at the end but may
-leave a good start for good; this does not.
+gamma(x) is a maximum of smooth functions, one per frequency and requirement. Each step models their
+logarithms at the worst member of the ellipse: slopes by the envelope theorem (that member may be held
+fixed), one common curvature, that of the sum weighted by the multipliers of the step before. It solves
+"smallest largest row within a box" (`minimax_step`) and accepts only where the true value falls and all
+nominal loops stay stable. With curvature, convergence near the end is that of Newton's method also where
+fewer rows are active than there are parameters.
 
-Worst members are looked for on `_BOUNDARY` points of each ellipse's boundary and refined by a parabola: good
-for a direction, not for a certificate.
+Worst members are looked for on `_BOUNDARY` points of each ellipse's boundary, refined by a parabola and
+Newton's method: good for a direction, not for a certificate.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
+import numpy.typing as npt
 
 from control_design.angle_program import Rows, parameter_bounds
 from control_design.biquads import Cascade, tustin_frequency
 from control_design.ellipses import Complex, Real
+from control_design.minimax_step import MinimaxStep, minimax_step
 
 _BOUNDARY = 40
 _FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
 _PATIENCE, _SLOW = 15, 1e-3  # give up where so many steps gain less than this share
+_LEAST_GAIN = 1e-7  # predicted gain of a step, in the logarithm, not worth taking
 _FAR_BELOW = 2.5  # rows this far (in log) below the worst cannot become it within one step and are left out
+_REFINEMENTS = 2  # Newton steps from the vertex of the parabola to the worst member
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,74 +59,110 @@ class MinimaxDescent:
         self._damping_rows = np.zeros((len(slack), cascade.parameters))
         for row, at in enumerate(slack):
             self._damping_rows[row, at], self._damping_rows[row, at + 1] = -1.0, 0.5
-        self._damping_limit = 0.0 if controller_damping is None else -float(np.log(2 * controller_damping))
+        limit = 0.0 if controller_damping is None else -float(np.log(2 * controller_damping))
+        self._damping_limit = np.full(len(slack), limit)
 
     def value(self, parameters: Real) -> float:
         """Worst case on the boundary points; inf for an unstable nominal loop or an ellipse over -1."""
-        if not self.stable(parameters) or any(plant.covers_minus_one(parameters) for plant in self._plants):
-            return float("inf")
-        logs = [plant.rows(parameters, gradient=False)[0] for plant in self._plants]
-        return float(np.exp(max(float(np.max(log)) for log in logs)))
+        logs = self._logs(parameters)
+        return float("inf") if logs is None else float(np.exp(np.max(logs)))
 
     def run(self, start: Real, steps: int) -> Descended:
-        """At most `steps` linear programmes from a start with stable nominal loops."""
+        """At most `steps` steps from a start with stable nominal loops."""
         x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
-        best, box, taken = self.value(x), _FIRST_BOX, 0
-        if not np.isfinite(best):
-            return Descended(x, best, 0)
-        model: tuple[Real, Real] | None = None
+        logs = self._logs(x)
+        if logs is None:
+            return Descended(x, float("inf"), 0)
+        best, box, taken = float(np.max(logs)), _FIRST_BOX, 0
+        local: _Local | None = None
+        multipliers: Real | None = None
         earlier = best
         for number in range(steps):
             if number % _PATIENCE == 0 and number > 0:
-                if best > earlier * (1 - _SLOW):
+                if best > earlier - _SLOW:
                     break
                 earlier = best
-            if model is None:
-                parts = [plant.rows(x, gradient=True) for plant in self._plants]
-                model = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+            if local is None:
+                local = self._local(x, multipliers)
             taken += 1
-            step, predicted = self._step(x, model[0], model[1], box)
-            gain = np.log(best) - predicted
-            if step is None or gain < 1e-7:
+            step = self._step(x, local, local.log, box)
+            if step is None:
                 break
-            trial = x + step
-            value = self.value(trial)
-            actual = np.log(best) - np.log(value) if np.isfinite(value) else -np.inf
-            if actual > 0.02 * gain:
-                x, best, model = trial, value, None
-            if actual > 0.7 * gain:
+            move = step.step * local.unit
+            predicted = best - step.level - 0.5 * float(move @ local.curvature @ move)
+            if predicted < _LEAST_GAIN:
+                break
+            trial, after = x + move, self._logs(x + move)
+            if after is not None and best - float(np.max(after)) < 0.25 * predicted:
+                # The rows bend more than their common curvature says: once more, with the rows as they are
+                # at the trial point (second-order correction).
+                again = self._step(x, local, after - local.slope @ move, box)
+                if again is not None:
+                    second = x + again.step * local.unit
+                    corrected = self._logs(second)
+                    if corrected is not None and np.max(corrected) < np.max(after):
+                        step, trial, after = again, second, corrected
+            actual = -np.inf if after is None else best - float(np.max(after))
+            if after is not None and actual > 0.02 * predicted:
+                x, best, local, multipliers = trial, float(np.max(after)), None, step.multipliers
+            if actual > 0.7 * predicted:
                 box = min(2.0 * box, _LARGEST_BOX)
-            elif actual < 0.25 * gain:
+            elif actual < 0.25 * predicted:
                 box *= 0.35
             if box < _SMALLEST_BOX:
                 break
-        return Descended(x, best, taken)
+        return Descended(x, float(np.exp(best)), taken)
 
-    def _step(self, x: Real, log: Real, slope: Real, box: float) -> tuple[Real | None, float]:
-        """d of min s, log + slope d <= s, |d| <= box in natural units; (None, worst) where it fails."""
+    def _logs(self, x: Real) -> Real | None:
+        """Logarithms (R,) of all weighted values; None for an unstable loop or an ellipse over -1."""
+        if not self.stable(x) or any(plant.covers_minus_one(x) for plant in self._plants):
+            return None
+        return np.concatenate([plant.rows(x, gradient=False)[0] for plant in self._plants])
+
+    def _local(self, x: Real, multipliers: Real | None) -> _Local:
+        """Rows, slopes and (with multipliers of the rows) their common curvature, made semi-definite."""
+        log, slope, curvature, at = [], [], np.zeros((x.size, x.size)), 0
+        for plant in self._plants:
+            part = plant.rows(x, gradient=True)
+            log.append(part[0])
+            slope.append(part[1])
+            if multipliers is not None:
+                curvature += plant.curvature(x, multipliers[at : at + part[0].size])
+            at += part[0].size
         unit = natural_units(self.cascade, x)
-        worst = float(np.max(log))
-        near = log > worst - _FAR_BELOW
-        n = x.size
-        a = np.column_stack([slope[near] * unit, -np.ones(int(np.sum(near)))])
-        b = worst - log[near]
-        if self._damping_rows.shape[0]:
-            a = np.vstack(
-                [a, np.column_stack([self._damping_rows * unit, np.zeros(len(self._damping_rows))])]
-            )
-            b = np.concatenate([b, self._damping_limit - self._damping_rows @ x])
-        low = np.maximum(-box, (self._low - x) / unit)
-        high = np.minimum(box, (self._high - x) / unit)
-        answer = linprog(
-            np.append(np.zeros(n), 1.0),
-            A_ub=a,
-            b_ub=b,
-            bounds=[*zip(low.tolist(), high.tolist(), strict=True), (-20.0, 0.0)],
-            method="highs-ds",
+        if multipliers is not None:
+            size, axes = np.linalg.eigh(curvature * np.outer(unit, unit))
+            curvature = (axes * np.maximum(size, 0.0)) @ axes.T / np.outer(unit, unit)
+        return _Local(np.concatenate(log), np.concatenate(slope), curvature, unit)
+
+    def _step(self, x: Real, local: _Local, log: Real, box: float) -> MinimaxStep | None:
+        """Smallest largest row, |d| <= box in natural units; multipliers of all rows; None where it fails."""
+        unit = local.unit
+        near = log > np.max(log) - _FAR_BELOW
+        step = minimax_step(
+            log[near],
+            local.slope[near] * unit,
+            local.curvature * np.outer(unit, unit),
+            np.maximum(-box, (self._low - x) / unit),
+            np.minimum(box, (self._high - x) / unit),
+            self._damping_rows * unit,
+            self._damping_limit - self._damping_rows @ x,
         )
-        if answer.x is None:
-            return None, worst
-        return np.asarray(answer.x[:n] * unit, dtype=np.float64), worst + float(answer.x[n])
+        if step is None:
+            return None
+        multipliers = np.zeros(log.size)
+        multipliers[near] = step.multipliers
+        return MinimaxStep(step.step, step.level, multipliers)
+
+
+@dataclass(frozen=True, eq=False)
+class _Local:
+    """Model at a point: log (R,), slope (R, n), curvature (n, n), natural unit of each parameter (n,)."""
+
+    log: Real
+    slope: Real
+    curvature: Real
+    unit: Real
 
 
 class _Boundary:
@@ -162,8 +201,7 @@ class _Boundary:
         """Logarithms (R,) of all weighted values and, if asked, their slopes (R, n)."""
         bare = self._cascade.response(x, self._omega)
         k = bare * self._delay
-        everywhere = np.arange(k.size)
-        at = self._worst(k, everywhere, -np.abs(1.0 + self._members * k[:, None]))
+        at, _, _ = self._nearest(k)
         back = 1.0 + at * k
         distance = -np.log(np.maximum(np.abs(back), 1e-300))
         effort = self._effort
@@ -172,9 +210,7 @@ class _Boundary:
         damped = self._damped
         worst = np.zeros(0, dtype=np.complex128)
         if damped.size:
-            members = self._members[damped]
-            ratio = np.abs(members) / np.maximum(np.abs(1.0 + members * k[damped, None]), 1e-300)
-            worst = self._worst(k, damped, ratio, disturbance=True)
+            worst, _, _ = self._loudest(k[damped])
             gain = np.abs(worst) / np.maximum(np.abs(1.0 + worst * k[damped]), 1e-300)
             logs.append(np.log(self._rows.w4[damped] * gain))
         if not gradient:
@@ -186,22 +222,146 @@ class _Boundary:
             slopes.append((-(worst * k[damped] / (1.0 + worst * k[damped]))[:, None] * relative[damped]).real)
         return np.concatenate(logs), np.concatenate(slopes)
 
-    def _worst(self, k: Complex, index: np.ndarray, value: Real, *, disturbance: bool = False) -> Complex:
-        """Member with the largest value: best boundary point, then the vertex of the parabola through it."""
+    def curvature(self, x: Real, multipliers: Real) -> Real:
+        """Second derivative (n, n) of the rows' sum weighted by multipliers (R,).
+
+        A row is the largest over the boundary angle of psi(x, angle), so its second derivative is psi_xx -
+        psi_xa psi_xa' / psi_aa: a long ellipse bends the row although its worst member moves only along it.
+        """
+        k = self._cascade.response(x, self._omega) * self._delay
+        count, effort, damped = self._omega.size, self._effort, self._damped
+        shared = multipliers[:count].copy()
+        shared[effort] += multipliers[count : count + effort.size]
+        of_effort = np.zeros(count)
+        of_effort[effort] = multipliers[count : count + effort.size]
+        relative = self._relative_slope(x)
+        total, second = self._bent(relative, k, shared, self._nearest(k), np.zeros(count))
+        second = second + of_effort
+        if damped.size:
+            more, own = self._bent(
+                relative[damped],
+                k[damped],
+                multipliers[count + effort.size :],
+                self._loudest(k[damped]),
+                np.ones(damped.size),
+            )
+            total = total + more
+            second[damped] += own
+        return total + self._section_curvature(x, relative, second)
+
+    @staticmethod
+    def _bent(
+        relative: Complex, k: Complex, share: Real, member: tuple[Complex, Complex, Complex], open_loop: Real
+    ) -> tuple[Real, Complex]:
+        """Curvature of sum share (open_loop log|g| - log|1 + g K|) but for that of log K, and the factor of
+        the latter, (F,)."""
+        g, g1, g2 = member
+        back = 1.0 + g * k
+        back = np.where(np.abs(back) < 1e-300, 1e-300, back)
+        w = g * k / back
+        total = -np.real((relative * (share * (w - w**2))[:, None]).T @ relative)
+        mixed = -np.real((g1 * k / back**2)[:, None] * relative)
+        safe = np.where(np.abs(g) > 0, g, 1.0)
+        bend = np.real(open_loop * (g2 / safe - (g1 / safe) ** 2) - g2 * k / back + (g1 * k / back) ** 2)
+        use = (bend < -1e-12) & (share > 0)
+        total = total + (mixed[use] * (share[use] / -bend[use])[:, None]).T @ mixed[use]
+        return total, np.asarray(-share * w, dtype=np.complex128)
+
+    def _nearest(self, k: Complex) -> tuple[Complex, Complex, Complex]:
+        """Members (F,) with the smallest |1 + g K|, and their first and second derivative along the
+        boundary."""
+        everywhere = np.arange(k.size)
+
+        def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
+            back = 1.0 + g * k
+            first = (back.conj() * g1 * k).real
+            return -np.abs(back), -first, -(np.abs(g1 * k) ** 2 + (back.conj() * g2 * k).real)
+
+        return self._worst(everywhere, -np.abs(1.0 + self._members * k[:, None]), newton)
+
+    def _loudest(self, k: Complex) -> tuple[Complex, Complex, Complex]:
+        """The same for the largest |g/(1 + g K)| at the damped frequencies; k (D,)."""
+        members = self._members[self._damped]
+        ratio = np.abs(members) / np.maximum(np.abs(1.0 + members * k[:, None]), 1e-300)
+
+        def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
+            back, safe = 1.0 + g * k, np.where(np.abs(g) > 0, g, 1.0)
+            back = np.where(np.abs(back) < 1e-300, 1e-300, back)
+            first = (g1 / safe - g1 * k / back).real
+            second = (g2 / safe - (g1 / safe) ** 2 - g2 * k / back + (g1 * k / back) ** 2).real
+            return np.abs(g) / np.abs(back), first, second
+
+        return self._worst(self._damped, ratio, newton)
+
+    def _worst(
+        self,
+        index: npt.NDArray[np.int64],
+        value: Real,
+        newton: Callable[[Complex, Complex, Complex], tuple[Real, Real, Real]],
+    ) -> tuple[Complex, Complex, Complex]:
+        """Largest member: best boundary point, vertex of the parabola through it, Newton from there.
+
+        newton: (value, slope, bend) along the boundary from a member and its derivatives. A point that does
+        not gain on the boundary's best is not taken.
+        """
+        e = self._ellipses
+        centre, turn = e.centre[index], e.direction[index]
+        major, minor = e.semi_major[index], e.semi_minor[index]
+
+        def member(angle: Real) -> tuple[Complex, Complex, Complex]:
+            cos, sin = np.cos(angle), np.sin(angle)
+            away = turn * (major * cos + 1j * minor * sin)
+            return centre + away, turn * (-major * sin + 1j * minor * cos), -away
+
         row = np.arange(index.size)
         top = np.argmax(value, axis=1)
         here, before, after = (value[row, (top + step) % _BOUNDARY] for step in (0, -1, 1))
         bend = before - 2 * here + after
         with np.errstate(divide="ignore", invalid="ignore"):
             shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
-        angle = 2 * np.pi * (top + np.clip(shift, -0.5, 0.5)) / _BOUNDARY
-        e = self._ellipses
-        refined = e.centre[index] + e.direction[index] * (
-            e.semi_major[index] * np.cos(angle) + 1j * e.semi_minor[index] * np.sin(angle)
-        )
-        found = np.abs(1.0 + refined * k[index])
-        better = np.abs(refined) / np.maximum(found, 1e-300) > here if disturbance else -found > here
-        return np.asarray(np.where(better, refined, self._members[index, top]), dtype=np.complex128)
+        width = 2 * np.pi / _BOUNDARY
+        best = width * top
+        angle = best + width * np.clip(shift, -0.5, 0.5)
+        for _ in range(_REFINEMENTS + 1):
+            found, slope, curve = newton(*member(angle))
+            better = found > here
+            best, here = np.where(better, angle, best), np.where(better, found, here)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                change = np.where(curve < 0, -slope / np.where(curve < 0, curve, -1.0), 0.0)
+            angle = angle + np.clip(change, -0.5 * width, 0.5 * width)
+        return member(best)
+
+    def _section_curvature(self, x: Real, relative: Complex, factor: Complex) -> Real:
+        """Real part of sum factor (F,) times the second derivative of log K, (n, n): block by section."""
+        p = self._powers
+        total = np.zeros((x.size, x.size))
+        at = 0
+        for kind, (numerator, denominator) in zip(
+            self._cascade.sections, self._cascade.split(x), strict=True
+        ):
+            if kind == "notch":
+                top, bottom = np.polyval(numerator, p), np.polyval(denominator, p)
+                top = np.where(np.abs(top) < 1e-300, 1e-300, top)
+                in_top = np.stack([np.exp(x[at]) * p / top, 0 * p, denominator[2] / top], axis=1)
+                in_bottom = np.stack([0 * p, denominator[1] * p / bottom, denominator[2] / bottom], axis=1)
+                block = np.real(
+                    (in_bottom * factor[:, None]).T @ in_bottom - (in_top * factor[:, None]).T @ in_top
+                )
+                block += np.diag(np.real(factor @ (in_top - in_bottom)))
+                total[at : at + 3, at : at + 3] = block
+                at += 3
+                continue
+            n = numerator.size
+            tops = relative[:, at : at + n]
+            total[at : at + n, at : at + n] = -np.real((tops * factor[:, None]).T @ tops)
+            at += n
+            m = 0 if kind == "integrator" else n - 1
+            if m:
+                bottoms = relative[:, at : at + m]
+                block = np.real((bottoms * factor[:, None]).T @ bottoms)
+                total[at : at + m, at : at + m] = block + np.diag(np.real(factor @ bottoms))
+                at += m
+        return total
 
     def _relative_slope(self, x: Real) -> Complex:
         """(dK/dx)/K, (F, n)."""

@@ -29,6 +29,7 @@ class Problem:
         self.plants, self.spec, self.options = plants, specification, options
         self.dt_s = plants[0].dt_s
         self.scale = options.scale_rad_s or _frequency_scale(plants, specification)
+        self._loops = [_Loop(plant, specification.computational_delay_samples) for plant in plants]
         self.grids: list[Real] = []
         self.dense: list[PlantData] = []
         for plant in plants:
@@ -89,7 +90,7 @@ class Problem:
         asked = self.spec.controller_damping
         if asked is not None and not cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
             return float("inf")  # a start that IPOPT left infeasible
-        if not self.stable(cascade, parameters):
+        if not self.usable(cascade, parameters):
             return float("inf")
         worst = 0.0
         for data in self.dense:
@@ -98,11 +99,17 @@ class Problem:
         return worst
 
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
-        """Whether every nominal loop is; false also for a controller that is numerically degenerate."""
+        """Whether every nominal loop is (poles of the full state space, strictly inside the circle)."""
+        a, b, c, d = cascade.state_space(parameters)
+        return all(loop.stable(a, b, c, d) for loop in self._loops)
+
+    def usable(self, cascade: Cascade, parameters: Real) -> bool:
+        """Whether it can be built and every nominal loop is stable; false also where no anti-windup gain
+        exists, which a numerically degenerate controller shows."""
         try:
             controller = self.controller(cascade, parameters)
         except ValueError:
-            return False  # no anti-windup gain
+            return False
         return all(
             bool(np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1.0)
             for plant in self.plants
@@ -198,6 +205,36 @@ class Problem:
         integrators = plant.n_integrators + int(self.spec.integrator)
         centre = -np.pi * (plant.unstable_poles + integrators / 2.0)
         return (centre - 1.4, centre + 1.4) if integrators == 0 else (centre - 0.63, centre + 1.87)
+
+
+class _Loop:
+    """One nominal plant with the computational delay at its input, ready to be closed many times."""
+
+    def __init__(self, plant: UncertainPlant, delay_samples: int) -> None:
+        a, b, c, d = (np.asarray(getattr(plant.nominal, m), dtype=np.float64) for m in "ABCD")
+        for _ in range(delay_samples):
+            n = a.shape[0]
+            a = np.block([[a, b], [np.zeros((1, n + 1))]])
+            b = np.vstack([np.zeros((n, 1)), np.ones((1, 1))])
+            c, d = np.hstack([c, d]), np.zeros((1, 1))
+        self._a, self._b, self._c, self._d = a, b, c, float(d[0, 0])
+
+    def stable(self, a: Real, b: Real, c: Real, d: Real) -> bool:
+        """Whether the loop with this controller is; false for an algebraic loop."""
+        loop = 1.0 + float(d[0, 0]) * self._d
+        n, m = self._a.shape[0], a.shape[0]
+        if not (abs(loop) > 1e-12 and np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
+            return False
+        # u = (c x_k - d C x)/loop, e = -(C x + D u)
+        u = np.hstack([(-float(d[0, 0]) / loop) * self._c, c / loop])
+        e = -self._d * u
+        e[:, :n] -= self._c
+        closed = np.vstack([self._b @ u, b @ e])
+        closed[:n, :n] += self._a
+        closed[n:, n:] += a
+        if not np.all(np.isfinite(closed)):
+            return False
+        return bool(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0) < 1.0) or n + m == 0
 
 
 def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specification) -> float:
