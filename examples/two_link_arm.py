@@ -65,19 +65,15 @@ def figure(result, truth, bands) -> Figure:
         for axis, show in ((gain, np.abs), (phase, lambda g: np.degrees(np.unwrap(np.angle(g))))):
             axis.semilogx(OMEGA, show(truth[:, i]), "k-" if i else "k:", lw=1, label=f"truth, {name}")
             axis.semilogx(OMEGA, show(model[:, i]), color=colour, lw=2.2, alpha=0.7, label=f"model, {name}")
-    gain.set_title("Two-link arm, elbow at 120°, motor voltages to tip")
-    gain.set(yscale="log", ylim=(1e-9, 2), ylabel="gain, m/V")
-    phase.set(
-        xlabel="frequency, rad/s", ylabel="phase, degrees", xlim=OMEGA[[0, -1]], yticks=range(-1080, 1, 180)
-    )
-    gain.grid(alpha=0.3)
-    phase.grid(alpha=0.3)
+            axis.grid(alpha=0.3)
+    gain.set(yscale="log", ylim=(1e-9, 2), ylabel="gain, m/V", title="Two-link arm, both motors to tip")
+    phase.set(xlabel="frequency, rad/s", ylabel="phase, degrees", xlim=OMEGA[[0, -1]])
+    phase.set_yticks(range(-1080, 1, 180))
     gain.legend(title="bands: 95 % of the model", loc="lower left")
     return picture
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
     identified, true_response, uncertain = run()
     report(identified, true_response)
-    figure(identified, true_response, uncertain).savefig(folder / "two_link_arm.png", dpi=120)
+    figure(identified, true_response, uncertain).savefig(Path(*sys.argv[1:2]) / "two_link_arm.png", dpi=120)

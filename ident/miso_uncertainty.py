@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from ident.arrays import ComplexArray, RealArray
 from ident.basis import basis_response
@@ -91,7 +92,7 @@ def response_uncertainty(
     return tuple(result)
 
 
-def _free_states(identification: MisoIdentification) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def _free_states(identification: MisoIdentification) -> npt.NDArray[np.intp]:
     """Indices of the block states that belong to searched poles: what was fixed comes first of each type."""
     poles = identification.model.poles
     n_real, n_pairs = identification.n_fixed
@@ -104,7 +105,7 @@ def _covariance_factor(
     data: MisoRegression,
     poles: Poles,
     projection: MisoProjection,
-    free: np.ndarray[tuple[int], np.dtype[np.intp]],
+    free: npt.NDArray[np.intp],
     noise_std: float,
 ) -> RealArray:
     """F (P, P) with F F^T the covariance of [coefficients of all channels, direct terms, states' weights]."""

@@ -316,6 +316,79 @@ def test_uncertainty_with_fixed_poles_is_that_of_linear_least_squares():
     np.testing.assert_allclose(bands[1].covariance, expected, rtol=1e-6, atol=1e-12)
 
 
+def test_uncertainty_is_that_of_all_unknowns_together():
+    """Gauss-Newton covariance of poles and coefficients from finite differences of the simulation."""
+    options = IdentOptions(
+        integrators=1, input_delay_samples=1, feedthrough=True, n_real=1, n_pairs=1,
+        estimate_offset=False, estimate_initial_state=False,
+    )  # fmt: skip
+    u = np.random.default_rng(2).normal(size=(400, 2))
+    truth = MisoModel(
+        Poles(np.array([0.0, 0.9]), np.array([0.8 + 0.5j])),
+        np.random.default_rng(3).normal(size=(2, 4)), np.array([0.5, -0.3]), DT_S, ("a", "b"), "y", 1, 1,
+    )  # fmt: skip
+    y = truth.simulate(u) + 0.1 * np.random.default_rng(4).normal(size=400)
+    item = Record("test", u, y[:, None], DT_S, ("a", "b"), ("y",))
+    result = identify_miso([item], options)
+    model = result.model
+
+    def moved(x):
+        poles = Poles(np.array([0.0, x[0]]), np.array([complex(x[1], x[2])]))
+        return MisoModel(poles, x[3:11].reshape(2, 4), x[11:], DT_S, ("a", "b"), "y", 1, 1)
+
+    pair = model.poles.pairs[0]
+    best = np.concatenate(
+        [[model.poles.real[1], pair.real, pair.imag], model.coefficients.ravel(), model.feedthrough]
+    )
+    omega = np.geomspace(1.0, 300.0, 12)
+    of_output, of_response, step = [], [], 1e-6
+    for direction in np.eye(best.size):
+        up, down = moved(best + step * direction), moved(best - step * direction)
+        of_output.append((up.simulate(u) - down.simulate(u))[1:] / (2 * step))
+        change = (up.frequency_response(omega) - down.frequency_response(omega)) / (2 * step)
+        of_response.append(np.stack([change.real, change.imag]))
+    jacobian = np.array(of_output).T
+    covariance = result.noise_std**2 * np.linalg.inv(jacobian.T @ jacobian)
+    # (P, Re/Im, F, U)
+    expected = np.einsum("iafu,ij,jbfu->ufab", of_response, covariance, of_response)
+    for i, band in enumerate(response_uncertainty([item], result, omega)):
+        scale = np.trace(expected[i], axis1=1, axis2=2)[:, None, None]
+        # The residual is orthogonal to the tangent space only to the tolerance of the descent; differences
+        # carry 1e-9 or so.
+        np.testing.assert_allclose(band.covariance / scale, expected[i] / scale, rtol=0, atol=1e-5)
+
+
+def test_nothing_but_noise_has_no_poles():
+    rng = np.random.default_rng(0)
+    item = Record("noise", rng.normal(size=(800, 2)), rng.normal(size=(800, 1)), DT_S, ("a", "b"), ("y",))
+    result = identify_miso([item])
+    assert result.model.order == 0
+    assert any("no pole" in sentence for sentence in result.warnings)
+    assert np.all(result.model.frequency_response(OMEGA) == 0)
+
+
+def test_nlopt_and_long_records_lead_to_the_same_poles(fitted):
+    for options in (
+        IdentOptions(algorithm="GN_DIRECT_L", n_real=1, n_pairs=2),
+        IdentOptions(search_samples=1500, n_real=1, n_pairs=2),
+    ):
+        poles = identify_miso([record(0)], options).model.poles
+        np.testing.assert_allclose(poles.values, fitted.model.poles.values, rtol=0, atol=1e-6)
+
+
+def test_advice_on_alike_inputs_and_coloured_residuals():
+    item = record(0, n=1000)
+    nearly = np.column_stack([item.input[:, 0], item.input[:, 0] + 0.05 * item.input[:, 1]])
+    y = signal.dlsim((*sampled(), DT_S), nearly)[1]
+    noise = signal.lfilter(
+        [1.0], [1.0, -0.97], 0.05 * np.random.default_rng(1).normal(size=(1000, 1)), axis=0
+    )
+    options = IdentOptions(n_real=1, n_pairs=2)
+    result = identify_miso([Record("alike", nearly, y + noise, DT_S, ("a", "b"), ("tip",))], options)
+    assert any("nearly one signal" in sentence for sentence in result.warnings)
+    assert any("not white" in sentence for sentence in result.warnings)
+
+
 def test_two_link_example(tmp_path):
     from examples import two_link_arm  # here: it draws
 
