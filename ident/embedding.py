@@ -88,7 +88,8 @@ class EmbeddingOptions(BaseModel):
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="prior probability that the poles lack a lightly damped mode; 0: none is looked for",
+        description="prior probability that the poles lack a lightly damped mode; 0: none is looked for. "
+        "For records only: a fit to a measured frequency response does not look for one",
     )
     coloured_noise: bool = Field(
         default=False, description="whiten with an AR model of the residuals, three rounds"

@@ -24,7 +24,7 @@ class Rows:
     """One record: nuisance (T,n), regressors F (T,p), output y (T,), all whitened.
 
     input (T,) is the input after integrators, delay and A(q); head (n,) its first samples before A(q), and
-    first (n,n) the matrix that whitens those rows.
+    first (n,n) the matrix that whitens those rows: zero where they are dropped, and so are they.
     """
 
     nuisance: RealArray
@@ -63,12 +63,14 @@ class EmbeddingRows:
             yield self._rows(record)
 
     def blocks(self) -> Iterator[RegressionBlock]:
-        """Rows with kernel columns."""
+        """Rows with kernel columns; those that are dropped are left out, for they count as data here."""
         for rows in self:
             kernel = _shifted(rows.input, self.fir_length)
-            if rows.first.size:
-                kernel[: len(rows.first)] = rows.first @ _shifted(rows.head, self.fir_length)
-            yield RegressionBlock(rows.nuisance, rows.regressors, kernel, rows.output)
+            n = len(rows.first)
+            if n:
+                kernel[:n] = rows.first @ _shifted(rows.head, self.fir_length)
+            used = slice(0 if np.any(rows.first) else n, None)
+            yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel[used], rows.output[used])
 
     def pair_blocks(self) -> Iterator[PairBlock]:
         """Rows with the signal that drives one more pair after all the poles."""

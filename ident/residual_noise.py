@@ -1,10 +1,11 @@
-"""Residuals of a whitened fit, and how much of the noise's correlation the fit itself has absorbed.
+"""Residuals of a whitened fit, and what the fit itself has done to the noise's correlation.
 
 Residuals of a fit are poorer in slow noise than the noise was: offset, initial states and slow poles take it
 up. A noise model from them puts too little at low frequency (AR(1) 0.87 for 0.9 with 2000 samples and 33
 columns), which makes the ellipses there too small by a quarter. For residuals e = (I - P) v of a generalised
-least squares fit with the covariance S of v in its weights, E e e^T = S - K (K^T S^-1 K)^-1 K^T, so the
-expected loss is known, lag by lag.
+least squares fit that whitens noise v with A(q), E (A e)_t e_s is not zero for s < t, but minus
+(A Z)_t . Z_s with Z Z^T = K (K^T S^-1 K)^-1 K^T, S the covariance of v and K all columns of the fit: the
+part that the fit has absorbed.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.signal import lfilter
 
 from ident.arrays import RealArray
-from ident.autoregression import whitened
+from ident.autoregression import first_rows, whitened
 from ident.embedding_algebra import KernelPosterior, ReducedRegression, joint_factor
 from ident.embedding_rows import EmbeddingRows
 
@@ -25,16 +27,23 @@ _RANK = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Absorbed:
-    """Columns Z (T,r) of each record with Z Z^T = K (K^T S^-1 K)^-1 K^T for innovations of unit variance."""
+    """Columns Z (T,r) of each record, for innovations of unit variance.
+
+    Where a fit leaves the first rows out, Z is what the noise filter makes of its whitened rows from rest:
+    that part of the columns is correlated with the noise of the rows used.
+    """
 
     columns: tuple[RealArray, ...]
 
-    def lag_sums(self, max_lag: int) -> RealArray:
-        """sum over t of Z_t . Z_(t+k), k = 0 .. max_lag, over all records."""
-        sums = np.zeros(max_lag + 1)
+    def gradient(self, whitening: RealArray, order: int, start: int) -> RealArray:
+        """-E sum over t >= start of (A e)_t e_(t-i), i = 1 .. order, over records longer than 2 start."""
+        sums = np.zeros(order)
         for z in self.columns:
-            for k in range(max_lag + 1):
-                sums[k] += float(np.sum(z[: z.shape[0] - k] * z[k:]))
+            if z.shape[0] <= 2 * start:
+                continue
+            innovations = lfilter(whitening, np.ones(1), z, axis=0)[start:]
+            for i in range(1, order + 1):
+                sums[i - 1] += float(np.sum(innovations * z[start - i : z.shape[0] - i]))
         return sums
 
 
@@ -50,6 +59,7 @@ def gls_residuals(
     p = reduced.n_columns
     scale = np.linalg.norm(reduced.r11, axis=0)
     residuals, absorbed = [], []
+    drops = rows.whitening.size > 1 and not np.any(first_rows(rows.whitening))
     for block in rows.with_whitening(np.ones(1)).blocks():
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
         shared = block.regressors[:, reduced.kept] / scale
@@ -67,5 +77,8 @@ def gls_residuals(
             shared = shared - fitted[:, 1:]
         theirs = solve_triangular((reduced.r11 / scale).T, shared.T, lower=True, check_finite=False).T
         residuals.append(rest)
-        absorbed.append(np.column_stack([local, theirs]))
+        columns = np.column_stack([local, theirs])
+        if drops:
+            columns = lfilter(np.ones(1), rows.whitening, whitened(columns, rows.whitening), axis=0)
+        absorbed.append(columns)
     return residuals, Absorbed(tuple(absorbed))

@@ -66,7 +66,7 @@ class PairBlock:
     """Rows of one record: nuisance (T,n), regressors F (T,p), output y (T,), all whitened.
 
     signal (T,) is the whitened input after the all-pass of F's poles; the first n rows are those of the plain
-    signal, head (n,), times first (n,n).
+    signal, head (n,), times first (n,n), which is zero where the first rows are dropped.
     """
 
     nuisance: RealArray

@@ -85,25 +85,87 @@ def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(whitening):
         np.testing.assert_allclose(z @ z.T, taken[here, here], atol=1e-9 * np.abs(taken).max())
         start += n
     assert ours.shape[0] == total
-    expected = [
-        sum(np.trace(taken[a : a + n, a : a + n], offset=lag) for a, n in zip((0, 60), sizes, strict=True))
-        for lag in range(4)
-    ]
-    np.testing.assert_allclose(absorbed.lag_sums(3), expected, rtol=1e-9)
 
 
-def test_nothing_absorbed_changes_nothing_and_a_given_share_is_put_back():
+# A resonance over a floor 1e-7 below it: the first rows are dropped.
+NARROW = np.real(np.poly([0.96 * np.exp(0.1j), 0.96 * np.exp(-0.1j), 0.9, 0.8, 0.9]))
+
+
+@pytest.mark.parametrize("whitening", [FILTERS[0], FILTERS[1], FILTERS[2], NARROW])
+def test_bias_of_the_estimating_equations_equals_the_dense_one(whitening):
+    rng = np.random.default_rng(5)
+    n, order, start = 80, 5, 6
+    record = Record("r", rng.standard_normal((n, 1)), rng.standard_normal((n, 1)), DT, ("u",), ("y",))
+    structure = Structure(estimate_offset=True, estimate_initial_state=True)
+    rows = EmbeddingRows((record,), structure, Poles(np.array([0.9, 0.6])), 3, whitening)
+    reduced = reduce_regression(rows.blocks())
+    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1))
+    _, absorbed = gls_residuals(rows, reduced, conditional_posterior(grid, np.zeros((1, 1)), 1.0))
+
+    a = np.arange(n)
+    k = np.column_stack(
+        [np.ones(n), 0.9**a, 0.6**a]
+        + [signal.lfilter([0.0, 1.0], [1.0, -p], record.input[:, 0]) for p in (0.9, 0.6)]
+    )
+    filtering = signal.lfilter(whitening, [1.0], np.eye(n), axis=0)
+    white = filtering.copy()
+    if whitening is NARROW:
+        white = white[whitening.size - 1 :]
+    else:
+        white[: whitening.size - 1] = 0
+        head = covariance(whitening, n)[: whitening.size - 1, : whitening.size - 1]
+        white[: whitening.size - 1, : whitening.size - 1] = np.linalg.inv(np.linalg.cholesky(head))
+    fit = k @ np.linalg.lstsq(white @ k, white, rcond=None)[0]
+    left = np.eye(n) - fit
+    moments = filtering @ left @ covariance(whitening, n) @ left.T
+    expected = [-sum(moments[t, t - i] for t in range(start, n)) for i in range(1, order + 1)]
+    np.testing.assert_allclose(
+        absorbed.gradient(whitening, order, start), expected, atol=1e-5 * np.abs(expected).max()
+    )
+
+
+def test_nothing_absorbed_changes_nothing_and_the_bias_of_a_mean_is_put_back():
     rng = np.random.default_rng(4)
     e = signal.lfilter([1.0], FILTERS[0], rng.standard_normal(3000))
-    plain = fit_autoregression([e], 4)
+    plain = fit_autoregression([e], 1)
     nothing = Absorbed((np.zeros((3000, 1)),))
-    np.testing.assert_allclose(fit_autoregression([e], 4, FILTERS[0], nothing), plain, rtol=1e-12)
-    # A constant that took a tenth of the variance at every lag's sum: the rest is less correlated.
-    gamma = autocovariance(FILTERS[0], 1)
-    share = np.full((3000, 1), np.sqrt(0.1 * gamma[0]))
-    seen = gamma - 0.1 * gamma[0]
-    moved = fit_autoregression([e], 4, FILTERS[0], Absorbed((share,)))
-    assert moved[1] - plain[1] == pytest.approx(-gamma[1] / gamma[0] + seen[1] / seen[0], rel=1e-3)
+    np.testing.assert_allclose(fit_autoregression([e], 1, FILTERS[0], nothing), plain, rtol=1e-12)
+    # The mean estimated: Z = 1 (1^T S^-1 1)^(-1/2), and the bias of a is known to be (1 + rho) / N.
+    weight = np.linalg.norm(whitened(np.ones(3000), FILTERS[0]))
+    moved = fit_autoregression([e], 1, FILTERS[0], Absorbed((np.full((3000, 1), 1 / weight),)))
+    assert moved[1] - plain[1] == pytest.approx(-1.9 / 3000, rel=0.1)
+
+
+def test_a_correction_that_is_no_small_perturbation_is_shrunk():
+    """Noise with a range of eight decades, most of it absorbed: the spectrum moves by less than two."""
+    rng = np.random.default_rng(6)
+    e = signal.lfilter([1.0], NARROW, rng.standard_normal(4000))
+    slow = np.column_stack([np.cos(w * np.arange(4000)) for w in np.linspace(0.05, 0.15, 40)])
+    plain = fit_autoregression([e], 5)
+    for size in (1.0, 1e3, 1e6):
+        moved = fit_autoregression([e], 5, NARROW, Absorbed((size * slow,)))
+        assert np.all(np.abs(np.roots(moved)) < 1)
+        w = np.linspace(0, np.pi, 3000)
+        ratio = np.abs(signal.freqz(moved, [1.0], w)[1] / signal.freqz(plain, [1.0], w)[1]) ** 2
+        assert ratio.min() > 0.499
+        assert ratio.max() < 2.0
+    # Had it not been shrunk it would have been 1e6 times what it is.
+    assert np.abs(ratio - 1).max() > 0.3
+
+
+def test_first_rows_are_dropped_where_their_covariance_is_nearly_singular():
+    np.testing.assert_array_equal(first_rows(NARROW), np.zeros((5, 5)))
+    y = np.random.default_rng(7).standard_normal((30, 2))
+    white = whitened(y, NARROW)
+    np.testing.assert_array_equal(white[:5], 0.0)
+    np.testing.assert_allclose(white[5:], signal.lfilter(NARROW, [1.0], y, axis=0)[5:], rtol=1e-12)
+    record = Record("r", y[:, :1], y[:, 1:], DT, ("u",), ("y",))
+    rows = EmbeddingRows((record,), Structure(), Poles(np.array([0.5])), 3, NARROW)
+    (block,) = rows.blocks()
+    assert block.output.size == block.kernel.shape[0] == len(block.nuisance) == 25
+    (pair,) = rows.pair_blocks()
+    np.testing.assert_array_equal(pair.regressors[:5], 0.0)
+    np.testing.assert_array_equal(pair.first, 0.0)
 
 
 def test_noise_model_is_not_biased_by_the_fit():
