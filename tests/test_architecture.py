@@ -15,7 +15,8 @@ MAY_IMPORT = {
     "plant": set(),
     "ident": set(),
     "control_design": {"ident"},
-    "workflow": {"plant", "ident", "control_design"},
+    "diagnosis": {"plant", "ident"},
+    "workflow": {"plant", "ident", "control_design", "diagnosis"},
 }
 ROOMS = set(MAY_IMPORT)
 # control_design takes result types from ident, never its estimators.
@@ -54,12 +55,12 @@ def test_imports_point_one_way(room):
 
 
 def test_arrows_have_no_circle():
-    order = ["plant", "ident", "control_design", "workflow"]
+    order = ["plant", "ident", "control_design", "diagnosis", "workflow"]
     for position, room in enumerate(order):
         assert MAY_IMPORT[room] <= set(order[:position])
 
 
-@pytest.mark.parametrize("room", ["plant", "ident", "control_design"])
+@pytest.mark.parametrize("room", ["plant", "ident", "control_design", "diagnosis"])
 def test_numerical_rooms_run_without_plotting_or_command_line(room):
     # A fresh interpreter in which those modules cannot be found: an import inside a function counts as well
     # only when it runs, so the static check below looks at every import statement.

@@ -1,0 +1,341 @@
+"""What may be missing in the model: every effect of the registry with coordinates, ranges and starts.
+
+A range is wide on purpose: three decades and more, in units that come from the rig and the records (stall
+torque, link mass, record length), so that no number here belongs to one arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from diagnosis.case import Case, Real
+from plant.effects import EFFECTS, Effect
+
+Scale = Literal["log", "linear", "angle"]
+
+# A parametric effect smaller than this many tolerances of the parameter it multiplies is no finding.
+_TOLERANCES = 3.0
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One coordinate of a search: parameter, scale, range, and a step for difference quotients.
+
+    `low` and `high` are in the parameter's unit; the coordinate is its logarithm on a "log" axis.
+    """
+
+    parameter: str
+    scale: Scale
+    low: float
+    high: float
+    step: float
+
+    def coordinate(self, value: float) -> float:
+        return float(np.log(value)) if self.scale == "log" else float(value)
+
+    def value(self, coordinate: float) -> float:
+        return float(np.exp(coordinate)) if self.scale == "log" else float(coordinate)
+
+    @property
+    def box(self) -> tuple[float, float]:
+        """Bounds of the coordinate; an angle has none."""
+        if self.scale == "angle":
+            return -np.inf, np.inf
+        return self.coordinate(self.low), self.coordinate(self.high)
+
+    @property
+    def width(self) -> float:
+        """Length of the range in the coordinate: its prior is flat over it."""
+        if self.scale == "angle":
+            return 2 * np.pi
+        return self.coordinate(self.high) - self.coordinate(self.low)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect (or one side of it: a ratio above or below 1) as a search space.
+
+    Attributes
+    ----------
+    effect : str
+        Registry id.
+    axes : tuple of Axis
+        The first one is the size; larger coordinates mean a larger effect if `grows`, smaller ones otherwise.
+    starts : (S, A) tuple of coordinates
+    sign : +1 or -1
+        Of a signed size (ratio - 1, drift).
+    """
+
+    effect: str
+    axes: tuple[Axis, ...]
+    starts: tuple[tuple[float, ...], ...]
+    sign: int = 1
+    grows: bool = True
+
+    @property
+    def label(self) -> str:
+        return self.effect if self.sign > 0 else f"{self.effect} (below)"
+
+    def parameters(self, x: Real) -> dict[str, float]:
+        """Parameter values of the effect at the coordinates x (A,)."""
+        values = {axis.parameter: axis.value(v) for axis, v in zip(self.axes, x, strict=True)}
+        if self.effect == "stribeck_friction":
+            values["coulomb_torque_Nm"] *= values["static_torque_Nm"]
+        elif self.effect == "sensor_drift":
+            values["rate_m_s"] *= self.sign
+        elif "phase_rad" in values:
+            values["phase_rad"] = float(np.mod(values["phase_rad"], 2 * np.pi))
+        return values
+
+    def effect_at(self, x: Real) -> Effect:
+        return EFFECTS[self.effect](**self.parameters(x))
+
+    @cached_property
+    def box(self) -> tuple[Real, Real]:
+        """Bounds (A,), (A,) of the coordinates."""
+        low, high = zip(*(axis.box for axis in self.axes), strict=True)
+        return np.array(low), np.array(high)
+
+    @property
+    def log_volume(self) -> float:
+        """log of the product of all widths."""
+        return float(sum(np.log(axis.width) for axis in self.axes))
+
+    def from_size(self, smallest: float) -> Candidate:
+        """The same candidate with its size no smaller than this coordinate of its first axis."""
+        axis = self.axes[0]
+        value = axis.value(smallest)
+        if self.grows:
+            axis = replace(axis, low=min(max(value, axis.low), 0.99 * axis.high + 0.01 * axis.low))
+        else:
+            axis = replace(axis, high=max(min(value, axis.high), 1.01 * axis.low))
+        return replace(self, axes=(axis, *self.axes[1:]))
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Magnitudes of a rig and its records that ranges are made of."""
+
+    voltage_V: float
+    torque_Nm: float
+    angle_rad: float
+    duration_s: float
+    dt_s: float
+    link_mass_kg: float
+    hub_inertia_kg_m2: float
+    link_stiffness_Nm_rad: float
+    damping_Nms: float
+    tip_noise_m: float
+
+    @classmethod
+    def of(cls, case: Case) -> Scales:
+        rig = case.rig
+        voltage = max(float(np.max(np.abs(e.voltage_V))) for e in case.experiments)
+        link = rig.link
+        return cls(
+            voltage_V=voltage,
+            torque_Nm=rig.motor.torque_per_volt_Nm_V * voltage,
+            angle_rad=max(float(np.max(np.abs(e.output[:, 0]))) for e in case.experiments),
+            duration_s=max(e.voltage_V.size for e in case.experiments) * rig.sampling.dt_s,
+            dt_s=rig.sampling.dt_s,
+            link_mass_kg=link.mass_per_length_kg_m * link.length_m,
+            hub_inertia_kg_m2=rig.hub.inertia_kg_m2,
+            link_stiffness_Nm_rad=3 * link.bending_stiffness_Nm2 / link.length_m,
+            damping_Nms=rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms,
+            tip_noise_m=rig.sensors.tip_noise_m,
+        )
+
+
+def candidates(case: Case) -> tuple[Candidate, ...]:
+    """Every effect of the registry; signed ones twice, above and below."""
+    s = Scales.of(case)
+    tau, k, J = s.torque_Nm, s.link_stiffness_Nm_rad, s.hub_inertia_kg_m2
+    found = [
+        _grid(
+            "coulomb_friction", [_log("torque_Nm", 1e-5 * tau, tau, 1e-3)], [_geom(3e-4 * tau, 0.6 * tau, 14)]
+        ),
+        _grid(
+            "stribeck_friction",
+            [
+                _log("static_torque_Nm", 1e-5 * tau, 2 * tau, 2e-3),
+                Axis("coulomb_torque_Nm", "linear", 0.0, 0.98, 2e-3),  # share of the static level
+                _log("stribeck_velocity_rad_s", 2e-3, 5.0, 2e-3),
+            ],
+            [_geom(3e-4 * tau, 0.6 * tau, 8), [0.5, 0.8], [0.02, 0.1, 0.5]],
+        ),
+        _grid(
+            "viscous_friction",
+            [_log("coefficient_Nms", 1e-5 * s.damping_Nms, 30 * s.damping_Nms)],
+            [_geom(1e-4 * s.damping_Nms, 3 * s.damping_Nms, 8)],
+        ),
+        _grid(
+            "actuator_saturation",
+            [_log("limit_V", 0.05 * s.voltage_V, s.voltage_V, 1e-4)],
+            [_geom(0.1 * s.voltage_V, 0.99 * s.voltage_V, 24)],
+            grows=False,
+        ),
+        _grid(
+            "actuator_dead_zone",
+            [_log("width_V", 1e-5 * s.voltage_V, s.voltage_V, 1e-4)],
+            [_geom(1e-3 * s.voltage_V, 0.5 * s.voltage_V, 12)],
+        ),
+        _grid(
+            "actuator_lag",
+            [_log("time_constant_s", 2e-4 * s.dt_s, 200 * s.dt_s)],
+            [_geom(0.02 * s.dt_s, 40 * s.dt_s, 10)],
+        ),
+        _grid(
+            "input_delay",
+            [_log("delay_s", 2e-4 * s.dt_s, 100 * s.dt_s)],
+            [_geom(0.04 * s.dt_s, 30 * s.dt_s, 14)],
+        ),
+        _grid(
+            "tip_payload",
+            [_log("mass_kg", 1e-6 * s.link_mass_kg, 5 * s.link_mass_kg)],
+            [_geom(1e-4 * s.link_mass_kg, 1.5 * s.link_mass_kg, 14)],
+        ),
+        _grid(
+            "torque_ripple",
+            [
+                _log("amplitude_Nm", 1e-6 * tau, tau),
+                Axis("cycles_per_rev", "linear", 0.3, 80.0, 1e-4),
+                _PHASE,
+            ],
+            [],
+        ),
+        _grid(
+            "periodic_disturbance",
+            [
+                _log("amplitude_Nm", 1e-6 * tau, tau),
+                Axis("frequency_Hz", "linear", 0.3 / s.duration_s, 0.5 / s.dt_s, 1e-5),
+                _PHASE,
+            ],
+            [],
+        ),
+        _grid(
+            "joint_compliance",
+            [_log("stiffness_Nm_rad", 0.05 * k, 1e4 * k), _log("damping_Nms", 1e-6 * k, 100 * k)],
+            [_geom(0.2 * k, 1e3 * k, 12), [3e-4, 3e-3, 2e-2]],
+            grows=False,
+            # Damping in proportion to the stiffness: time constants, not torques.
+            link=lambda p: {**p, "damping_Nms": p["damping_Nms"] * p["stiffness_Nm_rad"]},
+        ),
+        _grid(
+            "base_compliance",
+            [
+                _log("stiffness_Nm_rad", 1e-3 * k, 1e5 * k),
+                _log("damping_Nms", 1e-6 * k, 10 * k),
+                _log("inertia_kg_m2", 0.02 * J, 300 * J),
+            ],
+            [_geom(1.0, 40.0, 14), [0.02, 0.15], [0.5, 2.0, 8.0, 30.0]],
+            grows=False,
+            link=lambda p: _base(p, J),
+        ),
+        _grid("backlash", [_log("gap_rad", 1e-5, 0.5, 5e-3)], [_geom(3e-4, 0.2, 30)]),
+        _grid("gravity", [_log("acceleration_m_s2", 1e-4, 20.0)], [_geom(1e-3, 10.0, 12)]),
+        _grid(
+            "hardening_spring",
+            [_log("cubic_Nm_rad3", 1e-7 * tau / s.angle_rad**3, 1e3 * tau / s.angle_rad**3)],
+            [_geom(1e-5 * tau / s.angle_rad**3, 10 * tau / s.angle_rad**3, 12)],
+        ),
+        _grid(
+            "sensor_lag",
+            [_log("time_constant_s", 2e-4 * s.dt_s, 200 * s.dt_s)],
+            [_geom(0.02 * s.dt_s, 40 * s.dt_s, 10)],
+        ),
+        _grid(
+            "quantisation",
+            [_log("step_m", 0.3 * s.tip_noise_m, 100 * s.tip_noise_m, 1e-3)],
+            [_geom(0.5 * s.tip_noise_m, 30 * s.tip_noise_m, 24)],
+        ),
+    ]
+    for sign in (1, -1):
+        rate = s.tip_noise_m / s.duration_s
+        found.append(
+            _grid(
+                "sensor_drift",
+                [_log("rate_m_s", 1e-3 * rate, 1e4 * rate)],
+                [_geom(0.1 * rate, 100 * rate, 6)],
+                sign=sign,
+            )
+        )
+    found += [side for effect in _RATIOS for side in _ratio(effect, case)]
+    return tuple(found)
+
+
+_PHASE = Axis("phase_rad", "angle", 0.0, 2 * np.pi, 1e-4)
+# Effects that multiply a parameter, with the tolerance that may explain them as well.
+_RATIOS: Mapping[str, str | None] = {
+    "actuator_gain": "motor.torque_constant_Nm_A",
+    "hub_inertia": "hub.inertia_kg_m2",
+    "link_stiffness": "link.youngs_modulus_Pa",
+    "structural_damping": "link.kelvin_voigt_s",
+    "sensor_gain": None,
+}
+
+
+def _ratio(effect: str, case: Case) -> list[Candidate]:
+    key = _RATIOS[effect]
+    tolerance = 0.0 if key is None else case.rig.tolerances.get(key, 0.0)
+    least = max(1e-6, _TOLERANCES * tolerance)
+    largest = 50.0 if effect == "structural_damping" else 10.0
+    points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
+    points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
+    sides = [
+        Candidate(effect, (_log("ratio", 1 + least, largest),), tuple((float(p),) for p in points)),
+    ]
+    below = max(1 - least, 0.2) if least < 1 else 0.0
+    if below > 0:
+        sides.append(
+            Candidate(
+                effect,
+                (_log("ratio", 1 / largest, below),),
+                tuple((float(v),) for v in np.minimum(-points, np.log(below))),
+                sign=-1,
+                grows=False,
+            )
+        )
+    return sides
+
+
+def _log(parameter: str, low: float, high: float, step: float = 1e-5) -> Axis:
+    return Axis(parameter, "log", low, high, step)
+
+
+def _geom(low: float, high: float, count: int) -> list[float]:
+    return [float(v) for v in np.geomspace(low, high, count)]
+
+
+def _base(point: Mapping[str, float], J: float) -> dict[str, float]:
+    """Stiffness as a frequency in Hz, damping as a ratio, inertia in hub inertias -> SI."""
+    inertia = point["inertia_kg_m2"] * J
+    omega = 2 * np.pi * point["stiffness_Nm_rad"]
+    return {
+        "stiffness_Nm_rad": omega**2 * inertia,
+        "damping_Nms": 2 * point["damping_Nms"] * omega * inertia,
+        "inertia_kg_m2": inertia,
+    }
+
+
+def _grid(
+    effect: str,
+    axes: Sequence[Axis],
+    values: Sequence[Sequence[float]],
+    *,
+    sign: int = 1,
+    grows: bool = True,
+    link: Callable[[Mapping[str, float]], dict[str, float]] | None = None,
+) -> Candidate:
+    """Candidate whose starts are all combinations of the values, in the parameters' units after `link`."""
+    starts = []
+    for point in product(*values) if values else ():
+        named = dict(zip((axis.parameter for axis in axes), point, strict=True))
+        named = link(named) if link else named
+        starts.append(tuple(axis.coordinate(named[axis.parameter]) for axis in axes))
+    return Candidate(effect, tuple(axes), tuple(starts), sign, grows)

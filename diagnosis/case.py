@@ -1,0 +1,109 @@
+"""A case: a nominal rig and recorded experiments that it may or may not explain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from plant.rig import Rig
+
+Real = npt.NDArray[np.float64]
+Role = Literal["estimation", "held_out"]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One record.
+
+    Attributes
+    ----------
+    name : str
+    role : "estimation" or "held_out"
+        Held-out records judge a repaired model; no parameter is fitted to them.
+    voltage_V : (T,)
+        Commanded voltage, held from its row to the next.
+    output : (T, 2)
+        hub_angle_rad, tip_m as measured.
+    kind : str
+        Sort of input, in the words of whoever made the record; only shown.
+    closed_loop : bool
+        The command came from a feedback. It is still the exact input of the actuator.
+    """
+
+    name: str
+    role: Role
+    voltage_V: Real
+    output: Real
+    kind: str = ""
+    closed_loop: bool = False
+
+    def __post_init__(self) -> None:
+        voltage = np.array(self.voltage_V, dtype=np.float64)
+        output = np.array(self.output, dtype=np.float64)
+        if voltage.ndim != 1 or output.shape != (voltage.size, 2):
+            raise ValueError(
+                f"experiment {self.name}: needs voltage_V (T,) and output (T, 2); got {voltage.shape} and "
+                f"{output.shape}"
+            )
+        if self.role not in ("estimation", "held_out"):
+            raise ValueError(
+                f"experiment {self.name}: role must be estimation or held_out; got {self.role!r}"
+            )
+        if not (np.all(np.isfinite(voltage)) and np.all(np.isfinite(output))):
+            raise ValueError(f"experiment {self.name}: a value is not finite")
+        if voltage.size < 20:
+            raise ValueError(f"experiment {self.name}: {voltage.size} samples, needs at least 20")
+        for column, name in zip(output.T, ("hub_angle_rad", "tip_m"), strict=True):
+            if np.ptp(column) == 0:
+                raise ValueError(
+                    f"experiment {self.name}: {name} is {column[0]:.6g} throughout: is the sensor dead?"
+                )
+        voltage.setflags(write=False)
+        output.setflags(write=False)
+        object.__setattr__(self, "voltage_V", voltage)
+        object.__setattr__(self, "output", output)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A rig as its makers know it, and what it did.
+
+    Raises
+    ------
+    ValueError
+        If there is no estimation or no held-out experiment, a name comes twice, or a noise level is zero
+        (then nothing can be said to lie beyond the noise).
+    """
+
+    name: str
+    rig: Rig
+    experiments: tuple[Experiment, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "experiments", tuple(self.experiments))
+        names = [experiment.name for experiment in self.experiments]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"case {self.name}: experiment {name} is given twice")
+        for role in ("estimation", "held_out"):
+            if not any(experiment.role == role for experiment in self.experiments):
+                raise ValueError(f"case {self.name}: no experiment has the role {role}")
+        if not np.all(self.noise > 0):
+            raise ValueError(f"case {self.name}: sensors need a noise level above zero to judge a gap by")
+
+    @property
+    def noise(self) -> Real:
+        """(2,) noise standard deviations of hub_angle_rad and tip_m."""
+        sensors = self.rig.sensors
+        return np.array([sensors.hub_angle_noise_rad, sensors.tip_noise_m])
+
+    @property
+    def estimation(self) -> tuple[Experiment, ...]:
+        return tuple(e for e in self.experiments if e.role == "estimation")
+
+    @property
+    def held_out(self) -> tuple[Experiment, ...]:
+        return tuple(e for e in self.experiments if e.role == "held_out")

@@ -1,0 +1,213 @@
+"""Maximum a posteriori fit of deviations and effect parameters, and the evidence of a set of candidates.
+
+Minimises |e|^2 + |d|^2 over the deviations d of the nominal parameters (standard normal before the data) and
+the coordinates x of the candidates (flat over their boxes), e being the whitened residuals:
+Levenberg-Marquardt with difference quotients, inside the boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from diagnosis.candidates import Candidate
+from diagnosis.case import Real
+from diagnosis.residual import ResidualModel
+from plant.effects import Effect
+
+# Steps of difference quotients along the deviations. Where contacts switch, a small step measures which way
+# one contact fell; a large one averages over many.
+_DEVIATION_STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """End of a fit: d (P,), x per candidate, residuals e (N,), Jacobian (N, P + A), cost |e|^2 + |d|^2."""
+
+    candidates: tuple[Candidate, ...]
+    deviations: Real
+    coordinates: tuple[Real, ...]
+    residuals: Real
+    jacobian: Real
+    cost: float
+    converged: bool
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        return tuple(c.effect_at(x) for c, x in zip(self.candidates, self.coordinates, strict=True))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.effect for c in self.candidates)
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @property
+    def hessian(self) -> Real:
+        """Half the Gauss-Newton Hessian of the cost: J^T J plus the prior's identity."""
+        P = self.deviations.size
+        H = self.jacobian.T @ self.jacobian
+        H[range(P), range(P)] += 1.0
+        return H
+
+    def covariance(self) -> Real:
+        """Of (d, x), (P + A, P + A)."""
+        return np.asarray(np.linalg.pinv(self.hessian, hermitian=True))
+
+
+def fit(
+    model: ResidualModel,
+    candidates: Sequence[Candidate],
+    coordinates: Sequence[Real],
+    deviations: Real,
+    *,
+    nominal_jacobian: Real | None = None,
+    iterations: int = 20,
+    tolerance: float = 0.02,
+) -> Fit:
+    """Descend from the given point.
+
+    nominal_jacobian (N, P): taken for the derivatives by the deviations in place of new difference quotients,
+    which saves most simulations far from the end; the minimum then is not exactly stationary. tolerance:
+    least decrease of the cost of an iteration worth going on.
+    """
+    P = deviations.size
+    splits = np.cumsum([len(c.axes) for c in candidates])
+    low = np.concatenate([c.box[0] for c in candidates]) if candidates else np.zeros(0)
+    high = np.concatenate([c.box[1] for c in candidates]) if candidates else np.zeros(0)
+    steps = np.array([axis.step for c in candidates for axis in c.axes])
+    x = np.clip(np.concatenate(list(coordinates)) if candidates else np.zeros(0), low, high)
+    d = deviations.copy()
+
+    def effects(x: Real) -> tuple[Effect, ...]:
+        return (
+            tuple(c.effect_at(part) for c, part in zip(candidates, np.split(x, splits[:-1]), strict=True))
+            if candidates
+            else ()
+        )
+
+    e = model.of(d, effects(x))
+    cost = float(e @ e + d @ d)
+    damping, converged = 1e-3, False
+    for _ in range(iterations):
+        J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
+        step_cost = None
+        H = J.T @ J
+        H[range(P), range(P)] += 1.0
+        gradient = J.T @ e
+        gradient[:P] += d
+        free = _free(x, gradient[P:], low, high)
+        use = np.concatenate([np.arange(P), P + np.flatnonzero(free)]).astype(int)
+        if use.size == 0:
+            converged = True
+            break
+        Hu, gu = H[np.ix_(use, use)], gradient[use]
+        size = np.sqrt(np.maximum(np.diag(Hu), 1e-12))
+        for _try in range(9):
+            step = np.zeros(P + x.size)
+            step[use] = -np.linalg.solve(Hu + damping * np.diag(size**2), gu)
+            trial_d = model.nominal.within(d + step[:P])
+            trial_x = np.clip(x + step[P:], low, high)
+            trial_e = model.of(trial_d, effects(trial_x))
+            trial_cost = float(trial_e @ trial_e + trial_d @ trial_d)
+            if trial_cost < cost:
+                step_cost = trial_cost
+                break
+            damping = max(6 * damping, 1e-5)
+        if step_cost is None:
+            converged = True
+            break
+        gain, cost = cost - step_cost, step_cost
+        d, x, e = trial_d, trial_x, trial_e
+        damping *= 0.2
+        if gain < tolerance:
+            converged = True
+            break
+    J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
+    parts = tuple(np.split(x, splits[:-1])) if candidates else ()
+    return Fit(tuple(candidates), d, parts, e, J, cost, converged)
+
+
+def _jacobian(
+    model: ResidualModel,
+    d: Real,
+    x: Real,
+    e: Real,
+    effects: Callable[[Real], tuple[Effect, ...]],
+    steps: Real,
+    high: Real,
+    nominal_jacobian: Real | None,
+) -> Real:
+    P = d.size
+    J = np.empty((e.size, P + x.size))
+    if nominal_jacobian is not None:
+        J[:, :P] = nominal_jacobian
+    else:
+        here = effects(x)
+        step = max(
+            [_DEVIATION_STEP["smooth"], *(_DEVIATION_STEP[type(effect).dependence] for effect in here)]
+        )
+        for i in range(P):
+            moved = d.copy()
+            moved[i] += step
+            J[:, i] = (model.of(moved, here) - e) / step
+    for i in range(x.size):
+        moved = x.copy()
+        step = steps[i] if x[i] + steps[i] <= high[i] else -steps[i]
+        moved[i] += step
+        J[:, P + i] = (model.of(d, effects(moved)) - e) / step
+    return J
+
+
+def _free(x: Real, gradient: Real, low: Real, high: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Coordinates that are not held by a bound (a descent goes along -gradient)."""
+    return np.asarray(~(((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))))
+
+
+def log_evidence(fit: Fit) -> float:
+    """log of the integral of exp(-(|e|^2 + |d|^2)/2) over d (standard normal) and x (flat over its boxes).
+
+    Laplace's approximation, cut off at the boxes: along every coordinate that ends at or near a bound, the
+    Gaussian (or the slope down from the bound) is integrated over the inside only, given the others at their
+    best. Constants common to all hypotheses of a case are left out.
+    """
+    P = fit.deviations.size
+    H = fit.hessian
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
+    _, logdet = np.linalg.slogdet(H / np.outer(scale, scale) + 1e-10 * np.eye(scale.size))
+    logdet += 2 * float(np.sum(np.log(scale)))
+    A = H.shape[0] - P
+    value = -0.5 * fit.cost - 0.5 * logdet + 0.5 * A * np.log(2 * np.pi)
+    if not A:
+        return float(value)
+    spread = np.sqrt(np.maximum(np.diag(fit.covariance())[P:], 1e-300))
+    gradient = (fit.jacobian.T @ fit.residuals)[P:]
+    at = 0
+    for candidate, x in zip(fit.candidates, fit.coordinates, strict=True):
+        value -= candidate.log_volume
+        low, high = candidate.box
+        for i in range(x.size):
+            value += _inside(x[i], gradient[at], spread[at], low[i], high[i])
+            at += 1
+    return float(value)
+
+
+def _inside(x: float, slope: float, spread: float, low: float, high: float) -> float:
+    """log of the integral of exp(-slope t - t^2/(2 spread^2)) inside the box, over spread sqrt(2 pi)."""
+    if not np.isfinite(low):
+        return min(0.0, float(np.log(2 * np.pi / (spread * np.sqrt(2 * np.pi)))))
+    # Complete the square only where a bound holds the coordinate; inside, the slope is rounding.
+    held = x <= low or x >= high
+    centre = x - slope * spread**2 if held else x
+    shift = 0.5 * (slope * spread) ** 2 if held else 0.0
+    a, b = (low - centre) / spread, (high - centre) / spread
+    # log(Phi(b) - Phi(a)), from the tail that keeps digits.
+    if a > 0:
+        a, b = -b, -a
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return float(shift + upper + np.log1p(-np.exp(min(lower - upper, -1e-300))))

@@ -1,0 +1,192 @@
+"""Where a fit of a candidate starts: grids, with the nominal parameters following linearly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import fftconvolve
+
+from diagnosis.candidates import Candidate
+from diagnosis.case import Real
+from diagnosis.fit import Fit
+from diagnosis.residual import ResidualModel
+from plant.simulate import simulate
+
+# Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
+# of the inverse of the largest angle for the other.
+_CYCLES = np.concatenate([np.arange(0.5, 12, 0.25), np.arange(12, 80.5, 1.0)])
+
+_HARMONIC = ("torque_ripple", "periodic_disturbance")
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A point to descend from: cost with the deviations moved along their linearisation, x (A,), d (P,).
+
+    size_ratio: largest RMS, over experiments and outputs, by which the effect changes the model, over noise.
+    change: what the effect adds to the residuals (N,).
+    """
+
+    cost: float
+    coordinates: Real
+    deviations: Real
+    size_ratio: float
+    change: npt.NDArray[np.float32]
+
+
+class Screening:
+    """Grid points of candidates around a fit whose nominal Jacobian is known."""
+
+    def __init__(self, model: ResidualModel, around: Fit) -> None:
+        self.model = model
+        self.around = around
+        P = around.deviations.size
+        self._Jn = around.jacobian[:, :P]
+        self._A = self._Jn.T @ self._Jn + np.eye(P)
+        self._parts = np.cumsum([2 * e.voltage_V.size for e in model.case.estimation])[:-1]
+
+    def starts(self, candidate: Candidate) -> list[Start]:
+        """Every start of the candidate, best first."""
+        if candidate.effect in _HARMONIC:
+            found = self._harmonic(candidate)
+        else:
+            found = [
+                start for x in candidate.starts if (start := self._at(candidate, np.array(x))) is not None
+            ]
+        return sorted(found, key=lambda start: start.cost)
+
+    def beside(self, lead: Fit, starts: list[Start]) -> list[Start]:
+        """The same starts judged beside the effects of `lead`, changes simply added; best first.
+
+        No simulation: a second effect large enough for superposition to fail shows all the same. The nominal
+        parameters and the sizes of the lead follow along its Jacobian.
+        """
+        P = lead.deviations.size
+        A = lead.hessian
+        scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
+        A = A + 1e-8 * np.diag(scale**2)
+        found = []
+        for start in starts:
+            e = lead.residuals + start.change
+            gradient = lead.jacobian.T @ e
+            gradient[:P] += lead.deviations
+            step = -np.linalg.solve(A, gradient)
+            cost = float(e @ e + lead.deviations @ lead.deviations + gradient @ step)
+            d = lead.deviations + np.clip(step[:P], -1.5, 1.5)
+            found.append(replace(start, cost=cost, deviations=d))
+        return sorted(found, key=lambda start: start.cost)
+
+    def zoomed(self, candidate: Candidate, starts: list[Start]) -> list[Start]:
+        """Two finer grids around the best points of a jagged cost, one size coordinate; best first."""
+        found = list(starts)
+        for points, reach in ((24, 0.25), (16, 0.02)):
+            found.sort(key=lambda start: start.cost)
+            centre = found[0].coordinates
+            for shift in np.linspace(-reach, reach, points):
+                x = np.clip(centre + np.concatenate([[shift], np.zeros(centre.size - 1)]), *candidate.box)
+                start = self._at(candidate, x)
+                if start is not None:
+                    found.append(start)
+        return sorted(found, key=lambda start: start.cost)
+
+    def _at(self, candidate: Candidate, x: Real) -> Start | None:
+        effects = (*self.around.effects, candidate.effect_at(x))
+        e = self.model.of(self.around.deviations, effects)
+        if not np.all(np.isfinite(e)):
+            return None
+        cost, step = self._follow(e)
+        change = e - self.around.residuals
+        return Start(cost, x, self.around.deviations + step, self._size(change), change.astype(np.float32))
+
+    def _follow(self, e: Real) -> tuple[float, Real]:
+        """Least cost and step of the deviations on the linearisation."""
+        d = self.around.deviations
+        if not d.size:
+            return float(e @ e), np.zeros(0)
+        gradient = self._Jn.T @ e + d
+        step = -np.linalg.solve(self._A, gradient)
+        # Never trust the linearisation beyond a tolerance or so.
+        step = np.clip(step, -1.5, 1.5)
+        return float(e @ e + d @ d + 2 * gradient @ step + step @ self._A @ step), step
+
+    def _size(self, change: Real) -> float:
+        parts = np.split(change, self._parts)
+        return float(max(np.max(np.sqrt(np.mean(p.reshape(-1, 2) ** 2, axis=0))) for p in parts))
+
+    def _harmonic(self, candidate: Candidate) -> list[Start]:
+        """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""
+        model, around = self.model, self.around
+        P = around.deviations.size
+        rig = model.nominal.at(around.deviations)
+        dt, noise = rig.sampling.dt_s, model.case.noise
+        longest = max(e.voltage_V.size for e in model.case.estimation)
+        pulse = np.zeros(longest)
+        pulse[0] = 1.0
+        response = simulate(rig, np.zeros(longest), hub_torque_Nm=pulse).output / noise
+        model.simulations += 1
+        periodic = candidate.effect == "periodic_disturbance"
+        if periodic:
+            lines = np.arange(candidate.axes[1].low, min(60.0, 0.45 / dt), 0.4 / (longest * dt))
+        else:
+            lines = _CYCLES
+        found = []
+        for line in lines:
+            columns = []
+            for shift in (0.0, np.pi / 2):
+                parts = []
+                for e in model.case.estimation:
+                    time = (np.arange(e.voltage_V.size) + 0.5) * dt
+                    angle = 2 * np.pi * line * time if periodic else line * e.output[:, 0]
+                    torque = np.sin(angle + shift)
+                    n = torque.size
+                    parts.append(
+                        np.column_stack([fftconvolve(torque, response[:n, q])[:n] for q in range(2)]).ravel()
+                    )
+                columns.append(-np.concatenate(parts))
+            M = np.column_stack([self._Jn, *columns])
+            H = M.T @ M
+            H[range(P), range(P)] += 1.0
+            gradient = M.T @ around.residuals
+            gradient[:P] += around.deviations
+            step = -np.linalg.solve(H, gradient)
+            a, b = step[P:]
+            amplitude = float(np.hypot(a, b))
+            cost = around.cost + float(gradient @ step)
+            low, high = candidate.axes[0].low, candidate.axes[0].high
+            x = np.array([np.log(np.clip(amplitude, low, high)), line, np.arctan2(b, a)])
+            change = a * columns[0] + b * columns[1]
+            d = around.deviations + np.clip(step[:P], -1.5, 1.5)
+            found.append(Start(cost, x, d, self._size(change), change.astype(np.float32)))
+        return found
+
+
+def smallest_size(candidate: Candidate, starts: list[Start], ratio: float) -> float | None:
+    """Coordinate of the size at which the effect changes the model by `ratio` noise deviations.
+
+    From the grid: interpolated between points in log-log, extrapolated in proportion; over several points of
+    equal size the largest change counts. None if the grid never changes anything.
+    """
+    sizes: dict[float, float] = {}
+    for start in starts:
+        key = float(start.coordinates[0])
+        sizes[key] = max(sizes.get(key, 0.0), start.size_ratio)
+    x = np.array(sorted(sizes))
+    change = np.array([sizes[v] for v in x])
+    if not np.any(change > 0):
+        return None
+    change = np.log(np.maximum(change, 1e-9))
+    if not candidate.grows:
+        x, change = -x[::-1], change[::-1]
+    change = np.maximum.accumulate(change)
+    target = np.log(ratio)
+    if target <= change[0]:
+        found = x[0] + (target - change[0])
+    elif target >= change[-1]:
+        found = x[-1] + (target - change[-1])
+    else:
+        i = int(np.searchsorted(change, target))
+        share = (target - change[i - 1]) / (change[i] - change[i - 1])
+        found = x[i - 1] + share * (x[i] - x[i - 1])
+    return float(found if candidate.grows else -found)

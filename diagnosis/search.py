@@ -1,0 +1,126 @@
+"""Which effect: fits of every single one, then of further ones beside the best, until nothing is gained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.candidates import Candidate, candidates
+from diagnosis.case import Case, Real
+from diagnosis.fit import Fit, fit
+from diagnosis.hypotheses import Hypothesis
+from diagnosis.jagged import refined
+from diagnosis.residual import ResidualModel
+from diagnosis.screening import Screening, Start, smallest_size
+from plant.effects import EFFECTS
+
+Progress = Callable[[float, str], None]
+
+# An effect that changes no record by more than this many noise deviations (RMS) is not looked for.
+SMALLEST_SIZE_RATIO = 0.2
+# Fits whose cost is within this much of the best are finished with exact derivatives.
+_CLOSE = 60.0
+_ROUGH_ITERATIONS, _FINE_ITERATIONS = 8, 15
+_MOST_EFFECTS = 3
+# Further effects that are fitted beside the best hypothesis, by the cost their screening promises.
+_BESIDE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Everything that was fitted: the nominal alone, then every hypothesis, most probable first."""
+
+    base: Fit
+    hypotheses: tuple[Hypothesis, ...]
+    simulations: int
+
+    @property
+    def best(self) -> Hypothesis:
+        return self.hypotheses[0]
+
+
+def search(case: Case, progress: Progress | None = None) -> Search:
+    """Fit the nominal, every effect alone, and sets of effects as long as they gain."""
+    report = progress or (lambda fraction, message: None)
+    model = ResidualModel(case)
+    base = fit(model, (), (), np.zeros(model.nominal.count))
+    screening = Screening(model, base)
+    listed: list[tuple[Candidate, list[Start]]] = []
+    spaces = candidates(case)
+    for k, candidate in enumerate(spaces):
+        report(0.05 + 0.3 * k / len(spaces), f"looking at {candidate.effect}")
+        starts = screening.starts(candidate)
+        least = smallest_size(candidate, starts, SMALLEST_SIZE_RATIO) if starts else None
+        if least is not None:
+            if EFFECTS[candidate.effect].dependence == "jagged":
+                starts = screening.zoomed(candidate, starts)
+            listed.append((candidate.from_size(least), starts))
+    found = [Hypothesis.of(base)]
+    found += _fitted(model, base, listed, _part(report, 0.35, 0.35))
+    found.sort(key=lambda h: -h.log_weight)
+    while found[0].names and len(found[0].names) < _MOST_EFFECTS:
+        lead = found[0]
+        further = [
+            (candidate, screening.beside(lead.fit, starts))
+            for candidate, starts in listed
+            if candidate.effect not in lead.names
+        ]
+        further.sort(key=lambda item: item[1][0].cost)
+        found += _fitted(model, lead.fit, further[:_BESIDE], _part(report, 0.7 + 0.1 * len(lead.names), 0.1))
+        found.sort(key=lambda h: -h.log_weight)
+        if len(found[0].names) <= len(lead.names):
+            break
+    report(1.0, "done")
+    return Search(base, tuple(found), model.simulations)
+
+
+def _part(report: Progress, begin: float, share: float) -> Progress:
+    return lambda fraction, message: report(begin + share * fraction, message)
+
+
+def _fitted(
+    model: ResidualModel, around: Fit, listed: Sequence[tuple[Candidate, list[Start]]], report: Progress
+) -> list[Hypothesis]:
+    """Hypotheses with one effect more than `around`: rough fits of all, the best finished."""
+    nominal = around.jacobian[:, : around.deviations.size]
+    rough = []
+    for k, (candidate, starts) in enumerate(listed):
+        report(0.6 * k / len(listed), f"fitting {candidate.effect}")
+        ends = [
+            fit(
+                model,
+                (*around.candidates, candidate),
+                (*around.coordinates, start.coordinates),
+                model.nominal.within(start.deviations),
+                nominal_jacobian=nominal,
+                iterations=_ROUGH_ITERATIONS,
+                tolerance=0.5,
+            )
+            for start in _apart(starts, around.cost)
+        ]
+        rough.append(min(ends, key=lambda end: end.cost))
+    rough.sort(key=lambda end: end.cost)
+    finished = []
+    for k, item in enumerate(rough):
+        report(0.6 + 0.4 * k / len(rough), f"finishing {item.names[-1]}")
+        if k < 3 or item.cost < rough[0].cost + _CLOSE:
+            fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
+            item = refined(model, fine if fine.cost <= item.cost else item)
+        finished.append(Hypothesis.of(item))
+    return finished
+
+
+def _apart(starts: list[Start], without: float) -> list[Start]:
+    """The best start, and a second one that is elsewhere and not much worse."""
+    best = starts[0]
+    enough = best.cost + 0.5 * abs(without - best.cost) + 20
+    for start in starts[1:]:
+        if start.cost < enough and _distance(start.coordinates, best.coordinates) > 0.3:
+            return [best, start]
+    return [best]
+
+
+def _distance(a: Real, b: Real) -> float:
+    return float(np.max(np.abs(a - b)))

@@ -1,0 +1,67 @@
+"""Cases and nominal parameters: what is refused, and what a deviation means."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diagnosis import Case, Experiment
+from diagnosis.candidates import candidates
+from diagnosis.nominal import NominalParameters
+from plant import EFFECTS, paper_link
+
+RNG = np.random.default_rng(5)
+
+
+def _experiment(name="a", role="estimation", **changes):
+    values = {"voltage_V": RNG.standard_normal(50), "output": RNG.standard_normal((50, 2))}
+    return Experiment(name, role, **{**values, **changes})
+
+
+def _case(*experiments, rig=None):
+    return Case("arm", paper_link() if rig is None else rig, experiments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"output": np.zeros((50, 2))}, "dead"),
+        ({"output": np.ones((49, 2))}, r"\(T,\)"),
+        ({"voltage_V": np.full(50, np.nan)}, "finite"),
+        ({"role": "check"}, "role"),
+        ({"voltage_V": np.ones(5), "output": RNG.standard_normal((5, 2))}, "at least 20"),
+    ],
+)
+def test_experiments_that_cannot_be_used_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _experiment(**changes)
+
+
+def test_cases_need_both_roles_and_names_of_their_own():
+    with pytest.raises(ValueError, match="held_out"):
+        _case(_experiment())
+    with pytest.raises(ValueError, match="twice"):
+        _case(_experiment(), _experiment(role="held_out"))
+    silent = paper_link().perturbed({"sensors.tip_noise_m": 0.0})
+    with pytest.raises(ValueError, match="noise"):
+        _case(_experiment(), _experiment("b", "held_out"), rig=silent)
+
+
+def test_a_stated_value_one_tolerance_too_high_means_a_lower_true_one():
+    rig = paper_link().model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05}})
+    nominal = NominalParameters(rig)
+    true = nominal.at(np.array([1.0])).value("hub.inertia_kg_m2")
+    assert true * 1.05 == pytest.approx(rig.value("hub.inertia_kg_m2"))
+
+
+def test_every_effect_is_a_candidate_whose_starts_make_an_effect():
+    case = _case(_experiment(), _experiment("b", "held_out"))
+    found = candidates(case)
+    assert {candidate.effect for candidate in found} == set(EFFECTS)
+    for candidate in found:
+        low, high = candidate.box
+        assert np.all(low < high), candidate.label
+        for start in candidate.starts:
+            effect = candidate.effect_at(np.array(start))
+            assert effect.id == candidate.effect
+            assert np.all((np.array(start) >= low) & (np.array(start) <= high)), candidate.label

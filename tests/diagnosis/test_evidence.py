@@ -1,0 +1,112 @@
+"""Evidence against numerical integration, priors and probabilities that sum to one."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from diagnosis.candidates import Axis, Candidate
+from diagnosis.fit import Fit, log_evidence
+from diagnosis.hypotheses import Hypothesis, _gain, log_prior, probabilities, unknown_gain
+from plant import EFFECTS
+
+SLOPE = np.array([0.5, -1.2, 0.8, 2.0])
+
+
+def _candidate(low, high):
+    return Candidate("actuator_gain", (Axis("ratio", "linear", low, high, 1e-4),), ())
+
+
+def _linear_fit(target, low, high):
+    """Least squares of e = SLOPE x - target inside the box, one coordinate and no nominal parameter."""
+    x = float(np.clip(SLOPE @ target / (SLOPE @ SLOPE), low, high))
+    e = SLOPE * x - target
+    return Fit((_candidate(low, high),), np.zeros(0), (np.array([x]),), e, SLOPE[:, None], float(e @ e), True)
+
+
+@pytest.mark.parametrize(
+    ("optimum", "low", "high"),
+    [
+        (0.3, -2.0, 2.0),
+        (0.95, 0.0, 1.0),
+        (-0.4, 0.0, 1.0),
+        (-3.0, 0.0, 1.0),
+        (2.5, 0.0, 1.0),
+        (1.0, 0.0, 1.0),
+    ],
+    ids=["inside", "near a bound", "below", "far below", "above", "on the bound"],
+)
+def test_evidence_of_a_linear_model_is_its_integral(optimum, low, high):
+    target = SLOPE * optimum + np.array([1.2, 0.5, 0.0, 0.0])
+    fit = _linear_fit(target, low, high)
+    integral, _ = quad(lambda x: np.exp(-0.5 * np.sum((SLOPE * x - target) ** 2)) / (high - low), low, high)
+    # Laplace is exact for a linear model; the cut-off at the bounds is, too.
+    assert log_evidence(fit) == pytest.approx(np.log(integral), abs=1e-6)
+
+
+def test_evidence_integrates_the_deviations_of_the_nominal():
+    rng = np.random.default_rng(3)
+    J, e0 = rng.standard_normal((12, 2)), rng.standard_normal(12)
+    A = J.T @ J + np.eye(2)
+    d = -np.linalg.solve(A, J.T @ e0)
+    e = e0 + J @ d
+    fit = Fit((), d, (), e, J, float(e @ e + d @ d), True)
+    # Marginal of e0 = -J d + noise: normal with covariance I + J J^T, without the constant of the noise.
+    covariance = np.eye(12) + J @ J.T
+    expected = -0.5 * e0 @ np.linalg.solve(covariance, e0) - 0.5 * np.linalg.slogdet(covariance)[1]
+    assert log_evidence(fit) == pytest.approx(expected, abs=1e-8)
+
+
+def test_priors_of_all_sets_leave_the_rest_to_unknown():
+    names = list(EFFECTS)
+    total = sum(comb(len(names), k) * np.exp(log_prior(names[:k])) for k in range(4))
+    assert total == pytest.approx(0.9, abs=1e-12)
+
+
+@pytest.mark.parametrize("excess", [0.05, 0.5, 3.0])
+def test_unknown_is_the_likelihood_integrated_over_the_discrepancy(excess):
+    n = 4000
+    e = np.full(n, np.sqrt(1 + excess**2))
+    fit = Fit((), np.zeros(0), (), e, np.zeros((n, 0)), float(e @ e), True)
+    low, high = np.log(0.12), np.log(100.0)
+    best = _gain(max(excess, 0.12), n, fit.cost)
+    integral, _ = quad(
+        lambda v: np.exp(_gain(np.exp(v), n, fit.cost) - best) / (high - low),
+        low,
+        high,
+        points=[np.log(max(excess, 0.12))],
+        limit=200,
+    )
+    # At the lower end of the range (0.05) Laplace counts both sides of a maximum of which one is inside.
+    assert unknown_gain(fit) == pytest.approx(best + np.log(integral), abs=0.02 if excess > 0.12 else 2.0)
+
+
+def test_probabilities_sum_to_one_and_prefer_what_explains_the_records():
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal(5000)
+    good = Hypothesis.of(_fit_with(noise, "tip_payload"))
+    bad = Hypothesis.of(_fit_with(1.5 * noise, "input_delay"))
+    nothing = Hypothesis.of(
+        Fit((), np.zeros(0), (), 2 * noise, np.zeros((5000, 0)), float(4 * noise @ noise), True)
+    )
+    total, sets = probabilities([good, bad, nothing])
+    assert sum(total.values()) == pytest.approx(1.0)
+    assert sum(sets.values()) == pytest.approx(1.0)
+    assert set(total) == {"none", "unknown", *EFFECTS}
+    assert total["tip_payload"] > 0.9
+    without, _ = probabilities([bad, nothing])
+    assert without["unknown"] > 0.99
+    cooler, _ = probabilities([good, bad, nothing], temperature=1e6)
+    assert cooler["tip_payload"] < 0.5
+
+
+def _fit_with(residuals, effect):
+    axis = Axis("mass_kg" if effect == "tip_payload" else "delay_s", "log", 1e-3, 1.0, 1e-5)
+    candidate = Candidate(effect, (axis,), ())
+    J = np.full((residuals.size, 1), 0.1)
+    return Fit(
+        (candidate,), np.zeros(0), (np.array([-3.0]),), residuals, J, float(residuals @ residuals), True
+    )
