@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.controller import Controller
-from control_design.ellipses import Real, readonly_real
+from control_design.ellipses import Complex, Real, readonly_complex, readonly_real
 
 
 class SampledMachine(Protocol):
@@ -205,6 +205,100 @@ def _signal(name: str, value: npt.ArrayLike | None, n: int | None) -> Real:
             f"{name} has a value that is not finite at sample {int(np.argmin(np.isfinite(array)))}"
         )
     return array
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSensitivity:
+    """S measured in closed loop on a machine, from reference to error.
+
+    omega_rad_s (F,) the excited lines, response (F,) mean over periods and phase draws, std (F,) standard
+    deviation of that mean (of its modulus, nearly), from the scatter between draws, or between periods of a
+    single draw. peak_command and limited_fraction say whether the command stayed within its limits: with a
+    limit active the loop is not the one of the analysis. reference_rms: size of the excitation.
+    """
+
+    omega_rad_s: Real
+    response: Complex
+    std: Real
+    reference_rms: float
+    peak_command: float
+    limited_fraction: float
+
+    def __post_init__(self) -> None:
+        for name in ("omega_rad_s", "std"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        object.__setattr__(self, "response", readonly_complex(self.response))
+        if not self.omega_rad_s.shape == self.response.shape == self.std.shape == (self.omega_rad_s.size,):
+            raise ValueError("omega_rad_s, response and std must be (F,)")
+
+    @property
+    def peak(self) -> tuple[float, float, float]:
+        """Largest |S| over the lines, its standard deviation, its frequency [rad/s]."""
+        at = int(np.argmax(np.abs(self.response)))
+        return float(np.abs(self.response[at])), float(self.std[at]), float(self.omega_rad_s[at])
+
+
+def measure_sensitivity(
+    controller: Controller,
+    machine: SampledMachine,
+    rng: np.random.Generator,
+    *,
+    rms: float,
+    band_rad_s: tuple[float, float],
+    period_samples: int,
+    periods: int = 2,
+    draws: int = 1,
+    lead_in_periods: int = 1,
+    measured_index: int = 0,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
+) -> MeasuredSensitivity:
+    """Measure S on a machine: random-phase multisines as reference, ratio of error to reference.
+
+    Every draw has phases of its own; its first `lead_in_periods` periods are left out, so that the loop has
+    come to its periodic motion. On a nonlinear machine the mean over draws is the best linear approximation
+    for this spectrum and size, and the scatter between draws holds the distortion.
+
+    Raises
+    ------
+    ValueError
+        If the band holds no line of the period, or nothing would be left to take a scatter from.
+    """
+    if periods < 1 or draws < 1 or periods * draws < 2:
+        raise ValueError(f"a scatter needs two periods or two draws; got {periods} and {draws}")
+    if not (rms > 0 and np.isfinite(rms)):
+        raise ValueError(f"rms must be positive; got {rms}")
+    lines = np.arange(1, (period_samples - 1) // 2 + 1)
+    omega = np.asarray(2 * np.pi * lines / (period_samples * controller.dt_s), dtype=np.float64)
+    inside = (omega >= band_rad_s[0]) & (omega <= band_rad_s[1])
+    lines, omega = lines[inside], omega[inside]
+    if lines.size == 0:
+        raise ValueError(f"no line of {period_samples} samples lies in {band_rad_s} rad/s")
+    found, peak, limited = [], 0.0, 0.0
+    for _ in range(draws):
+        spectrum = np.zeros(period_samples // 2 + 1, dtype=np.complex128)
+        spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
+        period = np.fft.irfft(spectrum, period_samples)
+        period *= rms / np.sqrt(np.mean(period**2))
+        run = simulate(
+            controller,
+            machine,
+            np.tile(period, lead_in_periods + periods),
+            measured_index=measured_index,
+            measurement_step=measurement_step,
+            command_step=command_step,
+        )
+        error = (run.reference - run.measured)[lead_in_periods * period_samples :]
+        by_period = np.fft.rfft(error.reshape(periods, period_samples), axis=1)[:, lines]
+        found.append(by_period / np.fft.rfft(period)[lines])
+        peak = max(peak, float(np.max(np.abs(run.command))))
+        limited += float(np.mean(run.limited)) / draws
+    ratios = np.array(found)
+    each = ratios.mean(axis=1) if draws > 1 else ratios[0]
+    # Of a complex mean's scatter half lies along the modulus.
+    variance = np.sum(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1) / len(each)
+    std = np.asarray(np.sqrt(0.5 * variance), dtype=np.float64)
+    return MeasuredSensitivity(omega, ratios.mean(axis=(0, 1)), std, rms, peak, limited)
 
 
 @dataclass(frozen=True)
