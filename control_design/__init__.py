@@ -16,6 +16,7 @@ from control_design.ellipses import Ellipses
 from control_design.joint_coverage import JointCoverage
 from control_design.margins import Margins
 from control_design.plant_set import Channel, Mode, UncertainPlant
+from control_design.prefilter import Prefilter, PrefilterOptions, design_prefilter
 from control_design.specification import RationalWeight, Specification, SpecificationError
 from control_design.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis_result import (
@@ -25,6 +26,7 @@ from control_design.synthesis_result import (
     SynthesisError,
     SynthesisResult,
 )
+from control_design.youla import YoulaBracket, YoulaOptions, youla_bracket
 
 __all__ = [
     "AllFrequencies",
@@ -41,6 +43,8 @@ __all__ = [
     "Mode",
     "Outcome",
     "PlantVerdict",
+    "Prefilter",
+    "PrefilterOptions",
     "RationalWeight",
     "SampledMachine",
     "Specification",
@@ -52,10 +56,14 @@ __all__ = [
     "SynthesisOptions",
     "SynthesisResult",
     "UncertainPlant",
+    "YoulaBracket",
+    "YoulaOptions",
     "c_header",
     "c_source",
     "certify",
+    "design_prefilter",
     "simulate",
     "step_metrics",
     "synthesise",
+    "youla_bracket",
 ]
