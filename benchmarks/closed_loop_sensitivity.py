@@ -54,7 +54,8 @@ SIZES_RAD = (0.003, 0.01, 0.03, 0.1, 0.2)
 
 FRICTION_WORDS = (
     "The model behind the controller was identified at 0.02 N m and 0.5 rad. Dry friction takes a fixed",
-    "torque out of a motor torque that grows with the reference: at large size the loop is as predicted,",
+    "torque out of a motor torque that grows with the reference: at large size the loop is the predicted "
+    "one,",
     "at small size the hub follows less than the model says, the loop gain falls and the peak with it; where",
     "the hub sticks, the error is the reference and |S| is 1. At 0.003 rad the sensor's noise of 1 mrad",
     "lifts the largest of the lines by a few percent (first row).",
