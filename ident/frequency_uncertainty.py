@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import control
 import numpy as np
 import numpy.typing as npt
 
@@ -113,8 +112,11 @@ class FrequencyUncertainty:
         offset = self.centre - self._matching(nominal_response)
         return offset, offset_disc_radius(offset, self.covariance, self.level)
 
-    def to_control(self) -> control.FrequencyResponseData:
-        """The centre as python-control frequency response data (covariances have no place there)."""
+    def to_control(self) -> Any:
+        """The centre as `control.FrequencyResponseData` (covariances have no place there)."""
+        # Here and not above: python-control brings its plotting along.
+        import control
+
         return control.FrequencyResponseData(self.centre, self.omega_rad_s, dt=self.dt_s)
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
