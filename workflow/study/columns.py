@@ -19,10 +19,6 @@ class Column:
     unit: str = ""
     better: Literal["larger", "smaller"] | None = None
 
-    @property
-    def heading(self) -> str:
-        return f"{self.label} [{self.unit}]" if self.unit else self.label
-
     def badness(self, value: float) -> float:
         """Smaller is better. Only for columns that are judged."""
         return -value if self.better == "larger" else value

@@ -16,6 +16,8 @@ from typing import Self
 
 from workflow.study.task import Done, Task, failed, run_task
 
+_Running = Future[tuple[Done, ...]]
+
 MOST_ATTEMPTS = 3
 _ONE_THREAD: Mapping[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -62,7 +64,7 @@ class LocalProcesses:
         """Position and result of every task, as they finish."""
         attempts = [0] * len(tasks)
         waiting = deque(range(len(tasks)))
-        running: dict[Future[tuple[Done, ...]], int] = {}
+        running: dict[_Running, int] = {}
         while waiting or running:
             while waiting and len(running) < self._room(attempts, waiting, running):
                 index = waiting.popleft()
@@ -90,17 +92,12 @@ class LocalProcesses:
                         reason = f"the process computing it died {attempts[index]} times (out of memory?)"
                         yield index, failed(tasks[index], reason)
 
-    def _room(
-        self,
-        attempts: Sequence[int],
-        waiting: Sequence[int] | deque[int],
-        running: Mapping[Future[tuple[Done, ...]], int],
-    ) -> int:
+    def _room(self, attempts: Sequence[int], waiting: deque[int], running: Mapping[_Running, int]) -> int:
         """One at a time while a suspect is about, so that nobody else is blamed for its deaths."""
         suspects = any(attempts[index] > 1 for index in running.values())
         return 1 if suspects or (waiting and attempts[waiting[0]] > 0) else self._jobs
 
-    def _submit(self, task: Task) -> Future[tuple[Done, ...]]:
+    def _submit(self, task: Task) -> _Running:
         if self._pool is None:
             self._open()
         assert self._pool is not None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from workflow.figures.study import Mark, Panel, draw_pareto
 from workflow.figures.style import Picture, render
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text
 from workflow.report.rendering import page
-from workflow.study.columns import COLUMNS, Number
+from workflow.study.columns import COLUMNS, Column, Number
 from workflow.study.points import short
 from workflow.study.rows import PointRow, State
 from workflow.study.settings import Axis, ParetoPlot, StudyConfig
@@ -22,7 +22,7 @@ _SHOWN = (
     "delay_margin_ms",
     "bandwidth_rad_s",
     "mode_damping",
-    "settling_time_s",
+    "rise_time_s",
     "overshoot_percent",
     "peak_command",
 )
@@ -30,10 +30,13 @@ _MOST_REASONS = 60
 
 
 def study_pictures(
-    plots: Sequence[ParetoPlot], rows: Sequence[PointRow], fronts: Sequence[Sequence[int]]
+    plots: Sequence[ParetoPlot],
+    rows: Sequence[PointRow],
+    fronts: Sequence[Sequence[int]],
+    units: Mapping[str, str],
 ) -> dict[str, Picture]:
-    """The Pareto plots as one picture."""
-    panels = [_panel(plot, rows, front) for plot, front in zip(plots, fronts, strict=True)]
+    """The Pareto plots as one picture. units: those of columns whose unit the rig decides."""
+    panels = [_panel(plot, rows, front, units) for plot, front in zip(plots, fronts, strict=True)]
     return {"pareto": render(draw_pareto(panels))}
 
 
@@ -45,9 +48,9 @@ def study_page(
     rows: Sequence[PointRow],
     fronts: Sequence[Sequence[int]],
     pictures: dict[str, Picture],
-    units: dict[str, str],
+    units: Mapping[str, str],
 ) -> str:
-    """The page as HTML. units: those of columns whose unit the rig decides (peak_command ...)."""
+    """The page as HTML. units: as for the pictures."""
     sections = [
         Section("pareto", "What can be had together", "Pareto", _pareto_blocks(config, rows, fronts)),
         Section("points", "All points", "Points", (_table(config.axes, rows, units), *_points_words())),
@@ -79,7 +82,7 @@ _OTHER_STATES: tuple[State, ...] = ("not certified", "does not settle", "impossi
 def findings(axes: Sequence[Axis], rows: Sequence[PointRow]) -> list[str]:
     """The best certified point by each of the columns one asks for first."""
     found = []
-    for name in ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "settling_time_s"):
+    for name in ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "rise_time_s"):
         column = COLUMNS[name]
         placed = [(column.badness(float(v)), row) for row in rows if row.good and (v := row.numbers[name])]
         if placed:
@@ -91,7 +94,9 @@ def findings(axes: Sequence[Axis], rows: Sequence[PointRow]) -> list[str]:
     return found
 
 
-def _panel(plot: ParetoPlot, rows: Sequence[PointRow], front: Sequence[int]) -> Panel:
+def _panel(
+    plot: ParetoPlot, rows: Sequence[PointRow], front: Sequence[int], units: Mapping[str, str]
+) -> Panel:
     x, y = COLUMNS[plot.x], COLUMNS[plot.y]
     marks = []
     for row in rows:
@@ -99,7 +104,12 @@ def _panel(plot: ParetoPlot, rows: Sequence[PointRow], front: Sequence[int]) -> 
         if a is not None and b is not None:
             marks.append(Mark(row.number, float(a), float(b), row.good, row.number in front))
     return Panel(
-        x.heading, y.heading, str(x.better), str(y.better), tuple(marks), missing=len(rows) - len(marks)
+        _heading(x, units),
+        _heading(y, units),
+        str(x.better),
+        str(y.better),
+        tuple(marks),
+        missing=len(rows) - len(marks),
     )
 
 
@@ -108,7 +118,11 @@ def _pareto_blocks(
 ) -> tuple[Block, ...]:
     words = [
         f"{COLUMNS[plot.y].label} against {COLUMNS[plot.x].label}: "
-        + (f"points {', '.join(str(n) for n in front)} are on the front." if front else "no certified point.")
+        + (
+            f"points {', '.join(str(n) for n in front)} are on the front."
+            if front
+            else "no certified point has both numbers."
+        )
         for plot, front in zip(config.pareto, fronts, strict=True)
     ]
     caption = (
@@ -119,11 +133,8 @@ def _pareto_blocks(
     return (Plot("pareto", caption), Remarks(tuple(words), "note"))
 
 
-def _table(axes: Sequence[Axis], rows: Sequence[PointRow], units: dict[str, str]) -> Table:
-    heads = []
-    for name in _SHOWN:
-        unit = COLUMNS[name].unit or units.get(name, "")
-        heads.append(f"{COLUMNS[name].label} [{unit}]" if unit else COLUMNS[name].label)
+def _table(axes: Sequence[Axis], rows: Sequence[PointRow], units: Mapping[str, str]) -> Table:
+    heads = [_heading(COLUMNS[name], units) for name in _SHOWN]
     cells = []
     for row in rows:
         asked = [short(row.values[axis.key]) for axis in axes]
@@ -154,9 +165,16 @@ def _reasons(rows: Sequence[PointRow]) -> tuple[Section, ...]:
     missed = [row for row in rows if not row.good]
     if not missed:
         return ()
-    listed = [f"Point {row.number} ({row.state}): {row.why}" for row in missed[:_MOST_REASONS]]
-    if len(missed) > _MOST_REASONS:
-        listed.append(f"{len(missed) - _MOST_REASONS} more: see table.csv.")
+    # Points of one design miss the same items.
+    together: dict[tuple[str, str], list[str]] = {}
+    for row in missed:
+        together.setdefault((row.state, row.why), []).append(str(row.number))
+    listed = [
+        f"{'Point' if len(numbers) == 1 else 'Points'} {', '.join(numbers)} ({state}): {why}"
+        for (state, why), numbers in together.items()
+    ]
+    if len(listed) > _MOST_REASONS:
+        listed[_MOST_REASONS:] = [f"{len(listed) - _MOST_REASONS} reasons more: see table.csv."]
     return (Section("why", "Why not certified", "Why not", (Remarks(tuple(listed), "warning"),)),)
 
 
@@ -175,6 +193,11 @@ def _made(config: StudyConfig, text: str, base: str) -> tuple[Block, ...]:
         ),
         Code("The study's file", text),
     )
+
+
+def _heading(column: Column, units: Mapping[str, str]) -> str:
+    unit = column.unit or units.get(column.name, "")
+    return f"{column.label} [{unit}]" if unit else column.label
 
 
 def _cell(value: Number) -> str:

@@ -184,7 +184,7 @@ def short(value: Any) -> str:
 
 def _only_a_contradiction(detail: Any, key: str) -> bool:
     """True for what sections say about values that are each right by themselves."""
-    named = detail["loc"] and detail["loc"][-1] == last_name(key)
+    named = last_name(key) in detail["loc"]
     return detail["type"] == "value_error" and not named
 
 

@@ -6,13 +6,14 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
 from workflow import storage
 from workflow.code_version import code_digest
 from workflow.errors import InputError, StageError
+from workflow.pipeline import config_of
 from workflow.progress import Progress, Silence
 from workflow.run_directory import RunDirectory
 from workflow.study.cluster import DaskCluster
@@ -73,13 +74,14 @@ def run_study(
         strategy = ParzenSearch(study, maker, base.config.run.seed)
     processes = jobs or os.cpu_count() or 1
     # A cluster that does not answer is found out before anything is written.
-    points_on: AbstractContextManager[Executor] = (
-        LocalProcesses(processes) if scheduler is None else DaskCluster(scheduler)
-    )
-    with points_on as executor:
+    with ExitStack() as stack:
+        here = stack.enter_context(LocalProcesses(processes))
+        executor: Executor = here
+        if scheduler is not None:
+            executor = stack.enter_context(DaskCluster(scheduler))
         directory = StudyDirectory.begin(out, text=text, base=base, resume=resume)
         with directory.locked():
-            work = _Work(directory, base, executor, processes, progress)
+            work = _Work(directory, base, executor, here, progress)
             rows = work.compute(strategy, maker.base_point())
             progress.start("page")
             started = time.monotonic()
@@ -102,11 +104,11 @@ class _Work:
         directory: StudyDirectory,
         base: Base,
         executor: Executor,
-        processes: int,
+        here: LocalProcesses,
         progress: Progress,
     ) -> None:
         self._directory, self._base, self._executor = directory, base, executor
-        self._processes, self._progress = processes, progress
+        self._here, self._progress = here, progress
         self._broken_plants: dict[str, str] = {}
         self._count = self._finished = self._good = 0
 
@@ -182,13 +184,12 @@ class _Work:
             there = {name.partition(".")[0] for name in given}
             lacking = [stage.name for stage in PLANT_STAGES if stage.name not in there]
             tasks.append(_task([point], given, lacking))
-        with LocalProcesses(min(self._processes, len(tasks))) as here:
-            for index, (done,) in here.run(tasks):
-                point, given = wanted[index]
-                if done.failure is not None:
-                    self._broken_plants[point.plant_key] = done.failure
-                else:
-                    self._directory.save_plant(point, given, done)
+        for index, (done,) in self._here.run(tasks):
+            point, given = wanted[index]
+            if done.failure is not None:
+                self._broken_plants[point.plant_key] = done.failure
+            else:
+                self._directory.save_plant(point, given, done)
 
     def _given(self, point: Point, base_point: Point) -> Mapping[str, bytes]:
         """What a plant begins with: stages of a given run, else those it shares with the base's plant."""
@@ -250,13 +251,14 @@ def _write_up(
     storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, fronts))
     table = json.dumps(storage.strict_json(storage.encode(document)), indent=1, ensure_ascii=False)
     storage.write_text(directory.path / "table.json", table + "\n")
-    pictures = study_pictures(study.pareto, rows, fronts)
+    units = _units(directory, rows)
+    pictures = study_pictures(study.pareto, rows, fronts, units)
     for name, picture in pictures.items():
         storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
     storage.write_text(
         directory.page_path,
-        study_page(title, study, text, where, rows, fronts, pictures, _units(directory, rows)),
+        study_page(title, study, text, where, rows, fronts, pictures, units),
     )
     return RunSummary(
         title=title,
@@ -280,7 +282,7 @@ def _line(study: StudyConfig, row: PointRow) -> Row:
     from workflow.study.points import short
 
     asked = ", ".join(f"{axis.name} {short(row.values[axis.key])}" for axis in study.axes)
-    words = [row.state]
+    words: list[str] = [row.state]
     for name in ("worst_gamma", "modulus_margin", "bandwidth_rad_s"):
         value = row.numbers[name]
         if value is not None:
@@ -293,15 +295,10 @@ def _units(directory: StudyDirectory, rows: Sequence[PointRow]) -> dict[str, str
     for row in rows:
         run = RunDirectory(directory.points_path / row.name)
         if run.stage_file("records") is not None:
-            config = run.config_document()
+            control = config_of(run).control_channel
             units = run.load_stage("records").document["records"][0]["units"]
-            control = next(
-                c
-                for i, c in enumerate(config["channels"])
-                if (c["purpose"] or ("control" if i == 0 else "")) == "control"
-            )
             return {
-                "peak_command": units.get(control["input"], ""),
-                "disturbance_peak": units.get(control["output"], ""),
+                "peak_command": units.get(control.input, ""),
+                "disturbance_peak": units.get(control.output, ""),
             }
     return {}

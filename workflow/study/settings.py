@@ -133,7 +133,7 @@ class ParetoPlot(Section):
 
 _DEFAULT_PLOTS = (
     ParetoPlot(x="bandwidth_rad_s", y="modulus_margin"),
-    ParetoPlot(x="peak_command", y="settling_time_s"),
+    ParetoPlot(x="peak_command", y="rise_time_s"),
 )
 
 

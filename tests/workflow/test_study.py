@@ -1,0 +1,346 @@
+"""The tuning study on processes of this machine."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.workflow.command import FAST_ARM, start_flexlink
+from tests.workflow.study_examples import SMALL_STUDY, assert_same_study, point_bytes, write_study
+from workflow.config import load_config
+from workflow.entry import run_from_files
+from workflow.pipeline import config_of
+from workflow.progress import Silence
+from workflow.run_directory import RunDirectory
+from workflow.study.run import run_study
+from workflow.summary import RunSummary
+
+
+@pytest.fixture(scope="module")
+def small_study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
+    """Directory and summary of the small study, computed on two processes."""
+    folder = tmp_path_factory.mktemp("study")
+    out = folder / "out"
+    return out, run_study(write_study(folder), out, jobs=2)
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    with open(out / "table.csv", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_every_point_has_a_row_in_the_order_of_the_axes(small_study):
+    out, summary = small_study
+    rows = rows_of(out)
+    assert [row["number"] for row in rows] == ["1", "2", "3", "4", "5", "6"]
+    assert [float(row["specification.bandwidth_rad_s"]) for row in rows] == [1, 1, 1.5, 1.5, 1e5, 1e5]
+    assert [row["closed_loop.effects"] for row in rows][:2] == ["[]", "[{name = tip_payload, mass_kg = 0.02}]"]
+    assert summary.certified
+    assert [point["state"] for point in summary.numbers["points"]] == [row["state"] for row in rows]
+
+
+def test_impossible_points_are_results_with_their_reason(small_study):
+    for row in rows_of(small_study[0])[4:]:
+        assert row["state"] == "impossible"
+        assert "bandwidth_rad_s = 1e+05 rad/s lies beyond the Nyquist frequency" in row["why"]
+        assert row["worst_gamma"] == row["modulus_margin"] == ""
+
+
+def test_numbers_are_those_of_the_certificate(small_study):
+    out, _ = small_study
+    for row in rows_of(out)[:4]:
+        run = RunDirectory.open(out / "points" / row["name"])
+        certify = run.load_stage("certify").document
+        assert (row["state"] == "certified") == certify["certified"]
+        verdict = certify["certificate"]["plants"][0]
+        assert float(row["modulus_margin"]) == verdict["worst_margins"]["modulus"]
+        assert float(row["bandwidth_rad_s"]) == verdict["bandwidth_rad_s"]
+        achieved = run.load_stage("closed_loop").document["achieved"]
+        assert float(row["peak_command"]) == max(one["peak_command"] for one in achieved)
+
+
+def test_a_point_is_what_flexlink_run_makes_of_its_configuration(small_study, tmp_path, monkeypatch):
+    # Independent of the study: the ordinary pipeline, from the records on, on the point's own TOML.
+    out, _ = small_study
+    point = out / "points" / rows_of(out)[3]["name"]
+    monkeypatch.setattr("workflow.report.write_report", lambda run, *_: _blank(run))
+    run_from_files(point / "config.toml", tmp_path / "run")
+    for path in (point / "stages").iterdir():
+        assert (tmp_path / "run" / "stages" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def _blank(run: RunDirectory) -> Path:
+    run.report_path.write_text("<html></html>\n")
+    return run.report_path
+
+
+def test_points_open_with_the_usual_tools(small_study, tmp_path, flexlink):
+    out, _ = small_study
+    point = tmp_path / "point"
+    shutil.copytree(out / "points" / rows_of(out)[0]["name"], point)
+    config, _ = load_config(point / "config.toml")
+    assert config == config_of(RunDirectory.open(point))
+    answer = flexlink("report", point, "--json")
+    assert answer.code == 0, answer.err
+    assert (point / "report.html").is_file()
+
+
+def test_points_of_one_design_share_controller_and_plant(small_study):
+    out, _ = small_study
+    first, second = (out / "points" / row["name"] / "stages" for row in rows_of(out)[:2])
+    for name in ("uncertainty.npz", "design.json", "certify.json"):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+    assert (first / "closed_loop.npz").read_bytes() != (second / "closed_loop.npz").read_bytes()
+    assert len(list((out / "plants").iterdir())) == 1
+
+
+def test_numbers_do_not_depend_on_how_many_processes_there_are(small_study, tmp_path):
+    run_study(write_study(tmp_path), tmp_path / "out", jobs=1)
+    assert_same_study(small_study[0], tmp_path / "out")
+
+
+def test_resuming_computes_only_what_is_missing(small_study, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(small_study[0], out)
+    names = [row["name"] for row in rows_of(out)]
+    shutil.rmtree(out / "points" / names[1])
+    (out / "points" / names[2] / "stages" / "certify.json").unlink()
+    for name in ("table.csv", "table.json", "study.html"):
+        (out / name).unlink()
+    kept = {n: (out / "points" / n / "stages/design.json").stat().st_mtime_ns for n in (names[0], names[3])}
+    run_study(write_study(tmp_path), out, resume=True, jobs=1)
+    assert_same_study(small_study[0], out)
+    for name, before in kept.items():
+        assert (out / "points" / name / "stages/design.json").stat().st_mtime_ns == before
+
+
+def test_a_finished_study_is_taken_up_and_can_be_extended(small_study, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(small_study[0], out)
+    before = point_bytes(out)
+    run_study(write_study(tmp_path, SMALL_STUDY.replace("1e5", "1e5, 2e5")), out, resume=True, jobs=1)
+    assert len(rows_of(out)) == 8
+    after = point_bytes(out)
+    assert {name: after[name] for name in before} == before
+
+
+def test_page_and_picture_are_there(small_study):
+    out, _ = small_study
+    page = (out / "study.html").read_text()
+    assert "small" in page
+    assert "Why not certified" in page
+    assert "<svg" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert (out / "pareto.svg").is_file()
+
+
+def test_a_run_directory_is_a_base(fast_run, tmp_path):
+    text = SMALL_STUDY.replace(str(FAST_ARM), str(fast_run[0])).replace("values = [1.0, 1.5, 1e5]", "values = [1.5]")
+    out = tmp_path / "out"
+    run_study(write_study(tmp_path, text), out, jobs=1)
+    for row in rows_of(out):
+        for name in ("identify.npz", "uncertainty.npz"):
+            mine = (out / "points" / row["name"] / "stages" / name).read_bytes()
+            assert mine == (fast_run[0] / "stages" / name).read_bytes()
+    # The base's own specification: the design of the run again.
+    design = RunDirectory(out / "points" / rows_of(out)[0]["name"]).load_stage("design").document
+    assert design == RunDirectory(fast_run[0]).load_stage("design").document
+
+
+def test_other_ellipses_are_made_once_and_shared(fast_run, tmp_path):
+    text = f"""
+[study]
+base = "{fast_run[0]}"
+[[axes]]
+key = "channels[0].uncertainty.level"
+values = [0.9, 0.95]
+[[axes]]
+key = "closed_loop.draws"
+values = [1, 2]
+"""
+    out = tmp_path / "out"
+    run_study(write_study(tmp_path, text), out, jobs=2)
+    rows = rows_of(out)
+    assert len(list((out / "plants").iterdir())) == 2
+    gammas = [float(row["worst_gamma"]) for row in rows]
+    assert gammas[0] == gammas[1] < gammas[2] == gammas[3]  # larger ellipses, larger worst case
+
+
+def test_contradictions_between_axes_are_points_without_a_run(tmp_path):
+    text = f"""
+[study]
+base = "{FAST_ARM}"
+[changes]
+"closed_loop.draws" = 1
+[[axes]]
+key = "specification.effort_rolloff_rad_s"
+values = [60.0]
+[[axes]]
+key = "specification.effort_limit"
+values = [60.0, 1e-6]
+[[axes]]
+key = "specification.structure"
+values = ["biquads", "pi_d_notch"]
+"""
+    out = tmp_path / "out"
+    summary = run_study(write_study(tmp_path, text), out, jobs=2)
+    states = [point["state"] for point in summary.numbers["points"]]
+    # pi_d_notch of order 2 does not exist; a limit of nothing cannot be met.
+    assert states[1] == states[3] == "impossible"
+    assert states[2] in ("impossible", "not certified")
+    assert "pi_d_notch has order 1 plus two per notch" in summary.numbers["points"][1]["why"]
+
+
+class Watch(Silence):
+    """Remembers what was said."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.planned: list[str] = []
+
+    def plan(self, stages):
+        self.planned = [name for name, _ in stages]
+
+    def update(self, stage, fraction, message=""):
+        assert 0 <= fraction <= 1
+        self.messages.append(message)
+
+
+def test_progress_counts_points(small_study, tmp_path):
+    watch = Watch()
+    shutil.copytree(small_study[0], tmp_path / "out")
+    run_study(write_study(tmp_path), tmp_path / "out", resume=True, progress=watch)
+    assert watch.planned == ["plant", "points", "page"]
+    assert watch.messages[-1].startswith("6 of 6, ")
+
+
+def children_of(pid: int) -> list[int]:
+    """Child processes, from the system's own books."""
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def is_worker(pid: int) -> bool:
+    try:
+        return "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return False
+
+
+def wait_until(condition, process, seconds: float = 120.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened"
+        assert process.poll() is None, process.communicate()[1].decode()
+        time.sleep(0.005)
+
+
+def test_killed_study_resumes_with_identical_numbers_and_leaves_no_process(small_study, tmp_path):
+    out = tmp_path / "out"
+    study = write_study(tmp_path)
+    process = start_flexlink("study", "--config", study, "--out", out, "--jobs", 2)
+    wait_until(lambda: list(out.glob("points/*/stages/closed_loop.*")), process)
+    workers = [pid for pid in children_of(process.pid) if is_worker(pid)]
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (out / "study.html").exists()
+    deadline = time.monotonic() + 20
+    while any(is_worker(pid) for pid in workers):
+        assert time.monotonic() < deadline, "a worker outlived the study"
+        time.sleep(0.05)
+    run_study(study, out, resume=True, jobs=2)
+    assert_same_study(small_study[0], out)
+
+
+def test_killed_worker_is_replaced(small_study, tmp_path):
+    out = tmp_path / "out"
+    process = start_flexlink("study", "--config", write_study(tmp_path), "--out", out, "--jobs", 2)
+    wait_until(lambda: list(out.glob("plants/*/manifest.json")), process)
+    wait_until(lambda: len([pid for pid in children_of(process.pid) if is_worker(pid)]) >= 2, process)
+    os.kill(next(pid for pid in children_of(process.pid) if is_worker(pid)), signal.SIGKILL)
+    _, complaint = process.communicate(timeout=120)
+    assert process.returncode == 0, complaint.decode()
+    assert_same_study(small_study[0], out)
+
+
+# -- what is refused, each with one line
+# --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "expected"),
+    [
+        ("closed_loop.draws", "closed_loop.drawz", "changes: unknown key closed_loop.drawz (did you mean draws?)"),
+        ('"closed_loop.draws" = 2', '"closed_loop.draws" = 0', "closed_loop.draws"),
+        (
+            "specification.bandwidth_rad_s",
+            "specification.bandwith_rad_s",
+            "axes[0].values[0]: unknown key specification.bandwith_rad_s (did you mean bandwidth_rad_s?)",
+        ),
+        ("1.0, 1.5, 1e5", "1.0, -1.5", "axes[0].values[1]: specification.bandwidth_rad_s"),
+        ("1.0, 1.5, 1e5", "1.0, true", "axes[0].values[1]: specification.bandwidth_rad_s: input should be a number"),
+        ("1.0, 1.5, 1e5", "1.0, 1.0", "axes[0]: the value 1.0 is listed twice"),
+        ("values = [1.0, 1.5, 1e5]", "from = 1.0", "axes[0]: a range needs from and to"),
+        ("values = [1.0, 1.5, 1e5]", "from = 1.0\nto = 2.0", "a grid over a range needs points"),
+        ("values = [1.0, 1.5, 1e5]", "from = 2.0\nto = 1.0", "from below to"),
+        ("values = [1.0, 1.5, 1e5]", "", "axes[0]: give values, or from and to"),
+        ('key = "closed_loop.effects"', 'key = "closed_loop.effects[3]"', "closed_loop.effects has 0 entries"),
+        ('key = "closed_loop.effects"', 'key = "closed loop"', "not a dotted key"),
+        ("tip_payload", "tip_paylod", "axes[1].values[1]: closed_loop.effects[0]"),
+        ('label = "effects"', 'label = "asked"', "two axes have the same label 'asked'"),
+        ('title = "small"', 'titel = "small"', "unknown key study.titel (did you mean title?)"),
+        (str(FAST_ARM), "nowhere.toml", "study.base: no such file or run directory"),
+        ("[study]", '[search]\nobjectives = ["speed"]\n[study]', "search.objectives[0]: no column 'speed'"),
+        ("[study]", "[search]\nmethod = 'random'\n[study]", "search.method"),
+    ],
+)
+def test_bad_studies_are_refused(refused, tmp_path, was, now, expected):
+    assert was in SMALL_STUDY
+    path = write_study(tmp_path, SMALL_STUDY.replace(was, now))
+    line = refused("study", "--config", path, "--out", tmp_path / "out")
+    assert expected in line
+    assert "study.toml" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_places_that_are_taken_are_refused(refused, small_study, tmp_path):
+    study = write_study(tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("")
+    assert "not empty (it holds 'thesis.tex')" in refused("study", "--config", study, "--out", tmp_path / "other")
+    line = refused("study", "--config", study, "--out", small_study[0])
+    assert "an earlier study is there" in line
+    assert "--resume" in line
+    line = refused("study", "--config", study, "--out", tmp_path / "other", "--resume")
+    assert "no study is there" in line
+
+
+def test_resuming_with_another_base_is_refused(refused, small_study, tmp_path):
+    study = write_study(tmp_path, SMALL_STUDY.replace('"closed_loop.draws" = 2', '"closed_loop.draws" = 3'))
+    line = refused("study", "--config", study, "--out", small_study[0], "--resume")
+    assert "closed_loop.draws (was 2, now 3)" in line
+
+
+def test_jobs_and_scheduler_are_checked(refused, tmp_path):
+    study = write_study(tmp_path)
+    assert "--jobs must be at least 1" in refused("study", "--config", study, "--out", tmp_path / "o", "--jobs", 0)
+    line = refused(
+        "study", "--config", study, "--out", tmp_path / "o", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9"
+    )
+    assert "contradict" in line
+
+
+def test_nothing_certified_is_exit_code_3(flexlink, tmp_path):
+    path = write_study(tmp_path, SMALL_STUDY.replace("1.0, 1.5, 1e5", "1e5"))
+    answer = flexlink("study", "--config", path, "--out", tmp_path / "out", "--jobs", 1, "--json")
+    assert answer.code == 3
+    assert "no point is certified" in answer.err
+    document = json.loads(answer.out)
+    assert len(document["numbers"]["points"]) == 2
+    assert (tmp_path / "out" / "study.html").is_file()
