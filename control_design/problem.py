@@ -67,17 +67,17 @@ class Problem:
     def asks_tracking(self) -> bool:
         return self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
 
-    def lean(self) -> list[PlantData]:
-        """Every plant on its lean grid as it is now."""
+    def lean(self, grids: Sequence[Real] | None = None) -> list[PlantData]:
+        """Every plant on its lean grid, as it is now or as given."""
         return [
             PlantData.build(plant, self.spec, grid)
-            for plant, grid in zip(self.plants, self.grids, strict=True)
+            for plant, grid in zip(self.plants, self.grids if grids is None else grids, strict=True)
         ]
 
-    def rows(self, *, with_damping: bool = True) -> list[Rows]:
-        """Rows of the angle programme; without damping, W4 of the measured output is left out."""
+    def rows(self, grids: Sequence[Real] | None = None, *, with_damping: bool = True) -> list[Rows]:
+        """Rows of the optimisers; without damping, W4 of the measured output is left out."""
         rows: list[Rows] = []
-        for data in self.lean():
+        for data in self.lean(grids):
             rows.append(self._rows(data, data.delay, with_damping=with_damping))
             if self.spec.delay_margin_s is not None:
                 late = data.delay * np.exp(-1j * data.ellipses.omega_rad_s * self.spec.delay_margin_s)

@@ -14,10 +14,12 @@ from control_design.frequency_grid import local_maxima
 from control_design.order_search import Candidate, OrderResult, OrderSearch
 from control_design.plant_set import UncertainPlant
 from control_design.problem import Problem
+from control_design.search_tasks import Workshop
 from control_design.specification import Specification
 from control_design.starts import with_cancelling_section
 from control_design.synthesis_options import SynthesisOptions
 from control_design.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
+from control_design.work_pool import WorkPool
 from control_design.worst_case import KINDS
 
 __all__ = ["Progress", "SynthesisOptions", "synthesise"]
@@ -67,18 +69,20 @@ def synthesise(
     cascade: Cascade | None = None
     result = OrderResult(None, (), ())
     reports: list[StartReport] = []
-    for number, sections in enumerate(ladder):
-        lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale)
-        own = np.random.default_rng([root, cascade.order])
-        given: list[Real] = []
-        if lower is not None and result.best is not None:
-            given = [
-                with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
-                for _ in range(_EMBEDDINGS)
-            ]
-        search = OrderSearch(problem, cascade, own, _part(tell, number, len(ladder), cascade.order), given)
-        result = search.run()
-        reports += result.reports
+    workshop = Workshop(problem)
+    with WorkPool(workshop, options.jobs) as pool:
+        for number, sections in enumerate(ladder):
+            lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale)
+            own = np.random.default_rng([root, cascade.order])
+            given: list[Real] = []
+            if lower is not None and result.best is not None:
+                given = [
+                    with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
+                    for _ in range(_EMBEDDINGS)
+                ]
+            part = _part(tell, number, len(ladder), cascade.order)
+            result = OrderSearch(workshop, pool, cascade, own, part, given).run()
+            reports += result.reports
     assert cascade is not None
     numbered = tuple(
         StartReport(number + 1, r.status, r.iterations, r.gamma_grid, r.gamma_dense)

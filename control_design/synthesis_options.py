@@ -33,7 +33,18 @@ class SynthesisOptions(BaseModel):
     mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
     dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
     omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
-    iterations: int = Field(default=250, ge=10, le=5000, description="IPOPT iterations per start and round")
+    iterations: int = Field(
+        default=100,
+        ge=10,
+        le=5000,
+        description="IPOPT iterations per start, which the descent then takes to its end",
+    )
+    jobs: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="processes that work on the starts; the result does not depend on it",
+    )
     scale_rad_s: float | None = Field(
         default=None,
         gt=0,
