@@ -41,7 +41,10 @@ def test_every_point_has_a_row_in_the_order_of_the_axes(small_study):
     rows = rows_of(out)
     assert [row["number"] for row in rows] == ["1", "2", "3", "4", "5", "6"]
     assert [float(row["specification.bandwidth_rad_s"]) for row in rows] == [1, 1, 1.5, 1.5, 1e5, 1e5]
-    assert [row["closed_loop.effects"] for row in rows][:2] == ["[]", "[{name = tip_payload, mass_kg = 0.02}]"]
+    assert [row["closed_loop.effects"] for row in rows][:2] == [
+        "[]",
+        "[{name = tip_payload, mass_kg = 0.02}]",
+    ]
     assert summary.certified
     assert [point["state"] for point in summary.numbers["points"]] == [row["state"] for row in rows]
 
@@ -142,7 +145,9 @@ def test_page_and_picture_are_there(small_study):
 
 
 def test_a_run_directory_is_a_base(fast_run, tmp_path):
-    text = SMALL_STUDY.replace(str(FAST_ARM), str(fast_run[0])).replace("values = [1.0, 1.5, 1e5]", "values = [1.5]")
+    text = SMALL_STUDY.replace(str(FAST_ARM), str(fast_run[0])).replace(
+        "values = [1.0, 1.5, 1e5]", "values = [1.5]"
+    )
     out = tmp_path / "out"
     run_study(write_study(tmp_path, text), out, jobs=1)
     for row in rows_of(out):
@@ -241,6 +246,7 @@ def wait_until(condition, process, seconds: float = 120.0) -> None:
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 def test_killed_study_resumes_with_identical_numbers_and_leaves_no_process(small_study, tmp_path):
     out = tmp_path / "out"
     study = write_study(tmp_path)
@@ -258,6 +264,7 @@ def test_killed_study_resumes_with_identical_numbers_and_leaves_no_process(small
     assert_same_study(small_study[0], out)
 
 
+@pytest.mark.slow
 def test_killed_worker_is_replaced(small_study, tmp_path):
     out = tmp_path / "out"
     process = start_flexlink("study", "--config", write_study(tmp_path), "--out", out, "--jobs", 2)
@@ -276,7 +283,11 @@ def test_killed_worker_is_replaced(small_study, tmp_path):
 @pytest.mark.parametrize(
     ("was", "now", "expected"),
     [
-        ("closed_loop.draws", "closed_loop.drawz", "changes: unknown key closed_loop.drawz (did you mean draws?)"),
+        (
+            "closed_loop.draws",
+            "closed_loop.drawz",
+            "changes: unknown key closed_loop.drawz (did you mean draws?)",
+        ),
         ('"closed_loop.draws" = 2', '"closed_loop.draws" = 0', "closed_loop.draws"),
         (
             "specification.bandwidth_rad_s",
@@ -284,13 +295,21 @@ def test_killed_worker_is_replaced(small_study, tmp_path):
             "axes[0].values[0]: unknown key specification.bandwith_rad_s (did you mean bandwidth_rad_s?)",
         ),
         ("1.0, 1.5, 1e5", "1.0, -1.5", "axes[0].values[1]: specification.bandwidth_rad_s"),
-        ("1.0, 1.5, 1e5", "1.0, true", "axes[0].values[1]: specification.bandwidth_rad_s: input should be a number"),
+        (
+            "1.0, 1.5, 1e5",
+            "1.0, true",
+            "axes[0].values[1]: specification.bandwidth_rad_s: input should be a number",
+        ),
         ("1.0, 1.5, 1e5", "1.0, 1.0", "axes[0]: the value 1.0 is listed twice"),
         ("values = [1.0, 1.5, 1e5]", "from = 1.0", "axes[0]: a range needs from and to"),
         ("values = [1.0, 1.5, 1e5]", "from = 1.0\nto = 2.0", "a grid over a range needs points"),
         ("values = [1.0, 1.5, 1e5]", "from = 2.0\nto = 1.0", "from below to"),
         ("values = [1.0, 1.5, 1e5]", "", "axes[0]: give values, or from and to"),
-        ('key = "closed_loop.effects"', 'key = "closed_loop.effects[3]"', "closed_loop.effects has 0 entries"),
+        (
+            'key = "closed_loop.effects"',
+            'key = "closed_loop.effects[3]"',
+            "closed_loop.effects has 0 entries",
+        ),
         ('key = "closed_loop.effects"', 'key = "closed loop"', "not a dotted key"),
         ("tip_payload", "tip_paylod", "axes[1].values[1]: closed_loop.effects[0]"),
         ('label = "effects"', 'label = "asked"', "two axes have the same label 'asked'"),
@@ -313,7 +332,9 @@ def test_places_that_are_taken_are_refused(refused, small_study, tmp_path):
     study = write_study(tmp_path)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("")
-    assert "not empty (it holds 'thesis.tex')" in refused("study", "--config", study, "--out", tmp_path / "other")
+    assert "not empty (it holds 'thesis.tex')" in refused(
+        "study", "--config", study, "--out", tmp_path / "other"
+    )
     line = refused("study", "--config", study, "--out", small_study[0])
     assert "an earlier study is there" in line
     assert "--resume" in line
@@ -329,7 +350,9 @@ def test_resuming_with_another_base_is_refused(refused, small_study, tmp_path):
 
 def test_jobs_and_scheduler_are_checked(refused, tmp_path):
     study = write_study(tmp_path)
-    assert "--jobs must be at least 1" in refused("study", "--config", study, "--out", tmp_path / "o", "--jobs", 0)
+    assert "--jobs must be at least 1" in refused(
+        "study", "--config", study, "--out", tmp_path / "o", "--jobs", 0
+    )
     line = refused(
         "study", "--config", study, "--out", tmp_path / "o", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9"
     )
