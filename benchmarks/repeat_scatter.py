@@ -57,7 +57,9 @@ degrees of freedom from the joint covariance of the posterior). Noise bounds lea
 runs: the frequency of the second mode differs between sweeps and, seen at the tip, falls with amplitude
 (line above), and one sweep's noise says nothing about that; nor is the first stage's error in them.
 'Amplitudes apart' is the same seen between 50 and 75 counts. For a controller, bounds with the scatter
-between runs in them (last column: predicted by five sweeps, met by the sixth) are the ones to use.
+between runs in them (last column: predicted by five sweeps, met by the sixth) are the ones to use. The
+hub's bounds are larger than its scatter around the first mode (2-4 Hz): what friction does in the same way
+in every sweep stands in the residuals, and so in the bounds, but does not scatter (likely, not proved).
 """
 
 
