@@ -221,6 +221,11 @@ class ClosedLoopOptions(Section):
     measurement_step: float = Field(0.0, ge=0, description="step of the measured output, e.g. an encoder's")
     duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
+    conditions: bool = Field(
+        True,
+        description="on the simulated arm: measure S, and run slew, push at the tip, payloads 0 to 200 %, "
+        "delay, friction, coarse converters and a step beyond the voltage limit",
+    )
 
 
 class Notes(Section):

@@ -104,5 +104,5 @@ class EncodedArm:
     def measure(self) -> npt.NDArray[np.float64]:
         return quantised(self._arm.measure(), self._step)
 
-    def advance(self, voltage_V: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        self._arm.advance(voltage_V, hub_torque_Nm)
+    def advance(self, voltage_V: float, /, *, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
+        self._arm.advance(voltage_V, hub_torque_Nm, tip_force_N)

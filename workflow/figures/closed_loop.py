@@ -228,3 +228,128 @@ def _limits(
             bbox={"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.8},
         )
     axes.set_ylim(*style.pad_limits(low, high, 0.08))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPeak:
+    """|S| as measured: omega_rad_s, magnitude, its standard deviation (F,); `words` say on what."""
+
+    words: str
+    omega_rad_s: Real
+    magnitude: Real
+    std: Real
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedSensitivity:
+    """|S| of the nominal and worst case over the ellipses at omega_rad_s, (F,) each."""
+
+    omega_rad_s: Real
+    nominal: Real
+    worst: Real
+
+
+_MARKERS = (
+    {"color": style.ACHIEVED, "marker": "o", "ms": 3.0},
+    {"color": style.HIGHLIGHT, "marker": "^", "ms": 3.0},
+    {"color": style.MEASURED, "marker": "s", "ms": 2.6},
+)
+
+
+def draw_measured_sensitivity(
+    predicted: PredictedSensitivity, measured: Sequence[MeasuredPeak], *, level: float
+) -> Figure:
+    """Left: |S| over the measured band. Right: around its peak, with two standard deviations."""
+    with style.house_style():
+        figure = style.new_figure(3.9)
+        whole, near = figure.subplots(1, 2)
+        omega = predicted.omega_rad_s
+        at = int(np.argmax(predicted.worst))
+        for axes in (whole, near):
+            axes.fill_between(omega, predicted.nominal, predicted.worst, **style.BAND)
+            axes.plot(
+                omega,
+                predicted.worst,
+                color=style.UNCERTAIN,
+                lw=1.2,
+                label=f"worst case over the {100 * level:.4g} % ellipses",
+            )
+            axes.plot(omega, predicted.nominal, **style.PREDICTED_LINE, label="predicted, nominal model")
+            for found, look in zip(measured, _MARKERS, strict=False):
+                spread = {"yerr": 2 * found.std, "elinewidth": 0.6, "capsize": 0} if axes is near else {}
+                axes.errorbar(
+                    found.omega_rad_s, found.magnitude, ls="none", label=found.words, **look, **spread
+                )
+            axes.set_xlabel("frequency [rad/s]")
+            axes.set_xscale("log")
+        whole.set_yscale("log")
+        whole.set_ylabel("|S| [1]")
+        whole.set_title("Sensitivity, reference to error")
+        low = min(float(found.omega_rad_s[0]) for found in measured)
+        high = max(float(found.omega_rad_s[-1]) for found in measured)
+        whole.set_xlim(low / 1.1, high * 1.1)
+        inside = (omega >= low) & (omega <= high)
+        whole.set_ylim(0.7 * float(predicted.nominal[inside].min()), 1.6 * float(predicted.worst.max()))
+        start, stop = max(low, omega[at] / 3), min(high, omega[at] * 3)
+        peak = float(predicted.worst[at])
+        shown = [m.magnitude[(m.omega_rad_s >= start) & (m.omega_rad_s <= stop)] for m in measured]
+        top = min(max([peak, *(float(part.max()) for part in shown if part.size)]), 1.5 * peak)
+        part = (omega >= start) & (omega <= stop)
+        near.set_xlim(start, stop)
+        near.set_ylim(*style.pad_limits(float(predicted.nominal[part].min()), top, 0.08))
+        near.set_title("Around its peak (bars: two standard deviations)")
+        style.finish(figure, [whole, near], columns=3)
+    return figure
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionTraces:
+    """One condition: name, words, reference, predicted and achieved output (T,)."""
+
+    name: str
+    words: str
+    reference: Real
+    predicted: Real
+    achieved: Real
+
+
+def draw_conditions(
+    time_s: Real, conditions: Sequence[ConditionTraces], label: tuple[str, str], *, machine: str
+) -> Figure:
+    """One panel per condition: reference, prediction and what the machine did."""
+    columns = 3
+    rows = -(-len(conditions) // columns)
+    with style.house_style():
+        figure = style.new_figure(1.95 * rows + 0.8)
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=True)
+        panels = grid.ravel()
+        for axes in panels[len(conditions) :]:
+            axes.set_visible(False)
+        for axes, found in zip(panels, conditions, strict=False):
+            axes.plot(*outline(time_s, found.achieved, 120), **style.ACHIEVED_LINE, label=machine)
+            axes.plot(
+                *outline(time_s, found.predicted, 120),
+                **style.PREDICTED_LINE,
+                label="predicted, nominal model",
+            )
+            axes.plot(
+                time_s, found.reference, **style.REFERENCE_LINE, drawstyle="steps-post", label="reference"
+            )
+            axes.set_title(found.name)
+            values = np.concatenate([found.reference, found.predicted])
+            low, high = float(values.min()), float(values.max())
+            span = high - low
+            low = max(min(low, float(found.achieved.min())), low - span)
+            high = min(max(high, float(found.achieved.max())), high + span)
+            axes.set_ylim(*style.pad_limits(low, high, 0.08))
+            axes.set_xlim(float(time_s[0]), float(time_s[-1]))
+        for row in grid:
+            row[0].set_ylabel(style.two_lines(*label))
+        for index in range(columns):
+            lowest = [axes for axes in grid[:, index] if axes.get_visible()]
+            if lowest:
+                lowest[-1].set_xlabel("time [s]")
+                lowest[-1].tick_params(labelbottom=True)
+        figure.align_ylabels()
+        style.finish(figure, list(panels[: len(conditions)]), columns=3)
+    return figure

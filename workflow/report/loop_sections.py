@@ -273,7 +273,121 @@ def closed_loop_section(data: RunData) -> Section:
     head = ("quantity", "predicted", first, f"smallest of {draws}", f"largest of {draws}")
     blocks.append(Table(head, tuple(rows)))
     blocks += maybe(_lasting_error(data), "warning")
+    blocks += [*_sensitivity_blocks(data), *_condition_blocks(data)]
     return Section(anchor, title, short, tuple(blocks))
+
+
+_AGREES_PERCENT = 5.0
+_FRICTION_WORDS = (
+    "dry friction takes a fixed torque out of a motor torque that shrinks with the reference, so the loop "
+    "gain falls, the hub sticks, and |S| goes towards 1"
+)
+
+
+def _sensitivity_blocks(data: RunData) -> list[Block]:
+    """The peak of S: predicted, certified, measured on the arm, large and small."""
+    assert data.closed_loop is not None
+    found = data.closed_loop.document.get("sensitivity")
+    if not found:
+        return []
+    channel = data.config.control_channel
+    unit = data.unit(channel.output)
+    nominal, certified, rows = found["nominal_peak"], found["certified_peak"], found["measured"]
+    large, small = rows[0], rows[1]
+    agrees = abs(large["off_nominal_percent"]) <= _AGREES_PERCENT
+    words = [
+        f"Peak of |S| measured on the arm: {number(large['peak'], 4)} (standard deviation "
+        f"{number(large['peak_std'], 2)}) at {frequency(large['omega_rad_s'])}, predicted "
+        f"{number(nominal, 4)}, certified at most {number(certified, 4)}: measured and predicted are "
+        f"{percent(abs(large['off_nominal_percent']), 2)} apart."
+    ]
+    if not agrees:
+        words.append(
+            "The loop on the arm is not the predicted one: look at friction, at the voltage limit and at the "
+            "validation of the model before trusting the margins."
+        )
+    apart = small["off_nominal_percent"]
+    if abs(apart) > abs(large["off_nominal_percent"]) and small["peak_std"] < abs(apart) / 200 * nominal:
+        words.append(
+            f"With a tenth of the excitation the peak is {percent(abs(apart), 2)} "
+            f"{'lower' if apart < 0 else 'higher'} than predicted"
+            + (f": {_FRICTION_WORDS}." if apart < 0 else ": the loop is not linear at that size.")
+        )
+    table = Table(
+        (
+            "measured on",
+            "reference, rms",
+            "peak of |S|",
+            "at",
+            "from nominal",
+            "from certified",
+            "at a limit",
+        ),
+        tuple(
+            (
+                row["name"],
+                quantity(row["reference_rms"], unit),
+                f"{number(row['peak'], 4)} ± {number(row['peak_std'], 2)}",
+                frequency(row["omega_rad_s"]),
+                f"{row['off_nominal_percent']:+.2f} %",
+                "–" if row["off_certified_percent"] is None else f"{row['off_certified_percent']:+.2f} %",
+                percent(100 * row["limited_fraction"], 2),
+            )
+            for row in rows
+        ),
+        "Random-phase multisines as reference, error over reference; ± one standard deviation. The largest "
+        "of many noisy lines lies one to two of them above the true peak.",
+    )
+    picture = Plot(
+        "measured-sensitivity",
+        "Sensitivity measured in closed loop on the arm, beside prediction and worst case over the ellipses.",
+    )
+    return [Remarks(tuple(words), "good" if agrees else "warning", "Sensitivity on the arm"), picture, table]
+
+
+def _condition_blocks(data: RunData) -> list[Block]:
+    """What the loop does where the arm is not the one that was identified."""
+    assert data.closed_loop is not None
+    rows = data.closed_loop.document.get("conditions")
+    if not rows:
+        return []
+    channel = data.config.control_channel
+    command = data.unit(channel.input)
+    table = Table(
+        (
+            "condition",
+            "meaning",
+            "largest difference",
+            "overshoot",
+            "error left",
+            f"largest command [{command or 'as logged'}]",
+            "settled?",
+        ),
+        tuple(
+            (
+                row["name"],
+                row["words"],
+                percent(row["largest_difference_percent"], 3),
+                "–" if row["overshoot_percent"] is None else percent(row["overshoot_percent"], 2),
+                percent(row["error_left_percent"], 2),
+                number(row["peak_command"]),
+                "yes" if row["settled"] else "NO",
+            )
+            for row in rows
+        ),
+        "One run each; percent of the move, for the push of its predicted swing. Difference: achieved from "
+        "predicted, at its largest.",
+        tuple(bool(row["settled"]) for row in rows),
+    )
+    picture = Plot(
+        "closed-loop-conditions",
+        "The loop under other conditions. The prediction knows the model, the controller and its limits; of "
+        "payload, delay, friction and converters it knows nothing, and of a push at the tip how it moves the "
+        "free arm.",
+    )
+    unsettled = [row["name"] for row in rows if not row["settled"]]
+    words = (f"The loop does not settle with: {listing(unsettled)}.",) if unsettled else ()
+    return [picture, table, *maybe(words, "warning")]
 
 
 def _beyond_records(data: RunData) -> tuple[str, ...]:

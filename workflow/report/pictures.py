@@ -18,7 +18,16 @@ from ident.uncertainty import ResponsePosterior
 from ident.validation import ScatterRow, fit_on_fresh_data
 from workflow.figures.bands import Real
 from workflow.figures.bode import EmpiricalResponse, draw_bode
-from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
+from workflow.figures.closed_loop import (
+    ConditionTraces,
+    LoopScene,
+    LoopTraces,
+    MeasuredPeak,
+    PredictedSensitivity,
+    draw_closed_loop,
+    draw_conditions,
+    draw_measured_sensitivity,
+)
 from workflow.figures.error_surface import draw_error_surface, searched_pairs
 from workflow.figures.nyquist import UncertainLoop, draw_nyquist, uncertain_loop
 from workflow.figures.order import draw_order
@@ -48,6 +57,10 @@ def pictures_of(data: RunData) -> dict[str, Drawer]:
         drawers["sensitivities"] = lambda: _sensitivities(data)
     if data.closed_loop is not None:
         drawers["closed-loop"] = lambda: _closed_loop(data)
+        if data.closed_loop.document.get("sensitivity") and data.plant is not None:
+            drawers["measured-sensitivity"] = lambda: _measured_sensitivity(data)
+        if data.closed_loop.document.get("conditions"):
+            drawers["closed-loop-conditions"] = lambda: _conditions(data)
     if data.closed_loop is not None and data.plant is not None:
         drawers["overview"] = lambda: _overview(data)
     return drawers
@@ -282,6 +295,47 @@ def _sensitivities(data: RunData) -> Figure:
     modes = [m for m in data.control.identified["modes"] if m["damping"] < 0.3]
     marks = [(mode["omega_rad_s"], f"mode {number}") for number, mode in enumerate(modes[:4], 1)]
     return draw_sensitivities(curves, level=data.plant.level, marks=marks)
+
+
+def _measured_sensitivity(data: RunData) -> Figure:
+    assert data.closed_loop is not None
+    assert data.plant is not None
+    assert data.synthesis is not None
+    arrays, found = data.closed_loop.arrays, data.closed_loop.document["sensitivity"]
+    low, high = found["band_rad_s"]
+    omega = np.geomspace(0.9 * low, min(1.1 * high, data.plant.nyquist_rad_s), 900)
+    curve = sensitivity_curves(data.plant, data.synthesis.controller, data.config.specification, omega)[0]
+    peaks = [
+        MeasuredPeak(
+            row["name"],
+            arrays[f"sensitivity/{number}/omega_rad_s"],
+            arrays[f"sensitivity/{number}/magnitude"],
+            arrays[f"sensitivity/{number}/std"],
+        )
+        for number, row in enumerate(found["measured"])
+    ]
+    predicted = PredictedSensitivity(omega, curve.nominal, curve.worst)
+    return draw_measured_sensitivity(predicted, peaks, level=data.level)
+
+
+def _conditions(data: RunData) -> Figure:
+    assert data.closed_loop is not None
+    document = data.closed_loop.document
+    reference, predicted, achieved = (
+        data.loop_array(f"conditions/{name}") for name in ("reference", "predicted", "achieved")
+    )
+    time = data.loop_array("time_s")
+    assert reference is not None
+    assert predicted is not None
+    assert achieved is not None
+    assert time is not None
+    rows = [
+        ConditionTraces(row["name"], row["words"], reference[k], predicted[k], achieved[k])
+        for k, row in enumerate(document["conditions"])
+    ]
+    output = data.config.control_channel.output
+    machine = MACHINE_WORDS[document["machine"]]
+    return draw_conditions(time[: reference.shape[1]], rows, (output, data.unit(output)), machine=machine)
 
 
 def _closed_loop(data: RunData) -> Figure:

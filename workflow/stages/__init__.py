@@ -57,6 +57,12 @@ closed_loop.npz, or closed_loop.json when there was nothing to run
               predicted/output, /command, /limited, /performance  (1, T): on the posterior mean
               achieved/...                    (R, T): R runs on the machine
               performance is absent without a performance channel
+    on a simulated arm also (else sensitivity null, conditions empty)
+    document  sensitivity: {nominal_peak, nominal_omega_rad_s, certified_peak, band_rad_s, measured: [{name,
+              reference_rms, peak, peak_std, omega_rad_s, off_nominal_percent, off_certified_percent,
+              peak_command, limited_fraction}]}; conditions: [Condition.row()]
+    arrays    sensitivity/<k>/omega_rad_s, /magnitude, /std  (F,): measurement k of the document
+              conditions/reference, /predicted, /achieved, /predicted_command, /achieved_command  (C, T)
 
 report.json
     document  report_sha256

@@ -11,10 +11,14 @@ import numpy.typing as npt
 
 from control_design.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate, step_metrics
 from control_design.controller import Controller
+from control_design.plant_set import UncertainPlant
 from control_design.stability import closed_loop_poles
+from ident.record import Record
 from ident.uncertainty import ResponsePosterior
 from workflow.config import ClosedLoopOptions, RunConfig, SimulatedSource
 from workflow.errors import naming
+from workflow.loop_conditions import ConditionBench, condition_arrays
+from workflow.loop_sensitivity import measure_on, plan_sensitivity, sensitivity_row
 from workflow.run_directory import StageData
 from workflow.sampled_plant import StateSpaceMachine, realise
 from workflow.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
@@ -98,6 +102,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
             if config.machine == "simulated"
             else run_on_posterior(stage, controller, posterior, tip, trial)
         )
+        beyond = _beyond_the_trial(stage, controller, plant, posterior, trial, certificate)
     rows = describe(achieved, trial)
     document = {
         "skipped": None,
@@ -112,6 +117,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
         "input_limit": controller.input_limit,
         "predicted": describe(predicted, trial)[0],
         "achieved": rows,
+        **beyond.document,
     }
     arrays = {
         "time_s": trial.time_s,
@@ -119,20 +125,94 @@ def run_closed_loop(stage: StageInput) -> StageData:
         "disturbance": trial.disturbance,
         **predicted.arrays("predicted"),
         **achieved.arrays("achieved"),
+        **beyond.arrays,
     }
     return StageData(arrays, document)
+
+
+def _beyond_the_trial(
+    stage: StageInput,
+    controller: Controller,
+    plant: UncertainPlant,
+    posterior: ResponsePosterior,
+    trial: Trial,
+    certificate: Mapping[str, Any],
+) -> StageData:
+    """S measured on the arm, and the loop under other conditions; nothing where the arm is not simulated."""
+    config = stage.config
+    source = config.source
+    if not (isinstance(source, SimulatedSource) and config.machine == "simulated"):
+        return StageData(document={"sensitivity": None, "conditions": []})
+    if not config.closed_loop.conditions:
+        return StageData(document={"sensitivity": None, "conditions": []})
+    options = config.closed_loop
+    measured = OUTPUT_NAMES.index(config.control_channel.output)
+    stage.progress.update("closed_loop", 0.8, "sensitivity")
+    certified = float(certificate["certificate"]["plants"][0]["worst_peak_sensitivity"])
+    plan = plan_sensitivity(controller, plant, certified, _fitted_records(stage), trial.half)
+    arms: list[tuple[str, tuple[dict[str, Any], ...], bool]] = [
+        ("arm as identified", (), False),
+        ("arm as identified, a tenth of the size", (), True),
+    ]
+    if options.effects:
+        arms.append(("arm of the closed-loop check", options.effects, False))
+    rows, arrays = [], {}
+    for number, (name, effects, small) in enumerate(arms):
+        arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
+        found = measure_on(
+            arm,
+            controller,
+            plan,
+            stage.rng("closed_loop", "sensitivity", str(number)),
+            measured_index=measured,
+            measurement_step=options.measurement_step,
+            command_step=options.quantisation,
+            small=small,
+        )
+        rows.append(sensitivity_row(name, found, plan))
+        at = f"sensitivity/{number}"
+        arrays[f"{at}/omega_rad_s"] = found.omega_rad_s
+        arrays[f"{at}/magnitude"] = np.abs(found.response)
+        arrays[f"{at}/std"] = found.std
+    stage.progress.update("closed_loop", 0.9, "conditions")
+    conditions = ConditionBench(
+        controller=controller,
+        posterior=posterior,
+        source=source,
+        options=options,
+        rig=rig_of(source),
+        reference=trial.reference[: trial.half],
+        measured=measured,
+        rng=stage.rng("closed_loop", "conditions"),
+    ).run_all()
+    document = {
+        "sensitivity": {
+            "nominal_peak": plan.nominal_peak,
+            "nominal_omega_rad_s": plan.nominal_omega_rad_s,
+            "certified_peak": plan.certified_peak,
+            "band_rad_s": list(plan.band_rad_s),
+            "measured": rows,
+        },
+        "conditions": [condition.row() for condition in conditions],
+    }
+    return StageData({**arrays, **condition_arrays(conditions)}, document)
+
+
+def _fitted_records(stage: StageInput) -> list[Record]:
+    """The estimation records of the channel that is fed back."""
+    channel = stage.config.control_channel
+    return [
+        item.record.siso(channel.input, channel.output)
+        for item in load_records(stage.results)
+        if item.role == "estimation"
+    ]
 
 
 def make_trial(stage: StageInput, dt_s: float, pole_radius: float) -> Trial:
     """Half the record for the step, half for the disturbance, each long enough for the slowest closed-loop
     pole."""
     options, config = stage.config.closed_loop, stage.config
-    channel = config.control_channel
-    used = [
-        item.record.siso(channel.input, channel.output)
-        for item in load_records(stage.results)
-        if item.role == "estimation"
-    ]
+    used = _fitted_records(stage)
     if options.duration_s is not None:
         samples = round(options.duration_s / dt_s)
     else:
@@ -167,7 +247,7 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> Runs:
     nominal = rig_of(source)
     runs = []
     for draw in range(config.closed_loop.draws):
-        stage.progress.update("closed_loop", 0.1 + 0.9 * draw / config.closed_loop.draws, "machine")
+        stage.progress.update("closed_loop", 0.1 + 0.7 * draw / config.closed_loop.draws, "machine")
         # The first run is the nominal rig, the others as its tolerances allow (all alike where it has none).
         rig = nominal if draw == 0 else nominal.drawn(stage.rng("closed_loop", "rig", str(draw)))
         arm = EncodedArm(
