@@ -115,8 +115,19 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
     assert finished_points(tmp_path / "out") == 6
 
 
-def test_nobody_at_the_address(refused, tmp_path):
+def test_scheduler_without_workers(cluster, refused, tmp_path, monkeypatch):
+    monkeypatch.setattr("workflow.study.cluster.WITHOUT_WORKERS_S", 0.5)
+    line = refused(
+        "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", cluster.address
+    )
+    assert "no worker within" in line
+    assert f"dask worker {cluster.address}" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
+    monkeypatch.setattr("workflow.study.cluster.CONNECT_S", 1.0)
     address = f"tcp://127.0.0.1:{free_port()}"
     line = refused(
         "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", address
@@ -126,8 +137,9 @@ def test_nobody_at_the_address(refused, tmp_path):
 
 
 @pytest.mark.parametrize("address", ["", "nonsense://127.0.0.1:1", "127.0.0.1:nine"])
-def test_an_address_that_is_none(refused, tmp_path, address):
+def test_an_address_that_is_none(refused, tmp_path, address, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
+    monkeypatch.setattr("workflow.study.cluster.CONNECT_S", 1.0)
     line = refused(
         "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", address
     )

@@ -19,6 +19,7 @@ CONNECT_S = 10.0
 WITHOUT_WORKERS_S = 60.0
 _LOST_S = 5.0  # how long a broken connection may stay so before the scheduler counts as lost
 _LOOK_S = 0.05
+_ASK_S = 2.0
 
 # CasADi and numba's caches are used by one thread at a time, whatever a worker was started with.
 _ONE_AT_A_TIME = threading.Lock()
@@ -50,7 +51,11 @@ class DaskCluster:
         self._distributed = distributed
         self.address = address
         # Its own reports of lost connections would bury our one line.
-        self._loggers = [logging.getLogger(name) for name in ("distributed", "tornado")]
+        self._loggers = [
+            logger
+            for name, logger in list(logging.root.manager.loggerDict.items())
+            if isinstance(logger, logging.Logger) and name.startswith(("distributed", "tornado"))
+        ]
         self._levels = [logger.level for logger in self._loggers]
         for logger in self._loggers:
             logger.setLevel(logging.CRITICAL + 1)
@@ -59,7 +64,7 @@ class DaskCluster:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # differing versions of packages: the code digest is checked
                 self._client: Any = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
+        except Exception as error:  # a wrong address ends in whatever its parts are read with
             self._restore()
             raise InputError(f"--scheduler {address}: no Dask scheduler answers there") from error
         try:
@@ -87,7 +92,7 @@ class DaskCluster:
     @property
     def width(self) -> int:
         """How many tasks run at once, as far as is known."""
-        return max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        return max(1, self._workers() or 1)
 
     def run(self, tasks: Sequence[Task]) -> Iterator[tuple[int, tuple[Done, ...]]]:
         """Position and result of every task, as they finish. Raises StageError when the scheduler is lost."""
@@ -100,7 +105,7 @@ class DaskCluster:
                 self._client.submit(run_on_worker, task, key=f"flexlink-{name}-{index}", pure=False): index
                 for index, task in enumerate(tasks)
             }
-        alive = time.monotonic()
+        alive = staffed = looked = time.monotonic()
         while futures:
             # Looked at rather than waited for: waiting would not notice that the scheduler is gone.
             finished = [future for future in futures if future.done()]
@@ -110,6 +115,14 @@ class DaskCluster:
                 alive = time.monotonic()
             elif time.monotonic() - alive > _LOST_S or self._client.status == "closed":
                 raise self._lost()
+            if time.monotonic() - looked > _ASK_S:
+                looked = time.monotonic()
+                staffed = staffed if self._workers() == 0 else looked
+                if looked - staffed > WITHOUT_WORKERS_S:
+                    raise StageError(
+                        f"the Dask cluster at {self.address} had no worker for {WITHOUT_WORKERS_S:.0f} s; "
+                        "--resume continues the study"
+                    )
             for future in finished:
                 if future.status == "cancelled":
                     raise self._lost()
@@ -128,6 +141,13 @@ class DaskCluster:
             reason = f"{type(error).__name__}: {one_line(error)}"
             return failed(task, f"the worker cannot run flexlink ({reason})")
         return done
+
+    def _workers(self) -> int | None:
+        """How many workers the scheduler knows; None when it does not say."""
+        try:
+            return len(self._client.scheduler_info(n_workers=-1)["workers"])
+        except (OSError, TimeoutError, RuntimeError, KeyError):  # KeyError: while the connection is broken
+            return None
 
     def _lost(self) -> StageError:
         return StageError(f"the Dask scheduler at {self.address} was lost; --resume continues the study")

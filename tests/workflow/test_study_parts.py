@@ -1,0 +1,274 @@
+"""Parts of the study: keys, TOML, ranges, fronts, the search, the picture."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex
+
+from tests.workflow.command import FAST_ARM, ROOT
+from tests.workflow.study_examples import assert_same_study, write_study
+from workflow.config import RunConfig, load_config
+from workflow.entry import built_in_config
+from workflow.figures.study import Mark, Panel, draw_pareto
+from workflow.figures.style import PREDICTED, render
+from workflow.settings import check
+from workflow.study.columns import COLUMNS, numbers_of
+from workflow.study.keys import last_name, parse_key, with_values
+from workflow.study.local import LocalProcesses
+from workflow.study.points import short
+from workflow.study.rows import PointRow, pareto_front
+from workflow.study.run import run_study
+from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
+from workflow.study.task import Task
+from workflow.study.toml_text import toml_text
+
+
+def test_keys_reach_into_tables_and_lists():
+    assert parse_key("a.b[2][0].c") == ("a", "b", 2, 0, "c")
+    assert last_name("closed_loop.effects[0].mass_kg") == "mass_kg"
+    assert last_name("a.levels[1]") == "levels"
+    document = {"a": {"b": [{"c": 1}, {"c": 2}]}, "d": None}
+    changed = with_values(document, {"a.b[1].c": 5, "d.e": [1]})
+    assert changed == {"a": {"b": [{"c": 1}, {"c": 5}]}, "d": {"e": [1]}}
+    assert document == {"a": {"b": [{"c": 1}, {"c": 2}]}, "d": None}
+
+
+@pytest.mark.parametrize(
+    ("key", "complaint"),
+    [
+        ("a..b", "not a dotted key"),
+        ("a.b[x]", "not a dotted key"),
+        ("a.b[7].c", r"a\.b\[7\]\.c: a\.b has 1 entries"),
+        ("a.n.c", r"a\.n is no table"),
+        ("a[0]", "a is no list"),
+    ],
+)
+def test_keys_that_lead_nowhere(key, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        with_values({"a": {"b": [{}], "n": 3}}, {key: 1})
+
+
+def _without_none(value):
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return [_without_none(item) for item in value] if isinstance(value, list) else value
+
+
+_SCALARS = st.one_of(
+    st.booleans(),
+    st.integers(-(2**60), 2**60),
+    st.floats(allow_nan=False),
+    st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=8),
+)
+_VALUES = st.recursive(
+    _SCALARS | st.none(),
+    lambda inner: (
+        st.lists(inner.filter(lambda v: v is not None), max_size=3)
+        | st.dictionaries(st.text(st.characters(codec="ascii"), max_size=6), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@given(document=st.dictionaries(st.text(max_size=6), _VALUES, max_size=4))
+def test_toml_comes_back_as_it_was(document):
+    # Read by the standard library, which shares no code with the writer.
+    assert tomllib.loads(toml_text(document)) == _without_none(document)
+
+
+@pytest.mark.parametrize("name", ["default", "fast"])
+def test_configurations_come_back_from_toml(name):
+    config, _ = built_in_config() if name == "default" else load_config(FAST_ARM)
+    document = tomllib.loads(toml_text(config.to_document()))
+    assert check(RunConfig, document, source="again", context={"may_be_gone": True}) == config
+
+
+def _axis(**keys) -> Axis:
+    return Axis.model_validate({"key": "specification.bandwidth_rad_s", **keys})
+
+
+def test_ranges():
+    assert _axis(**{"from": 1, "to": 4}).grid() == (1, 2, 3, 4)
+    assert _axis(**{"from": 1.0, "to": 2.0, "points": 3}).grid() == (1.0, 1.5, 2.0)
+    assert _axis(**{"from": 0.1, "to": 10.0, "points": 3, "log": True}).grid() == (0.1, 1.0, 10.0)
+    assert _axis(**{"from": 1, "to": 100, "points": 3, "log": True}).grid() == (1, 10, 100)
+    assert _axis(values=[3, "x"]).grid() == (3, "x")
+    assert tidy(0.12345678) == 0.123457
+
+
+def test_names_of_values():
+    assert [short(v) for v in (0.1 + 0.2, 4, True, [1.0, 2.5], {"a": 1.0})] == [
+        "0.3",
+        "4",
+        "True",
+        "[1, 2.5]",
+        "{a = 1}",
+    ]
+
+
+def test_example_is_a_valid_study():
+    config, _, base = load_study(ROOT / "examples" / "study.toml")
+    assert base is None
+    assert {axis.name for axis in config.axes} == {"asked_rad_s", "order", "payload_kg"}
+
+
+def _row(number: int, bandwidth: float | None, margin: float | None, good: bool = True) -> PointRow:
+    numbers = dict.fromkeys(COLUMNS) | {"bandwidth_rad_s": bandwidth, "modulus_margin": margin}
+    return PointRow(number, str(number), {}, "certified" if good else "not certified", "", numbers)
+
+
+_PLOT = ParetoPlot(x="bandwidth_rad_s", y="modulus_margin")
+
+
+def test_front_of_a_known_set():
+    rows = [
+        _row(1, 1.0, 0.9),
+        _row(2, 2.0, 0.8),
+        _row(3, 2.0, 0.7),  # beaten by 2
+        _row(4, 3.0, 0.5),
+        _row(5, 9.0, 0.95, good=False),  # nothing is promised there
+        _row(6, None, 0.99),
+        _row(7, 3.0, 0.5),  # as good as 4: neither beats the other
+    ]
+    assert pareto_front(rows, _PLOT) == [1, 2, 4, 7]
+
+
+@given(places=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=12))
+def test_front_by_sweeping(places):
+    # Independent: along falling bandwidth the margin must reach a new maximum.
+    rows = [_row(index, float(x), float(y)) for index, (x, y) in enumerate(places)]
+    expected, best = [], -1
+    for x in sorted({x for x, _ in places}, reverse=True):
+        top = max(y for other, y in places if other == x)
+        if top > best:
+            best = top
+            expected += [index for index, place in enumerate(places) if place == (x, top)]
+    assert sorted(pareto_front(rows, _PLOT)) == sorted(expected)
+
+
+def test_smaller_is_better_where_it_says_so():
+    assert COLUMNS["worst_gamma"].badness(0.9) < COLUMNS["worst_gamma"].badness(1.1)
+    assert COLUMNS["modulus_margin"].badness(0.9) < COLUMNS["modulus_margin"].badness(0.5)
+
+
+def test_margins_in_the_units_of_the_table():
+    margins = {"gain_up": 4.0, "gain_down": 0.5, "phase_rad": 1.0, "delay_s": None, "modulus": 0.4}
+    verdict = {
+        "worst_margins": margins,
+        "nominal_margins": margins | {"gain_down": 0.0},
+        "bandwidth_rad_s": 3.0,
+        "closed_loop_modes": [{"omega_rad_s": 40.0, "zeta": 0.2}, {"omega_rad_s": 200.0, "zeta": 0.1}],
+    }
+    certify = {"certificate": {"plants": [verdict], "gamma": "inf", "gamma_bound": None}}
+    skipped = {"skipped": "why not"}
+    found = numbers_of({"synthesis": {"gamma": 0.8}}, certify, skipped, (30.0, 100.0))
+    assert found["gain_margin_dB"] == pytest.approx(6.0206, abs=1e-4)  # down to a half: the nearer side
+    assert found["nominal_gain_margin_dB"] == pytest.approx(12.0412, abs=1e-4)
+    assert found["phase_margin_deg"] == pytest.approx(57.29578)
+    assert found["delay_margin_ms"] is None
+    assert found["worst_gamma"] is None
+    assert (found["mode_damping"], found["mode_omega_rad_s"]) == (0.2, 40.0)
+    assert numbers_of({"synthesis": None}, certify, skipped, None)["mode_damping"] == 0.1
+
+
+def test_picture_tells_certified_from_uncertified():
+    marks = (
+        Mark(1, 1.0, 0.9, good=True, front=True),
+        Mark(2, 1.0, 0.5, good=True, front=False),
+        Mark(3, 2.0, 0.9, good=False, front=False),
+    )
+    figure = draw_pareto([Panel("x", "y", "larger", "larger", marks, missing=2)])
+    axes = figure.axes[0]
+    by_label = {line.get_label(): line for line in axes.lines}
+    assert to_hex(by_label["certified, on the front"].get_color()) == PREDICTED.lower()
+    assert by_label["not certified"].get_markerfacecolor() == "none"
+    assert list(by_label["certified, dominated"].get_xdata()) == [1.0]
+    texts = [text.get_text() for text in axes.texts]
+    assert "1" in texts
+    assert "2 not drawn: no number here" in texts
+    assert render(figure).kind == "svg"
+
+
+def test_picture_of_nothing_is_drawn():
+    empty = Panel("x", "y", "larger", "smaller", (), missing=3)
+    assert render(draw_pareto([empty, empty, empty])).kind == "svg"
+
+
+def test_other_code_on_the_worker_is_refused():
+    task = Task((), {}, (), "0" * 64)
+    job = type("J", (), {"name": "p"})()
+    from workflow.study.task import run_task
+
+    (done,) = run_task(Task((job,), {}, task.stages, task.code))
+    assert "code of the worker is not that of the study" in str(done.failure)
+
+
+def test_jobs_must_be_positive():
+    with pytest.raises(ValueError, match="at least 1"):
+        LocalProcesses(0)
+
+
+SEARCH = f"""
+[study]
+base = "{FAST_ARM}"
+[changes]
+"closed_loop.draws" = 1
+[search]
+method = "optuna"
+trials = 5
+batch = 2
+startup_trials = 3
+objectives = ["bandwidth_rad_s", "modulus_margin"]
+[[axes]]
+key = "specification.bandwidth_rad_s"
+from = 0.5
+to = 3.0
+log = true
+[[axes]]
+key = "specification.controller_order"
+from = 1
+to = 2
+[[axes]]
+key = "specification.modulus_margin"
+values = [0.4, 0.5]
+"""
+
+
+def test_search_gives_the_same_points_whatever_runs_them(tmp_path):
+    pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
+    study = write_study(tmp_path, SEARCH)
+    first = run_study(study, tmp_path / "one", jobs=2)
+    points = first.numbers["points"]
+    assert len(points) == 5
+    assert len({point["name"] for point in points}) > 3
+    for point in points:
+        assert 0.5 <= point["values"]["specification.bandwidth_rad_s"] <= 3.0
+        assert point["values"]["specification.controller_order"] in (1, 2)
+    # A resumed search asks the same questions: two points are gone, three are taken up.
+    other = tmp_path / "other"
+    run_study_from(tmp_path / "one", other, [point["name"] for point in points[:3]])
+    run_study(study, other, jobs=1, resume=True)
+    assert_same_study(tmp_path / "one", other)
+
+
+def run_study_from(finished: Path, out: Path, names: list[str]) -> None:
+    """A copy of a finished study with only these points left."""
+    import shutil
+
+    shutil.copytree(finished, out)
+    for point in (out / "points").iterdir():
+        if point.name not in names:
+            shutil.rmtree(point)
+    (out / "table.csv").unlink()
+
+
+def test_search_without_its_extra(refused, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    line = refused("study", "--config", write_study(tmp_path, SEARCH), "--out", tmp_path / "out")
+    assert "needs the extra 'optuna': pip install 'flexlink[optuna]'" in line
