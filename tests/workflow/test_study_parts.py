@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import tomllib
 from pathlib import Path
@@ -25,7 +26,7 @@ from workflow.study.points import short
 from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
-from workflow.study.task import Task
+from workflow.study.task import Job, Task, run_task
 from workflow.study.toml_text import toml_text
 
 
@@ -201,11 +202,7 @@ def test_picture_of_nothing_is_drawn():
 
 
 def test_other_code_on_the_worker_is_refused():
-    task = Task((), {}, (), "0" * 64)
-    job = type("J", (), {"name": "p"})()
-    from workflow.study.task import run_task
-
-    (done,) = run_task(Task((job,), {}, task.stages, task.code))
+    (done,) = run_task(Task((Job("p", {}, {}),), {}, ("design",), "0" * 64))
     assert "code of the worker is not that of the study" in str(done.failure)
 
 
@@ -252,15 +249,13 @@ def test_search_gives_the_same_points_whatever_runs_them(tmp_path):
         assert point["values"]["specification.controller_order"] in (1, 2)
     # A resumed search asks the same questions: two points are gone, three are taken up.
     other = tmp_path / "other"
-    run_study_from(tmp_path / "one", other, [point["name"] for point in points[:3]])
+    keep_only(tmp_path / "one", other, [point["name"] for point in points[:3]])
     run_study(study, other, jobs=1, resume=True)
     assert_same_study(tmp_path / "one", other)
 
 
-def run_study_from(finished: Path, out: Path, names: list[str]) -> None:
+def keep_only(finished: Path, out: Path, names: list[str]) -> None:
     """A copy of a finished study with only these points left."""
-    import shutil
-
     shutil.copytree(finished, out)
     for point in (out / "points").iterdir():
         if point.name not in names:
