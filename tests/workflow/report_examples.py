@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from control_design.certificate import certify
+from control_design.closed_loop import ClosedLoopTrajectory as LoopTrajectory
 from control_design.controller import Controller
 from control_design.plant_set import Channel, UncertainPlant
 from control_design.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
@@ -24,6 +26,7 @@ from ident.uncertainty import ResponsePosterior
 from ident.validation import ScatterRow, fit_on_fresh_data
 from workflow.conditioning import as_fitted
 from workflow.config import RunConfig
+from workflow.loop_conditions import Condition, condition_arrays
 from workflow.run_directory import RunDirectory, StageData
 from workflow.stages import closed_loop as closed_loop_stage
 from workflow.stages import identify as identify_stage
@@ -399,4 +402,51 @@ def closed_loop_data(settings: RunConfig, settled: int, draws: int = 3) -> Stage
         "settled_draws": settled,
     }
     arrays = {"time_s": time, "reference": reference, "disturbance": disturbance}
+    if settings.machine == "simulated":
+        more = beyond_the_trial(reference[:400], output[:400])
+        arrays |= more.arrays
+        document |= more.document
     return StageData({**arrays, **predicted.arrays("predicted"), **achieved.arrays("achieved")}, document)
+
+
+def beyond_the_trial(reference, output, *, small_off_percent: float = -12.0) -> StageData:
+    """Two measurements of S and two conditions, as the closed-loop stage writes them."""
+    omega = np.linspace(1.0, 60.0, 40)
+    loop = controller().response(omega) * plant().channel.nominal_response(omega)
+    size = 1 / np.abs(1 + loop)
+    peak = float(size.max())
+    names = ("arm as identified", "arm as identified, a tenth of the size")
+    rows, arrays = [], {}
+    for number, (name, off) in enumerate(zip(names, (0.4, small_off_percent), strict=True)):
+        arrays[f"sensitivity/{number}/omega_rad_s"] = omega
+        arrays[f"sensitivity/{number}/magnitude"] = size * (1 + off / 100)
+        arrays[f"sensitivity/{number}/std"] = np.full(omega.size, 0.002)
+        rows.append(
+            {
+                "name": name,
+                "reference_rms": 0.2 / 10**number,
+                "peak": peak * (1 + off / 100),
+                "peak_std": 0.002,
+                "omega_rad_s": float(omega[np.argmax(size)]),
+                "off_nominal_percent": off,
+                "off_certified_percent": off - 0.1,
+                "peak_command": 12.0,
+                "limited_fraction": 0.0,
+            }
+        )
+    found = {
+        "nominal_peak": peak,
+        "nominal_omega_rad_s": rows[0]["omega_rad_s"],
+        "certified_peak": 1.001 * peak,
+        "band_rad_s": [1.0, 60.0],
+        "measured": rows,
+    }
+    conditions = []
+    for name, factor in (("payload 200 %", 0.9), ("push at the tip", 1.1)):
+        law = LoopTrajectory(np.arange(400) * DT_S, reference, output[:, None], output, output > 9, DT_S)
+        real = replace(law, output=factor * output[:, None])
+        conditions.append(Condition(name, "something <else>", reference, law, real, 0.5))
+    return StageData(
+        {**arrays, **condition_arrays(conditions)},
+        {"sensitivity": found, "conditions": [condition.row() for condition in conditions]},
+    )

@@ -19,7 +19,16 @@ from tests.workflow import report_examples as example
 from workflow.figures import style
 from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees
 from workflow.figures.bode import EmpiricalResponse, draw_bode
-from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
+from workflow.figures.closed_loop import (
+    ConditionTraces,
+    LoopScene,
+    LoopTraces,
+    MeasuredPeak,
+    PredictedSensitivity,
+    draw_closed_loop,
+    draw_conditions,
+    draw_measured_sensitivity,
+)
 from workflow.figures.error_surface import draw_error_surface, searched_pairs
 from workflow.figures.nyquist import draw_nyquist, uncertain_loop
 from workflow.figures.order import draw_order
@@ -127,6 +136,31 @@ def closed_loop_figure(name: str = "hub") -> Figure:
     return draw_closed_loop(scene, predicted, achieved, machine="simulated arm", spread=achieved)
 
 
+def measured_sensitivity_figure(name: str = "") -> Figure:
+    """No name of the user's stands in it."""
+    arrays = example.closed_loop_data(example.config(), 3).arrays
+    omega = arrays["sensitivity/0/omega_rad_s"]
+    size = arrays["sensitivity/0/magnitude"]
+    measured = [
+        MeasuredPeak(f"arm {k}", omega, arrays[f"sensitivity/{k}/magnitude"], arrays[f"sensitivity/{k}/std"])
+        for k in range(2)
+    ]
+    return draw_measured_sensitivity(PredictedSensitivity(omega, size, 1.05 * size), measured, level=0.95)
+
+
+def conditions_figure(name: str = "hub") -> Figure:
+    arrays = example.closed_loop_data(example.config(), 3).arrays
+    rows = [
+        ConditionTraces(
+            f"condition {k}",  # our own words; only the output's name is the user's
+            "words",
+            *(arrays[f"conditions/{key}"][k] for key in ("reference", "predicted", "achieved")),
+        )
+        for k in (0, 1, 0, 1, 0)
+    ]
+    return draw_conditions(arrays["time_s"][:400], rows, (name, "rad"), machine="simulated arm")
+
+
 def validation_figure(name: str = "fresh") -> Figure:
     of = example.model()
     fresh = example.record([of], name, 3)
@@ -164,6 +198,8 @@ FAMILIES: list[Callable[..., Figure]] = [
     overview_figure,
     sensitivity_figure,
     closed_loop_figure,
+    measured_sensitivity_figure,
+    conditions_figure,
     validation_figure,
     residuals_figure,
     repeats_figure,

@@ -85,6 +85,8 @@ def test_page_and_pictures_are_written(drawn):
         "nyquist",
         "sensitivities",
         "closed-loop",
+        "closed-loop-conditions",
+        "measured-sensitivity",
         "overview",
     }
     text = drawn.report_path.read_text(encoding="utf-8")
@@ -324,3 +326,32 @@ def test_small_phrases():
     assert frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
     assert sentence("hub: it is") == "hub: it is."
     assert sentence("stop!") == "Stop!"
+
+
+def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn):
+    """A smaller peak at small excitation is put down to friction; a large gap is a warning."""
+    page = page_for(tmp_path, example.config())
+    assert "measured and predicted are 0.4 % apart" in page.text
+    assert "the peak is 12 % lower than predicted: dry friction takes" in page.text
+    assert "payload 200 %" in page.text
+    assert "something <else>" in page.text
+    run = RunDirectory.open(tmp_path / "run")
+    loop = run.load_stage("closed_loop")
+    found = dict(loop.document["sensitivity"])
+    rows = [dict(row) for row in found["measured"]]
+    rows[0] |= {"off_nominal_percent": 9.0}
+    rows[1] |= {"off_nominal_percent": 0.1}
+    document = {**loop.document, "sensitivity": {**found, "measured": rows}}
+    document["conditions"] = [{**row, "settled": False} for row in document["conditions"]]
+    with run.locked():
+        run.save_stage("closed_loop", StageData(loop.arrays, document), "x")
+    text = Page(write_report(run, example.config()).read_text(encoding="utf-8")).text
+    assert "The loop on the arm is not the predicted one" in text
+    assert "dry friction takes" not in text
+    assert "The loop does not settle with: payload 200 % and push at the tip." in text
+
+
+def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, undrawn):
+    page = page_for(tmp_path, example.config(machine="identified"))
+    assert "Sensitivity on the arm" not in page.text
+    assert "The loop under other conditions" not in page.text

@@ -120,6 +120,48 @@ def test_closed_loop_arrays_fit_the_schema(run):
     assert np.sqrt(np.mean(error**2)) < 0.05 * step
 
 
+def test_sensitivity_measured_on_the_arm_is_the_predicted_one(run):
+    """The fast arm has no dry friction, so S is linear: 5 % is the reach, 1 % is seen."""
+    data = run.load_stage("closed_loop")
+    found = data.document["sensitivity"]
+    assert [row["name"] for row in found["measured"]] == [
+        "arm as identified",
+        "arm as identified, a tenth of the size",
+    ]
+    assert abs(found["measured"][0]["off_nominal_percent"]) < 5
+    assert found["nominal_peak"] <= found["certified_peak"] * (1 + 1e-6)
+    certificate = load_certificate(run)
+    assert found["certified_peak"] == certificate.plants[0].worst_peak_sensitivity
+    for number in range(2):
+        shape = data.arrays[f"sensitivity/{number}/omega_rad_s"].shape
+        assert data.arrays[f"sensitivity/{number}/magnitude"].shape == shape
+        assert data.arrays[f"sensitivity/{number}/std"].shape == shape
+
+
+def test_conditions_fit_the_schema(run):
+    data = run.load_stage("closed_loop")
+    names = [row["name"] for row in data.document["conditions"]]
+    assert names == [
+        "slew",
+        "push at the tip",
+        "payload 0 %",
+        "payload 100 %",
+        "payload 200 %",
+        "late",
+        "no friction",
+        "double friction",
+        "coarse",
+        "voltage limit",
+        "no anti-windup",
+    ]
+    assert all(row["settled"] for row in data.document["conditions"])
+    half = data.arrays["time_s"].size // 2
+    for key in ("reference", "predicted", "achieved", "predicted_command", "achieved_command"):
+        assert data.arrays[f"conditions/{key}"].shape == (len(names), half)
+    limit = data.document["input_limit"]
+    assert np.max(np.abs(data.arrays["conditions/achieved_command"][:-1])) <= limit
+
+
 def test_encoder_rounds_the_hub_angle_only():
     config, _ = load_config(FAST_ARM)
     step = 0.01
