@@ -278,6 +278,27 @@ def closed_loop_rows(loop: Mapping[str, Any], unit: str, command_unit: str) -> t
         if achieved and never:
             text += f" ({never} never)"
         rows.append(Row(label, f"predicted {_text(loop['predicted'][key], suffix)}, achieved {text}"))
+    found = loop.get("sensitivity")
+    if found:
+        large = found["measured"][0]
+        rows.append(
+            Row(
+                "peak of |S|",
+                f"predicted {_text(found['nominal_peak'])}, certified at most "
+                f"{_text(found['certified_peak'])}, measured {_text(large['peak'])} "
+                f"({large['off_nominal_percent']:+.2f} % of predicted)",
+            )
+        )
+    if loop.get("conditions"):
+        unsettled = [row["name"] for row in loop["conditions"] if not row["settled"]]
+        count = len(loop["conditions"])
+        rows.append(
+            Row(
+                "other conditions",
+                f"{count - len(unsettled)} of {count} settle"
+                + (f", not: {', '.join(unsettled)}" if unsettled else ""),
+            )
+        )
     return tuple(rows)
 
 

@@ -375,8 +375,8 @@ def _condition_blocks(data: RunData) -> list[Block]:
             )
             for row in rows
         ),
-        "One run each; percent of the move, for the push of its predicted swing. Difference: achieved from "
-        "predicted, at its largest.",
+        "One run each, otherwise on the arm of the closed-loop check; percent of the move, for the push of "
+        "its predicted swing. Difference: achieved from predicted, at its largest.",
         tuple(bool(row["settled"]) for row in rows),
     )
     picture = Plot(
