@@ -217,8 +217,6 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         return _measured(path, design)
     if suffix not in _STATE_SPACE_FILES:
         known = ", ".join((*_STATE_SPACE_FILES, ".csv"))
-        if not path.exists():
-            raise InputError(f"cannot read {path}: no such file or directory")
         raise InputError(f"{path}: not a run directory, and the ending is none of {known}")
     document = _read_document(path, suffix)
     if "posterior/mean" in document or "model/coefficients" in document:

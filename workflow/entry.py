@@ -167,6 +167,9 @@ def design_controller(
         storage.check_writable(out)
         if out.absolute() in [path.absolute() for path in paths]:
             raise InputError(f"--out {out} is a source; give the controller a name of its own")
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"cannot read {path}: no such file or directory")
     asked = read_design_file(specification_path) if specification_path is not None else DesignFile()
     found = load_sources(paths, asked)
     specification, options = asked.specification, asked.synthesis or found[0].synthesis or SynthesisOptions()
