@@ -74,7 +74,8 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
             run.stage_digest(stage.name)
     else:
         config, _ = load_config(base)
-    values = dict(study.changes)
+    # The points share the processors already, and a Dask worker may start no processes of its own.
+    values: dict[str, Any] = {"synthesis.jobs": 1, **study.changes}
     if study.study.seed is not None:
         values["run.seed"] = study.study.seed
     folder = study_path.absolute().parent

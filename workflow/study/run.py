@@ -110,7 +110,7 @@ class _Work:
         self._directory, self._base, self._executor = directory, base, executor
         self._here, self._progress = here, progress
         self._broken_plants: dict[str, str] = {}
-        self._count = self._finished = self._good = 0
+        self._count = self._finished = self._taken_up = self._good = 0
 
     def compute(self, strategy: Strategy, base_point: Point) -> list[PointRow]:
         """All rows, in the order of the points."""
@@ -155,6 +155,7 @@ class _Work:
                 rows[point.name] = row_without_run(point, "failed", self._broken_plants[point.plant_key])
             elif self._directory.has_point(point):
                 rows[point.name] = row_of(point, self._directory.point(point))
+                self._taken_up += 1
             else:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
@@ -213,7 +214,9 @@ class _Work:
             self._finished += 1
             self._good += row.good
         message = f"{self._finished} of {self._count}, {self._good} certified"
-        self._progress.update("points", self._finished / self._count, message)
+        # The time left follows from the points computed now; those taken up took none.
+        share = (self._finished - self._taken_up) / max(self._count - self._taken_up, 1)
+        self._progress.update("points", min(share, 1.0), message)
 
 
 def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[str]) -> Task:
