@@ -21,7 +21,7 @@ from ident.uncertainty import ResponsePosterior
 from plant import Rig, parse_effect
 from plant import simulate as simulate_arm
 from workflow.config import ClosedLoopOptions, SimulatedSource
-from workflow.sampled_plant import StateSpaceMachine, realise
+from workflow.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 from workflow.simulated_rig import EncodedArm
 
 Real = npt.NDArray[np.float64]
@@ -104,26 +104,6 @@ class _Pushed:
         self._sample += 1
 
 
-class _Clipped:
-    """A machine that clips its input without telling the controller."""
-
-    def __init__(self, machine: SampledMachine, limit: float) -> None:
-        self._machine, self._limit = machine, limit
-
-    @property
-    def dt_s(self) -> float:
-        return self._machine.dt_s
-
-    def reset(self) -> None:
-        self._machine.reset()
-
-    def measure(self) -> Real:
-        return self._machine.measure()
-
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        self._machine.advance(min(max(u, -self._limit), self._limit), hub_torque_Nm=hub_torque_Nm)
-
-
 @dataclass(frozen=True, eq=False)
 class ConditionBench:
     """Everything the conditions share.
@@ -166,7 +146,7 @@ class ConditionBench:
         model = StateSpaceMachine(a, b, c, d, self.posterior.dt_s, holds_input=holds)
         if holds:
             law = replace(law, computational_delay_samples=law.computational_delay_samples - 1)
-        machine: SampledMachine = model if clip is None else _Clipped(model, clip)
+        machine: SampledMachine = model if clip is None else ClippedMachine(model, clip)
         run = simulate(law, machine, reference, output_disturbance=output_disturbance)
         if holds:
             return replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
@@ -187,8 +167,7 @@ class ConditionBench:
         extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
         arm = EncodedArm(self.source, extra, self.rng.spawn(1)[0], rig=rig or self.rig)
         machine: SampledMachine = arm if tip_force_N is None else _Pushed(arm, tip_force_N)
-        if clip is not None:
-            machine = _Clipped(machine, clip)
+        machine = ClippedMachine(machine, FINITE if clip is None else clip)
         measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
         return simulate(
             law or self.controller,

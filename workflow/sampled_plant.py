@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from control_design.closed_loop import SampledMachine
 from ident.model import GobfModel
 from ident.poles import Poles
 from ident.uncertainty import ResponsePosterior
 
 Real = npt.NDArray[np.float64]
+
+FINITE = 1e9
+"""Input at which a machine is clipped only so that a loop that runs away stays made of numbers."""
 
 
 def realise(posterior: ResponsePosterior, coefficients: Real) -> tuple[Real, Real, Real, float]:
@@ -83,3 +87,25 @@ class StateSpaceMachine:
         acting = self._held if self._holds_input else u
         self._x = self._a @ self._x + self._b * acting
         self._held = u
+
+
+class ClippedMachine:
+    """A machine that clips its input without telling the controller."""
+
+    def __init__(self, machine: SampledMachine, limit: float) -> None:
+        self._machine, self._limit = machine, limit
+
+    @property
+    def dt_s(self) -> float:
+        return self._machine.dt_s
+
+    def reset(self) -> None:
+        self._machine.reset()
+
+    def measure(self) -> Real:
+        """Outputs (Y,) at t_k."""
+        return self._machine.measure()
+
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        """Hold the clipped input for one sample."""
+        self._machine.advance(min(max(u, -self._limit), self._limit), hub_torque_Nm=hub_torque_Nm)

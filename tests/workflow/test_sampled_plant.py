@@ -11,7 +11,7 @@ from control_design.closed_loop import simulate
 from control_design.controller import Controller
 from ident.poles import Poles
 from ident.uncertainty import ResponsePosterior
-from workflow.sampled_plant import StateSpaceMachine, realise
+from workflow.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 
 DT_S = 0.01
 
@@ -93,3 +93,23 @@ def test_hub_torque_has_nowhere_to_go():
     machine = StateSpaceMachine(np.zeros((1, 1)), np.ones(1), np.ones(1), 0.0, DT_S, holds_input=False)
     with pytest.raises(ValueError, match="no input for a hub torque"):
         machine.advance(1.0, hub_torque_Nm=0.1)
+
+
+def test_loop_that_runs_away_stays_finite():
+    """Far too much gain on an integrator: the clipped machine keeps every number a number."""
+    machine = StateSpaceMachine(np.ones((1, 1)), np.ones(1), np.ones(1), 0.0, DT_S, holds_input=False)
+    law = Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[50.0]]), DT_S)
+    run = simulate(law, ClippedMachine(machine, FINITE), np.ones(3000))
+    assert np.all(np.isfinite(run.measured))
+    assert np.max(np.abs(run.measured)) > 1e8
+
+
+def test_clipping_is_clipping():
+    machine = StateSpaceMachine(np.zeros((1, 1)), np.ones(1), np.ones(1), 0.0, DT_S, holds_input=False)
+    clipped = ClippedMachine(machine, 2.0)
+    seen = []
+    for value in (1.0, 5.0, -7.0):
+        clipped.advance(value)
+        seen.append(float(clipped.measure()[0]))
+    assert seen == [1.0, 2.0, -2.0]
+    assert clipped.dt_s == DT_S

@@ -295,10 +295,11 @@ def _sensitivity_blocks(data: RunData) -> list[Block]:
     nominal, certified, rows = found["nominal_peak"], found["certified_peak"], found["measured"]
     large, small = rows[0], rows[1]
     agrees = abs(large["off_nominal_percent"]) <= _AGREES_PERCENT
+    bound = f"certified at most {number(certified, 4)}" if math.isfinite(certified) else "no bound certified"
     words = [
         f"Peak of |S| measured on the arm: {number(large['peak'], 4)} (standard deviation "
         f"{number(large['peak_std'], 2)}) at {frequency(large['omega_rad_s'])}, predicted "
-        f"{number(nominal, 4)}, certified at most {number(certified, 4)}: measured and predicted are "
+        f"{number(nominal, 4)}, {bound}: measured and predicted are "
         f"{percent(abs(large['off_nominal_percent']), 2)} apart."
     ]
     if not agrees:

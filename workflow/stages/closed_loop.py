@@ -20,7 +20,7 @@ from workflow.errors import naming
 from workflow.loop_conditions import ConditionBench, condition_arrays
 from workflow.loop_sensitivity import measure_on, plan_sensitivity, sensitivity_row
 from workflow.run_directory import StageData
-from workflow.sampled_plant import StateSpaceMachine, realise
+from workflow.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 from workflow.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
 from workflow.stages.base import StageInput
 from workflow.stages.results import load_plant, load_posterior, load_records, load_synthesis
@@ -160,7 +160,7 @@ def _beyond_the_trial(
     for number, (name, effects, small) in enumerate(arms):
         arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
         found = measure_on(
-            arm,
+            ClippedMachine(arm, FINITE),
             controller,
             plan,
             stage.rng("closed_loop", "sensitivity", str(number)),
@@ -253,7 +253,7 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> Runs:
         arm = EncodedArm(
             source, config.closed_loop.effects, stage.rng("closed_loop", "noise", str(draw)), rig=rig
         )
-        runs.append(_loop(controller, arm, trial, measured, config.closed_loop))
+        runs.append(_loop(controller, ClippedMachine(arm, FINITE), trial, measured, config.closed_loop))
     outputs = np.stack([run.output for run in runs])
     return Runs(
         outputs[:, :, measured],
