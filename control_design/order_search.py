@@ -23,7 +23,8 @@ _EASED = 4  # with tracking: low-gain starts given to the interior point first
 _SHAPED_TRACKING = 3
 _STEPS = 100
 _CARRIED = 3  # candidates carried through the exchange
-_HOPS = 3
+_HOPS, _LATER_HOPS = 4, 2
+_HALVINGS = 20  # natural units of a section far from the loop's crossover are far too large
 _AGREE = 1.001
 
 
@@ -140,28 +141,34 @@ class OrderSearch:
         Several are carried along at first: the best on a coarse grid is often not the best on a finer one.
         In between, hops from the best look for a better valley.
         """
-        history = [found[0].gamma]
-        pool = different(found, _CARRIED)
+        history, tolerance = [found[0].gamma], self.options.exchange_tolerance
+        pool, fresh = different(found, _CARRIED), list[Candidate]()
         for number in range(self.options.exchange_rounds):
             self.tell(0.5 + 0.5 * number / self.options.exchange_rounds, f"exchange {number + 1}")
             if self._enough(pool):
                 break
-            added = sum(self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid) for c in pool)
+            # Also of what lost: better on the grid and worse between its points, it may yet win.
+            added = sum(
+                self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
+                for c in different([*pool, *fresh], _CARRIED)
+            )
             if added == 0 and number > 0:
                 break
             starts = [c.parameters for c in pool]
-            hops = min(_HOPS, self.options.starts) if number == 0 else 1
+            if fresh and min(c.gamma_grid for c in fresh) < pool[0].gamma * (1 - tolerance):
+                starts.append(min(fresh, key=lambda c: c.gamma_grid).parameters)
+            hops = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts)
             starts += [self._hop(pool[0].parameters) for _ in range(hops)]
-            fresh: list[Candidate] = []
+            fresh = []
             for at, end in enumerate(self.pool.do([self._task(x) for x in starts])):
                 fresh += self._taken(end)
                 if number == 0 and at >= len(pool) and self._agree(fresh):
                     break
-            pool = different(
-                [*pool, *(c for c in fresh if np.isfinite(c.gamma))], max(1, _CARRIED - 1 - number)
-            )
+            fresh = [c for c in fresh if np.isfinite(c.gamma)]
+            pool = different([*pool, *fresh], max(1, _CARRIED - 1 - number))
             history.append(pool[0].gamma)
-            if number > 0 and history[-1] > history[-2] * (1 - self.options.exchange_tolerance):
+            settled = min([c.gamma_grid for c in fresh], default=np.inf) > pool[0].gamma * (1 - tolerance)
+            if number > 0 and settled and history[-1] > history[-2] * (1 - tolerance):
                 break
         return OrderResult(pool[0], tuple(self.reports), tuple(history))
 
@@ -169,7 +176,7 @@ class OrderSearch:
         """A stable neighbour: every parameter moved by up to a natural unit, less until it is stable."""
         size = 10 ** self.rng.uniform(-1.0, 0.0)
         direction = self.rng.standard_normal(parameters.size) * natural_units(self.cascade, parameters)
-        for _ in range(8):
+        for _ in range(_HALVINGS):
             if np.isfinite(self._descent().value(parameters + size * direction)):
                 break
             size *= 0.5

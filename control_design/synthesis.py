@@ -27,7 +27,7 @@ __all__ = ["Progress", "SynthesisOptions", "synthesise"]
 Progress = Callable[[float, str], None]
 
 _STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
-_EMBEDDINGS = 2  # ways to add a cancelling section to the result of the order below
+_EMBEDDINGS = 3  # ways to add a cancelling section to the result of the order below
 _LOWEST_ORDER, _LOWEST_TRACKING = 2, 3  # first rung of the ladder; two states rarely track and damp
 
 

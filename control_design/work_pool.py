@@ -12,8 +12,13 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing.reduction import ForkingPickler
 from pickle import PicklingError
 from types import TracebackType
+from typing import Any
+
+import control
+import numpy as np
 
 from control_design.plant_set import UncertainPlant
 from control_design.problem import Problem
@@ -22,6 +27,15 @@ from control_design.specification import Specification
 from control_design.synthesis_options import SynthesisOptions
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def _parts(system: control.StateSpace) -> tuple[Any, tuple[Any, ...]]:
+    """How a state space travels to another process: python-control keeps a local function in its own."""
+    matrices = (np.asarray(getattr(system, name)) for name in "ABCD")
+    return control.StateSpace, (*matrices, system.dt)
+
+
+ForkingPickler.register(control.StateSpace, _parts)  # for transport between our processes only
 
 
 class WorkPool:
