@@ -1,6 +1,6 @@
 """P2 (three modes): do 95 % ellipses hold the truth 95 % of the time, poles and order from the same data?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.coverage_p2 [--cases main,random] [--seeds 200] [--first-seed 0]
+    OMP_NUM_THREADS=1 python -m benchmarks.coverage_p2 [--cases main,random] [--seeds 200] [--first-seed 0] [--file NAME]
 
 Plants, inputs and noise: `benchmarks.p2_plants`; every run has its own input and noise, and its own plant
 where the case says so. Poles and order by identify([record]) with default options.
@@ -292,6 +292,7 @@ def report(out: ResultsFile, case: Case, runs: Sequence[RunOutcome]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="coverage of 95 % ellipses on P2")
     parser.add_argument("--cases", default=",".join(CASES), help="comma-separated; default: all")
+    parser.add_argument("--file", default="coverage_p2", help="name of the results file, without ending")
     parser.add_argument("--seeds", type=int, default=200, help="runs per case")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
@@ -306,7 +307,7 @@ def main() -> None:
     # Processes started afresh: forking after the numerical libraries have started their threads can hang.
     context = multiprocessing.get_context("spawn")
     with (
-        ResultsFile("coverage_p2", seeds=label, write=not arguments.trial) as out,
+        ResultsFile(arguments.file, seeds=label, write=not arguments.trial) as out,
         ProcessPoolExecutor(max(1, min(2, arguments.processes)), mp_context=context) as pool,
     ):
         for line in HEADER.strip().splitlines():
