@@ -203,6 +203,38 @@ values = ["biquads", "pi_d_notch"]
     assert "pi_d_notch has order 1 plus two per notch" in summary.numbers["points"][1]["why"]
 
 
+def test_points_that_fail_are_named_and_the_others_stand(flexlink, tmp_path):
+    text = f"""
+[study]
+base = "{FAST_ARM}"
+[changes]
+"closed_loop.draws" = 1
+[[axes]]
+key = "channels[0].uncertainty.fir_length"
+values = [40, 690]
+"""
+    # 700 samples do not carry a response of 690 coefficients.
+    answer = flexlink(
+        "study", "--config", write_study(tmp_path, text), "--out", tmp_path / "out", "--jobs", 1
+    )
+    assert answer.code == 1
+    assert answer.err.count("\n") == 1
+    assert "1 of 2 points failed" in answer.err
+    assert "point 2: " in answer.err
+    rows = rows_of(tmp_path / "out")
+    assert [row["state"] for row in rows] == ["certified", "failed"]
+    assert "fir_length" in rows[1]["why"]
+
+
+def test_a_base_that_cannot_be_identified_is_refused(refused, tmp_path):
+    study = write_study(
+        tmp_path, SMALL_STUDY.replace("[changes]", '[changes]\n"channels[0].uncertainty.fir_length" = 690')
+    )
+    line = refused("study", "--config", study, "--out", tmp_path / "out", "--jobs", 1)
+    assert "the base cannot be identified" in line
+    assert not (tmp_path / "out").exists()
+
+
 class Watch(Silence):
     """Remembers what was said."""
 

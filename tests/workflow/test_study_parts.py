@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tomllib
@@ -204,6 +205,26 @@ def test_picture_of_nothing_is_drawn():
 def test_other_code_on_the_worker_is_refused():
     (done,) = run_task(Task((Job("p", {}, {}),), {}, ("design",), "0" * 64))
     assert "code of the worker is not that of the study" in str(done.failure)
+
+
+class Deadly:
+    """Kills the process that unpacks it, as a crash in compiled code would."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+def test_a_task_that_kills_its_process_fails_alone():
+    harmless = Task((Job("harmless", {}, {}),), {}, ("design",), "0" * 64)
+    deadly = Task((Job("deadly", {}, {}),), {"bomb": Deadly()}, ("design",), "0" * 64)
+    before = os.environ.get("OMP_NUM_THREADS")
+    with LocalProcesses(2) as processes:
+        found = dict(processes.run([harmless, deadly, harmless, harmless]))
+    assert os.environ.get("OMP_NUM_THREADS") == before
+    assert found.keys() == {0, 1, 2, 3}
+    assert found[1][0].failure == "the process computing it died 3 times (out of memory?)"
+    for index in (0, 2, 3):
+        assert "code of the worker" in str(found[index][0].failure)
 
 
 def test_jobs_must_be_positive():

@@ -78,6 +78,17 @@ class StudyDirectory:
         storage.write_json(study.path / "study.json", document)
         return study
 
+    def discard_if_empty(self) -> None:
+        """Take back what `begin` wrote, if neither a plant nor a point is there: a corrected base may come."""
+        if any(self.plants_path.iterdir()) or any(self.points_path.iterdir()):
+            return
+        for name in ("study.json", "study.toml", "lock"):
+            (self.path / name).unlink(missing_ok=True)
+        self.plants_path.rmdir()
+        self.points_path.rmdir()
+        if not any(self.path.iterdir()):
+            self.path.rmdir()
+
     @property
     def plants_path(self) -> Path:
         return self.path / "plants"
@@ -129,7 +140,9 @@ class StudyDirectory:
 
     def save_plant(self, point: Point, given: Mapping[str, bytes], done: Done) -> None:
         """Keep records, model and ellipses."""
-        _write(self.plant(point), point, given, done)
+        run = self.plant(point)
+        _write(run, point, given, done)
+        run.record_status("identified")
 
     def save_point(self, point: Point, done: Done) -> None:
         """Keep a finished point, with the plant's stages beside its own: a run like any other."""

@@ -82,7 +82,11 @@ def run_study(
         directory = StudyDirectory.begin(out, text=text, base=base, resume=resume)
         with directory.locked():
             work = _Work(directory, base, executor, here, progress)
-            rows = work.compute(strategy, maker.base_point())
+            try:
+                rows = work.compute(strategy, maker.base_point())
+            except InputError:
+                directory.discard_if_empty()
+                raise
             progress.start("page")
             started = time.monotonic()
             summary = _write_up(directory, study, text, base, rows)
