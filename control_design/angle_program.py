@@ -4,11 +4,8 @@ IPOPT.
 Distance from -1 to the convex set K E is the largest value over unit normals e^{jt} of
     m(t) = Re(e^{-jt} c) - sqrt(s1^2 Re(q)^2 + s2^2 Im(q)^2 + eps),   c = 1 + G K,  q = e^{-jt} K u1,
 so |W1 S| <= 1/g for every G in E  <=>  there is t with m(t) >= g |W1|, likewise g |W3 K| and g |W4 Gp| with
-an independent Gp. For the measured output itself (Gp = G) the S-lemma is used instead, exact for one
-quadratic on a ball:
-    |c + K e|^2 >= g^2 W4^2 |G + e|^2 on E  <=>  there is tau >= 0 with A_i + tau > 0 and C - tau - sum
-    B_i^2/(A_i + tau) >= 0.
-Variables: controller parameters, g, one t per frequency, one tau where W4 acts. Maximise log g.
+an independent Gp. W4 of the measured output itself (Gp = G) has no row here: the descent takes it up.
+Variables: controller parameters, g, one t per frequency. Maximise log g.
 """
 
 from __future__ import annotations
@@ -19,7 +16,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from control_design.biquads import Cascade, tustin_frequency
 from control_design.ellipses import Complex, Ellipses, Real
@@ -34,8 +30,8 @@ class Rows:
     """Everything the programme needs of one plant (or delayed copy) on its grid; all arrays (F,).
 
     delay : z^-d times a delay copy, multiplies K. w1, w3, w4 : weight magnitudes, 0 = no row. gp_max :
-    largest |Gp| of an independent performance channel; None with w4 > 0 means Gp = G. phase_start : arg(1 +
-    L) towards zero frequency for a stable loop.
+    largest |Gp| of an independent performance channel; None with w4 > 0 means Gp = G, a row of the descent
+    only. start_window : range of the first angle for a stable loop.
     """
 
     ellipses: Ellipses
@@ -77,7 +73,6 @@ class AngleProgram:
         self.plants = tuple(plants)
         x = ca.SX.sym("x", cascade.parameters)
         g = ca.SX.sym("g")
-        damping = ca.SX.sym("damping")
         variables, lower, upper = (
             [x, g],
             [-np.inf] * cascade.parameters + [1e-4],
@@ -86,7 +81,6 @@ class AngleProgram:
         bound = parameter_bounds(cascade)
         lower[: cascade.parameters], upper[: cascade.parameters] = list(bound[0]), list(bound[1])
         rows: list[Symbol] = []
-        s_lemma: list[tuple[Rows, Symbol, Symbol, Symbol, Symbol]] = []
         row_lower: list[Real] = []
         row_upper: list[Real] = []
 
@@ -132,37 +126,13 @@ class AngleProgram:
                 use = np.flatnonzero(plant.w3 > 0).tolist()
                 size = ca.sqrt(k_re**2 + k_im**2 + 1e-16)
                 add((margin - g * (scale * plant.w3) * size)[use], 0.0, np.inf)
-            if np.any(plant.w4 > 0):
+            if plant.gp_max is not None and np.any(plant.w4 > 0):
                 use = np.flatnonzero(plant.w4 > 0).tolist()
-                if plant.gp_max is not None:
-                    add((margin - g * (scale * plant.w4 * plant.gp_max))[use], 0.0, np.inf)
-                else:
-                    s_lemma.append((plant, k_re, k_im, c_re, c_im))
-        self._damped: list[tuple[int, npt.NDArray[np.int64]]] = []
-        for plant, k_re, k_im, c_re, c_im in s_lemma:
-            use_at = np.flatnonzero(plant.w4 > 0)
-            pick = use_at.tolist()
-            self._damped.append((self.plants.index(plant), use_at))
-            tau: Symbol = ca.SX.sym("tau", use_at.size)
-            variables.append(tau)
-            lower += [0.0] * use_at.size
-            upper += [np.inf] * use_at.size
-            first, second, value = _s_lemma_terms(
-                plant.ellipses.subset(use_at),
-                plant.row_scale[use_at],
-                (damping * g * plant.w4[use_at]) ** 2,
-                (k_re[pick], k_im[pick]),
-                (c_re[pick], c_im[pick]),
-            )
-            p1, p2 = first[0] + tau, second[0] + tau
-            add(p1, 0.0, np.inf)
-            add(p2, 0.0, np.inf)
-            add(value - tau - first[1] ** 2 / (p1 + 1e-14) - second[1] ** 2 / (p2 + 1e-14), 0.0, np.inf)
+                add((margin - g * (scale * plant.w4 * plant.gp_max))[use], 0.0, np.inf)
         nlp: dict[str, Any] = {
             "x": ca.vertcat(*variables),
             "f": -ca.log(g),
             "g": ca.vertcat(*rows),
-            "p": damping,
         }
         self._bounds = np.array(lower), np.array(upper)
         self._row_bounds = np.concatenate(row_lower), np.concatenate(row_upper)
@@ -220,34 +190,12 @@ class AngleProgram:
             re, im = re * f_re - im * f_im, re * f_im + im * f_re
         return re, im
 
-    def _multipliers(self, start: NlpPoint, damping: float) -> list[Real]:
-        """Best multipliers of the S-lemma rows at a start, so that only g decides its feasibility."""
-        values = []
-        for index, use in self._damped:
-            plant = self.plants[index]
-            e = plant.ellipses.subset(use)
-            k = self.cascade.response(start.parameters, e.omega_rad_s) * plant.delay[use]
-            c = 1 + e.centre * k
-            first, second, _ = _s_lemma_terms(
-                e,
-                plant.row_scale[use],
-                (damping * start.g * plant.w4[use]) ** 2,
-                (k.real, k.imag),
-                (c.real, c.imag),
-            )
-            values.append(best_multiplier(first[0], first[1], second[0], second[1]))
-        return values
-
-    def solve(self, start: NlpPoint, *, damping: float = 1.0) -> NlpPoint:
-        """Maximise log g from a start; `damping` scales the S-lemma rows' W4 (a path from a solution without
-        them)."""
-        initial = np.concatenate(
-            [start.parameters, [start.g], *start.angles, *self._multipliers(start, damping)]
-        )
+    def solve(self, start: NlpPoint) -> NlpPoint:
+        """Maximise log g from a start."""
+        initial = np.concatenate([start.parameters, [start.g], *start.angles])
         initial = np.clip(initial, self._bounds[0], self._bounds[1])
         answer = self._solver(
             x0=initial,
-            p=damping,
             lbx=self._bounds[0],
             ubx=self._bounds[1],
             lbg=self._row_bounds[0],
@@ -264,41 +212,6 @@ class AngleProgram:
         return NlpPoint(
             values[:n], float(values[n]), tuple(angles), str(stats["return_status"]), int(stats["iter_count"])
         )
-
-
-def _s_lemma_terms(
-    e: Ellipses, scale: Real, weight: Any, k: tuple[Any, Any], c: tuple[Any, Any]
-) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
-    """((A1, B1), (A2, B2), C) of |c + k e|^2 - weight |G + e|^2 on the ellipse; numbers or symbols.
-
-    All rows are multiplied by scale^2. With k e free of 1/K: kappa (G + 1/K) conj(u1) = conj(k) c conj(u1).
-    """
-    k_re, k_im = k
-    c_re, c_im = c
-    u_re, u_im = e.direction.real, e.direction.imag
-    h = e.centre * np.conj(e.direction)
-    kappa = k_re**2 + k_im**2
-    y_re, y_im = k_re * c_re + k_im * c_im, k_re * c_im - k_im * c_re
-    z_re, z_im = y_re * u_re + y_im * u_im, y_im * u_re - y_re * u_im
-    s2 = scale**2
-    a1 = (kappa - weight) * (s2 * e.semi_major**2)
-    a2 = (kappa - weight) * (s2 * e.semi_minor**2)
-    b1 = (z_re - weight * h.real) * (s2 * e.semi_major)
-    b2 = (z_im - weight * h.imag) * (s2 * e.semi_minor)
-    value = (c_re**2 + c_im**2 - weight * np.abs(h) ** 2) * s2
-    return (a1, b1), (a2, b2), value
-
-
-def best_multiplier(a1: Real, b1: Real, a2: Real, b2: Real) -> Real:
-    """tau >= max(0, -A_i) that maximises -tau - sum B_i^2/(A_i + tau) (concave): bisection on its derivative,
-    (F,)."""
-    floor = np.maximum(0.0, np.maximum(-a1, -a2))
-    low, high = floor, floor + np.abs(b1) + np.abs(b2) + 1e-12
-    for _ in range(60):
-        mid = 0.5 * (low + high)
-        rising = (b1 / (a1 + mid + 1e-300)) ** 2 + (b2 / (a2 + mid + 1e-300)) ** 2 > 1.0
-        low, high = np.where(rising, mid, low), np.where(rising, high, mid)
-    return np.asarray(0.5 * (low + high), dtype=np.float64)
 
 
 def parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:

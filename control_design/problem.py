@@ -74,11 +74,11 @@ class Problem:
             for plant, grid in zip(self.plants, self.grids if grids is None else grids, strict=True)
         ]
 
-    def rows(self, grids: Sequence[Real] | None = None, *, with_damping: bool = True) -> list[Rows]:
-        """Rows of the optimisers; without damping, W4 of the measured output is left out."""
+    def rows(self, grids: Sequence[Real] | None = None) -> list[Rows]:
+        """Rows of the optimisers on the lean grids, as they are now or as given."""
         rows: list[Rows] = []
         for data in self.lean(grids):
-            rows.append(self._rows(data, data.delay, with_damping=with_damping))
+            rows.append(self._rows(data, data.delay))
             if self.spec.delay_margin_s is not None:
                 late = data.delay * np.exp(-1j * data.ellipses.omega_rad_s * self.spec.delay_margin_s)
                 rows.append(self._delay_copy(data, late))
@@ -153,15 +153,13 @@ class Problem:
             added += new.size
         return added
 
-    def _rows(self, data: PlantData, delay: Complex, *, with_damping: bool) -> Rows:
-        omega = data.ellipses.omega_rad_s
-        keep_w4 = with_damping or data.gp_max is not None
+    def _rows(self, data: PlantData, delay: Complex) -> Rows:
         return Rows(
             ellipses=data.ellipses,
             delay=delay,
             w1=np.maximum(data.w1, data.modulus),
             w3=data.w3,
-            w4=data.w4 if keep_w4 else np.zeros(omega.size),
+            w4=data.w4,
             gp_max=data.gp_max,
             row_scale=self._row_scale(data),
             start_window=self._start_window(data.plant),

@@ -93,7 +93,7 @@ class Workshop:
         if self._program is None:
             self._program = AngleProgram(
                 task.cascade,
-                self.problem.rows(task.grids, with_damping=False),
+                self.problem.rows(task.grids),
                 controller_damping=self.problem.spec.controller_damping,
                 max_iterations=self.problem.options.iterations,
             )

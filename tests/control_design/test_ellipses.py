@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from control_design.angle_program import _s_lemma_terms, best_multiplier
 from control_design.ellipses import (
     Ellipses,
     distance_to_minus_one,
@@ -106,23 +105,3 @@ def test_distance_of_the_loop_and_worst_gain_agree_with_sampling_members():
     reach = (3 * step)[clear] / distance[clear]
     assert np.all(gain[clear] <= ratio[clear] * (1 + reach) + reach / np.abs(k)[clear])
     assert np.all(np.isinf(gain[distance == 0]))
-
-
-def test_s_lemma_rows_of_the_programme_are_lossless():
-    """tau of the rows exists exactly where the worst gain stays below the limit (checked at +-0.1 %)."""
-    rng = np.random.default_rng(4)
-    e = _random(rng, 300)
-    k = rng.standard_normal(300) + 1j * rng.standard_normal(300)
-    gain = largest_disturbance_gain(k, e)
-    ok = np.isfinite(gain)
-    e, k, gain = e.subset(ok), k[ok], gain[ok]
-    c = 1 + e.centre * k
-    for factor, expected in ((1.001, True), (0.999, False)):
-        weight = 1 / (gain * factor) ** 2
-        (a1, b1), (a2, b2), value = _s_lemma_terms(
-            e, np.ones(gain.size), weight, (k.real, k.imag), (c.real, c.imag)
-        )
-        tau = best_multiplier(a1, b1, a2, b2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            left = value - tau - b1**2 / (a1 + tau) - b2**2 / (a2 + tau)
-        assert np.all((left >= 0) == expected)

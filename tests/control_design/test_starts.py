@@ -8,8 +8,9 @@ import pytest
 
 from control_design import Specification, SynthesisOptions, UncertainPlant, certify, synthesise
 from control_design.biquads import Cascade
-from control_design.descent import MinimaxDescent
+from control_design.descent import MinimaxDescent, _Boundary
 from control_design.ellipses import distance_to_minus_one, largest_disturbance_gain
+from control_design.example_plants import flexible_link, flexible_link_specification
 from control_design.problem import Problem
 from control_design.starts import StartMaker, with_cancelling_section
 
@@ -114,6 +115,38 @@ def test_slopes_of_the_descent_agree_with_finite_differences():
         # The worst member changes from point to point of the boundary: a few rows switch within the step.
         wrong = np.abs(numeric - slope[:, index]) > 1e-3 * (1 + np.abs(numeric))
         assert np.mean(wrong) < 0.05
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"controller_order": 5, "integrator": False},
+        {"controller_order": 5, "integrator": True},
+        {"controller_order": 6, "integrator": True, "structure": "pi_d_notch"},
+    ],
+)
+def test_curvature_of_the_descent_agrees_with_finite_differences(fields):
+    """Long ellipses, so that the moving worst member counts; away from the kinks where it jumps."""
+    problem = Problem((flexible_link("B"),), flexible_link_specification(5), SynthesisOptions())
+    specification = problem.spec.model_copy(update=fields | {"mode_peak_ratio": 0.5})
+    problem = Problem(problem.plants, specification, SynthesisOptions())
+    cascade = Cascade(specification.sections(), problem.dt_s, problem.scale)
+    boundary = _Boundary(cascade, problem.rows()[0])
+    rng = np.random.default_rng(0)
+    x = 0.3 * rng.standard_normal(cascade.parameters)
+    multipliers = rng.random(boundary.rows(x, gradient=False)[0].size)
+    bends = []
+    for h in (2e-6, 1e-6):
+        ends = [
+            [multipliers @ boundary.rows(x + sign * h * e, gradient=True)[1] for sign in (1, -1)]
+            for e in np.eye(x.size)
+        ]
+        bends.append(np.stack([(up - down) / (2 * h) for up, down in ends]))
+    exact = boundary.curvature(x, multipliers)
+    np.testing.assert_allclose(exact, exact.T, atol=1e-9 * np.abs(exact).max())
+    # Error of the difference itself: truncation and rounding, seen in the two steps.
+    doubt = 4 * np.abs(bends[0] - bends[1]).max() + 1e-5 * np.abs(exact).max()
+    np.testing.assert_allclose(bends[1], exact, atol=doubt)
 
 
 def test_a_cancelling_section_does_not_change_the_controller():

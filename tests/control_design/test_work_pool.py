@@ -1,0 +1,109 @@
+"""Starts in processes of their own: the same result, nothing left behind, a clear word where it cannot be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from control_design import Specification, SynthesisOptions, UncertainPlant, synthesise
+
+from .plants import RelativeDisc, hub_arm
+
+_SPECIFICATION = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
+
+_ENDLESS = """
+import numpy as np
+from control_design import SynthesisOptions, synthesise
+from control_design.example_plants import flexible_link, flexible_link_specification
+
+if __name__ == "__main__":
+    tell = lambda fraction, message: print(message, flush=True)
+    synthesise(
+        [flexible_link("B")],
+        flexible_link_specification(6),
+        SynthesisOptions(jobs=2, starts=50, agreeing_starts=50),
+        rng=np.random.default_rng(1),
+        progress=tell,
+    )
+"""
+
+
+def _plant() -> UncertainPlant:
+    return UncertainPlant("hub", hub_arm(), RelativeDisc(hub_arm(), 0.03, 60.0))
+
+
+def test_the_number_of_processes_does_not_change_the_result():
+    results = [
+        synthesise(
+            [_plant()],
+            _SPECIFICATION,
+            SynthesisOptions(starts=2, exchange_rounds=1, jobs=jobs),
+            rng=np.random.default_rng(3),
+        )
+        for jobs in (1, 2)
+    ]
+    assert results[0].to_dict() == results[1].to_dict()
+
+
+def test_a_plant_that_cannot_travel_is_refused_by_name_of_the_option():
+    class Local(RelativeDisc):
+        """Known inside this function only."""
+
+    plant = UncertainPlant("hub", hub_arm(), Local(hub_arm(), 0.03, 60.0))
+    with pytest.raises(ValueError, match="jobs = 2 needs plants that can be sent"):
+        synthesise([plant], _SPECIFICATION, SynthesisOptions(jobs=2), rng=np.random.default_rng(1))
+
+
+def _group(leader: int) -> list[int]:
+    """Processes of a session, zombies left out."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+            except OSError:
+                continue
+            if int(fields[3]) == leader and fields[0] != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="lists processes through /proc")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupt_leaves_no_process_behind(tmp_path, how):
+    """SIGINT to the whole group, as the keyboard does; SIGKILL to the parent alone."""
+    script = tmp_path / "endless.py"
+    script.write_text(_ENDLESS)
+    root = str(Path(__file__).resolve().parents[2])
+    process = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        assert process.stdout is not None
+        assert "start 1" in process.stdout.readline()
+        assert len(_group(process.pid)) >= 3
+        if how is signal.SIGINT:
+            os.killpg(process.pid, how)
+        else:
+            process.send_signal(how)
+        assert process.wait(30) != 0
+        process.stdout.close()
+        deadline = time.monotonic() + 20
+        while _group(process.pid) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert _group(process.pid) == []
+    finally:
+        for left in _group(process.pid):
+            os.kill(left, signal.SIGKILL)
