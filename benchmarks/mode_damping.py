@@ -1,4 +1,4 @@
-"""What damping of the flexible mode costs: the published link at order 6 with W4 (input disturbance to output).
+"""What damping of the flexible mode costs: the published link at order 6 with W4, a weight on G S.
 
     OMP_NUM_THREADS=1 python -m benchmarks.mode_damping [--part exact A B] [--ratios ...] [--no-write]
 
@@ -8,7 +8,7 @@ certificate's refined grid). Damping: of the nominal closed loop's pole nearest 
 least of all its poles between 10 and 22.5 rad/s (a controller could put a second, badly damped pole beside
 the mode). Loop and poles are evaluated here with python-control, not by the optimiser.
 
-Reference: full-order `hinfsyn` with the same plant and weights, published. It is recomputed in no run of ours:
+Reference: full-order `hinfsyn` with the same plant and weights, as published: it is not run here, because
 it needs slycot, which pip does not install without a Fortran compiler.
 """
 

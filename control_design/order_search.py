@@ -69,14 +69,15 @@ class OrderSearch:
         if self._enough(found):
             return OrderResult(found[0], (), (found[0].gamma,))
         tasks = self._starts()
+        least = len(self.given) + (len(tasks) - len(self.given) + 1) // 2
         for number, end in enumerate(self.pool.do(tasks)):
             self.tell(0.5 * (number + 1) / len(tasks), f"start {number + 1} of {len(tasks)}")
             found += self._taken(end)
             if self._enough(found):
                 best = min(found, key=lambda c: c.gamma)
                 return OrderResult(best, tuple(self.reports), (best.gamma,))
-            if number >= len(self.given) and self._agree(found):
-                break
+            if number + 1 >= least and self._agree(found):
+                break  # not before half of the starts: the first ones are of one kind
         found = sorted((c for c in found if np.isfinite(c.gamma)), key=lambda c: c.gamma)
         if not found:
             return OrderResult(None, tuple(self.reports), ())
