@@ -69,7 +69,8 @@ class OrderSearch:
         if self._enough(found):
             return OrderResult(found[0], (), (found[0].gamma,))
         tasks = self._starts()
-        least = len(self.given) + (len(tasks) - len(self.given) + 1) // 2
+        drawn = len(tasks) - len(self.given)
+        least = len(self.given) + max((drawn + 1) // 2, min(drawn, 3))
         for number, end in enumerate(self.pool.do(tasks)):
             self.tell(0.5 * (number + 1) / len(tasks), f"start {number + 1} of {len(tasks)}")
             found += self._taken(end)
