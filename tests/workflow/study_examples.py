@@ -13,6 +13,7 @@ base = "{FAST_ARM}"
 
 [changes]
 "closed_loop.draws" = 2
+"closed_loop.conditions" = false
 
 [[axes]]
 key = "specification.bandwidth_rad_s"

@@ -163,6 +163,8 @@ def test_other_ellipses_are_made_once_and_shared(fast_run, tmp_path):
     text = f"""
 [study]
 base = "{fast_run[0]}"
+[changes]
+"closed_loop.conditions" = false
 [[axes]]
 key = "channels[0].uncertainty.level"
 values = [0.9, 0.95]
@@ -184,6 +186,7 @@ def test_contradictions_between_axes_are_points_without_a_run(tmp_path):
 base = "{FAST_ARM}"
 [changes]
 "closed_loop.draws" = 1
+"closed_loop.conditions" = false
 [[axes]]
 key = "specification.effort_rolloff_rad_s"
 values = [60.0]
@@ -209,6 +212,7 @@ def test_points_that_fail_are_named_and_the_others_stand(flexlink, tmp_path):
 base = "{FAST_ARM}"
 [changes]
 "closed_loop.draws" = 1
+"closed_loop.conditions" = false
 [[axes]]
 key = "channels[0].uncertainty.fir_length"
 values = [40, 690]

@@ -237,6 +237,7 @@ SEARCH = f"""
 base = "{FAST_ARM}"
 [changes]
 "closed_loop.draws" = 1
+"closed_loop.conditions" = false
 [search]
 method = "optuna"
 trials = 5

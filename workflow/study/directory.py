@@ -79,7 +79,7 @@ class StudyDirectory:
         return study
 
     def discard_if_empty(self) -> None:
-        """Take back what `begin` wrote, if neither a plant nor a point is there: a corrected base may come."""
+        """Take back what `begin` wrote if neither a plant nor a point is there: a corrected base may come."""
         if any(self.plants_path.iterdir()) or any(self.points_path.iterdir()):
             return
         for name in ("study.json", "study.toml", "lock"):
