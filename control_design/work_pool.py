@@ -13,7 +13,6 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing.reduction import ForkingPickler
-from pickle import PicklingError
 from types import TracebackType
 from typing import Any
 
@@ -54,17 +53,18 @@ class WorkPool:
             return
         problem = workshop.problem
         parts = problem.plants, problem.spec, problem.options
+        try:
+            ForkingPickler.dumps(parts)
+        except Exception as error:  # what a plant made of local functions raises differs between versions
+            raise ValueError(
+                f"jobs = {jobs} needs plants that can be sent to another process: {error}; use jobs = 1"
+            ) from error
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=parts)
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
         os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
         try:
             pool.submit(_ready)  # the first task starts all processes, with these variables
-        except (PicklingError, AttributeError, TypeError) as error:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise ValueError(
-                f"jobs = {jobs} needs plants that can be sent to another process: {error}; use jobs = 1"
-            ) from error
         finally:
             for name, value in before.items():
                 if value is None:
