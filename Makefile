@@ -17,11 +17,16 @@ help:
 	@echo "make test   the whole test suite   make test-fast   without the slow Monte Carlo"
 	@echo "make check  what CI runs: tests, lint, types"
 
+# The run at the end fills the cache of compiled code: code compiled in the same process may round otherwise than code
+# from the cache, and a killed run must resume to the same digits.
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "flexlink needs Python 3.11 or newer with venv"; exit 2; }
 	@echo "installing flexlink and its pinned dependencies into $(VENV) (a minute or two, once)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@echo "compiling the numerical kernels (a minute, once)"
+	@$(BIN)/flexlink run --out $(VENV)/compiled --replace >/dev/null
+	@rm -rf $(VENV)/compiled
 	@touch $(STAMP)
 
 install: $(STAMP)
