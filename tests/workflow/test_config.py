@@ -136,7 +136,9 @@ def test_packaged_default_is_the_example():
 NAMED_ARMS = sorted(path for path in (ROOT / "examples").glob("*.toml") if path.stem != "own_log")
 
 
-@pytest.mark.parametrize("path", NAMED_ARMS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [path for path in NAMED_ARMS if "[study]" not in path.read_text()], ids=lambda path: path.stem
+)
 def test_examples_are_valid_and_say_what_is_not_known(path, monkeypatch, request):
     if "FLEXLINK_DATA" in path.read_text():
         monkeypatch.setenv("FLEXLINK_DATA", str(request.getfixturevalue("flexlink_data")))

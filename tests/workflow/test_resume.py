@@ -48,6 +48,19 @@ def kill(process) -> None:
     assert process.returncode == -signal.SIGKILL
 
 
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """The run nobody disturbed, in a process of its own like the one that is killed.
+
+    A test process has other compiled variants of the kernels in memory, and those may round otherwise.
+    """
+    out = tmp_path_factory.mktemp("reference") / "run"
+    process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
+    _, error = process.communicate()
+    assert process.returncode == 0, error.decode()
+    return out
+
+
 # A point is a file that has just appeared, and how long the next stage is then left working before the kill.
 @pytest.mark.parametrize(
     ("appears", "pause_s"),
@@ -58,7 +71,7 @@ def kill(process) -> None:
         ("stages/certify.json", 0.0),
     ],
 )
-def test_killed_run_resumes_with_identical_numbers(fast_run, tmp_path, plain_page, appears, pause_s):
+def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears, pause_s):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
     wait_for(out / appears, process)
@@ -71,10 +84,11 @@ def test_killed_run_resumes_with_identical_numbers(fast_run, tmp_path, plain_pag
         storage.read_npz(path)  # whatever has its final name is whole
     assert not (out / "report.html").exists()
 
-    summary = run_from_files(FAST_ARM, out, resume=True)
+    resumed = start_flexlink("run", "--config", FAST_ARM, "--out", out, "--resume")
+    _, error = resumed.communicate()
+    assert resumed.returncode == 0, error.decode()
 
-    assert_same_run(fast_run[0], out)
-    assert summary.numbers == fast_run[1].numbers
+    assert_same_run(reference, out)
     after = {path.name: path.stat().st_mtime_ns for path in (out / "stages").iterdir()}
     assert {name: after[name] for name in done_before} == done_before, "a finished stage was made again"
     assert RunDirectory.open(out).manifest()["status"].startswith("complete")
