@@ -69,8 +69,8 @@ def test_numbers_are_those_of_the_certificate(small_study):
 
 
 def test_a_point_is_what_flexlink_run_makes_of_its_configuration(small_study, tmp_path):
-    # Independent of the study: the ordinary pipeline, from the records on, on the point's own TOML, in a fresh
-    # process like the study's own (this one has other compiled variants of the kernels in memory).
+    # Independent of the study: the ordinary pipeline, from the records on, on the point's own TOML, in a
+    # process as fresh as the study's own (this one has other compiled variants of the kernels in memory).
     out, _ = small_study
     point = out / "points" / rows_of(out)[3]["name"]
     process = start_flexlink("run", "--config", point / "config.toml", "--out", tmp_path / "run")
