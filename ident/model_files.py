@@ -19,6 +19,7 @@ import numpy as np
 import scipy.io
 
 from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.mat_files import mat_variables
 from ident.model import GobfModel
 from ident.poles import Poles
 
@@ -123,16 +124,8 @@ class ModelFile:
     @classmethod
     def from_mat(cls, content: bytes, source: str = "model file") -> ModelFile:
         """Inverse of `to_mat`. ValueError: one line that begins with `source`."""
-        stream: Any = io.BytesIO(content)
-        try:
-            raw = scipy.io.loadmat(stream)
-        except NotImplementedError:
-            raise ValueError(f"{source}: a version 7.3 .mat file; save it with '-v7' in MATLAB") from None
-        except Exception as error:  # scipy raises many kinds on damaged files
-            raise ValueError(f"{source}: not a MATLAB .mat file ({type(error).__name__})") from None
-        document: dict[str, Any] = {
-            name: _plain(value) for name, value in raw.items() if not name.startswith("__")
-        }
+        raw = mat_variables(content, source)
+        document: dict[str, Any] = {name: _plain(value) for name, value in raw.items()}
         if "ellipses" in raw:
             struct = raw["ellipses"]
             if struct.dtype.names is None or struct.size != 1:

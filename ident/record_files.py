@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from ident.arrays import RealArray
+from ident.mat_files import mat_variables
 
 # Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
 # of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
@@ -224,16 +225,8 @@ def read_npz(path: str | PathLike[str]) -> Table:
 
 def read_mat(path: str | PathLike[str]) -> Table:
     """A MATLAB file up to version 7.2 (version 7.3 is HDF5: save with '-v7')."""
-    import scipy.io
-
     file = _existing(path)
-    try:
-        content = scipy.io.loadmat(file)
-    except NotImplementedError:
-        raise ValueError(f"{file}: a version 7.3 .mat file; save it with '-v7' in MATLAB") from None
-    except Exception as error:  # scipy raises many kinds on damaged files
-        raise ValueError(f"{file}: not a MATLAB .mat file ({type(error).__name__})") from None
-    raw = {name: value for name, value in content.items() if not name.startswith("__")}
+    raw = mat_variables(file, file)
     return Table(file, tuple(raw), raw, first_line=None)
 
 

@@ -19,7 +19,6 @@ from typing import Any, Literal, Self
 
 import control
 import numpy as np
-import scipy.io
 from pydantic import Field, field_validator, model_validator
 
 from control_design.plant_set import UncertainPlant, count_integrators
@@ -27,6 +26,7 @@ from control_design.specification import RationalWeight, Specification
 from control_design.stated_uncertainty import StatedDiscs
 from control_design.synthesis_options import SynthesisOptions
 from ident.frf_records import FrfRepeats
+from ident.mat_files import mat_variables
 from ident.model import GobfModel
 from ident.model_files import FORMAT, ModelFile
 from ident.options import IdentOptions
@@ -243,16 +243,11 @@ def _read_document(path: Path, suffix: str) -> dict[str, Any]:
         if not isinstance(document, dict):
             raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
         return document
-    try:
-        raw = scipy.io.loadmat(path)
-    except NotImplementedError as error:
-        raise InputError(f"{path}: a version 7.3 .mat file; save it with '-v7' in MATLAB") from error
-    except Exception as error:  # scipy raises many kinds on damaged files
-        raise InputError(f"{path}: not a MATLAB .mat file ({type(error).__name__})") from error
+    with naming(str(path)):
+        raw = mat_variables(content, path)
     return {
         name: "".join(value.ravel().tolist()) if np.asarray(value).dtype.kind == "U" else value
         for name, value in raw.items()
-        if not name.startswith("__")
     }
 
 
