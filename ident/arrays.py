@@ -11,6 +11,16 @@ RealArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 
+def kernel_array(array: RealArray) -> RealArray:
+    """The array as compiled code takes it: C-contiguous and writable, copied only where it is not.
+
+    A locked array is another type to the compiler, for which it compiles the function once more, and two
+    compilations of one function may round differently. One type always: the same numbers always.
+    """
+    flags = array.flags
+    return array if flags.c_contiguous and flags.writeable else array.copy(order="C")
+
+
 def readonly_real(values: Any) -> RealArray:
     """A float64 copy that cannot be written to."""
     array = np.array(values, dtype=np.float64)

@@ -41,7 +41,7 @@ def block_parameters(poles: Poles) -> RealArray:
     |re|) - im^2 from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 =
     1 and gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
     """
-    return np.asarray(_blocks(poles.real, poles.pairs))
+    return np.asarray(_blocks(*poles.writable()))
 
 
 @numba.njit(cache=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.arrays import RealArray
+from ident.arrays import RealArray, kernel_array
 from ident.batched_cost import COLUMNS, batched_rss
 from ident.coordinates import SearchSpace, blocks_of_point
 from ident.kernels import candidate_rss
@@ -38,7 +38,7 @@ class CandidateCost:
         frozen = project(data, shared, local)
         free = data.structure.estimate_initial_state
         residual_power = float(frozen.residual @ frozen.residual)
-        box = (space.n_real, space.low, space.high, space.raw)
+        box = (space.n_real, space.low.copy(), space.high.copy(), space.raw)
         drive = driving_signal(data, shared)
         n_shared = frozen.shared_q.shape[0]
         self._one_by_one = (
@@ -51,6 +51,7 @@ class CandidateCost:
     def rss(self, units: RealArray) -> RealArray:
         """Residual sums of squares (E,) at points (E, D) of the unit cube."""
         self.evaluations += len(units)
+        units = kernel_array(units)
         if self._together is not None and len(units) >= _FEWEST_IN_A_BATCH:
             return np.asarray(batched_rss(units, *self._together))
         return np.asarray(_scan(units, *self._one_by_one))

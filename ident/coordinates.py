@@ -14,7 +14,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.arrays import RealArray, readonly_real
+from ident.arrays import RealArray, kernel_array, readonly_real
 from ident.options import IdentOptions
 from ident.poles import Poles
 
@@ -62,15 +62,19 @@ class SearchSpace:
         pairs = [f"{name} {i + 1}" for i in range(self.n_pairs) for name in pair]
         return (*(f"{real} {i + 1}" for i in range(self.n_real)), *pairs)
 
+    def kernel_arguments(self, units: RealArray) -> tuple[RealArray, int, RealArray, RealArray]:
+        """Points and box as compiled code takes them (`ident.arrays.kernel_array`)."""
+        return kernel_array(units), self.n_real, self.low.copy(), self.high.copy()
+
     def blocks(self, unit: RealArray) -> RealArray:
         """Cascade blocks (R + P, 4) of a point of the unit cube."""
-        return np.asarray(blocks_of_point(unit, self.n_real, self.low, self.high, self.raw))
+        return np.asarray(blocks_of_point(*self.kernel_arguments(unit), self.raw))
 
     def poles(self, unit: RealArray) -> Poles:
         """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =
         0.95."""
         if not self.raw:
-            point = np.asarray(_coordinates_of_point(unit, self.n_real, self.low, self.high))
+            point = np.asarray(_coordinates_of_point(*self.kernel_arguments(unit)))
             real, first, second = point[: self.n_real], point[self.n_real :: 2], point[self.n_real + 1 :: 2]
             omega, zeta = 10.0**first, 10.0**second
             return Poles(1 - 10.0**real, np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
@@ -100,7 +104,7 @@ class SearchSpace:
 
     def coordinates(self, units: RealArray) -> RealArray:
         """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s."""
-        points = np.asarray(_coordinates_of_points(units, self.n_real, self.low, self.high))
+        points = np.asarray(_coordinates_of_points(*self.kernel_arguments(units)))
         if not self.raw:
             points[:, self.n_real :: 2] -= np.log10(self.dt_s)
         return points

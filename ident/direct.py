@@ -8,7 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.arrays import RealArray
+from ident.arrays import RealArray, kernel_array
 from ident.batched_direct import minimise_in_batches
 from ident.options import Algorithm
 
@@ -68,7 +68,7 @@ def minimise(
 def best_apart(points: RealArray, costs: RealArray, count: int, apart: float = 0.15) -> RealArray:
     """Up to `count` of the best points (C, D), each at least `apart` from the better ones chosen before
     it."""
-    return np.asarray(points[_greedy(points, np.argsort(costs, kind="stable"), count, apart)])
+    return np.asarray(points[_greedy(kernel_array(points), np.argsort(costs, kind="stable"), count, apart)])
 
 
 @numba.njit(cache=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,10 @@ class Identification:
     prior_tests : tuple of PriorTest
         The same verdicts on priors with their numbers.
     search : SearchTrace
+        Its warnings are those known when the search ended; `warnings` has them all.
+    advise : callable
+        Gives further warnings when they are first asked for: looking for them takes a good part of the time
+        of a fit of low order.
     """
 
     model: GobfModel
@@ -57,6 +62,7 @@ class Identification:
     verdicts: tuple[str, ...]
     search: SearchTrace
     prior_tests: tuple[PriorTest, ...] = ()
+    advise: Callable[[], Sequence[str]] = tuple
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
@@ -64,10 +70,10 @@ class Identification:
         if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
             raise ValueError("residuals, record_names and fit_percent must have one entry per record")
 
-    @property
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What to look at before trusting the model, one sentence each."""
-        return self.search.warnings
+        return tuple(dict.fromkeys((*self.search.warnings, *self.advise())))
 
     def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
         """Plain arrays, exact round trip through `from_arrays`."""
@@ -107,7 +113,8 @@ class Identification:
         }
         arrays |= {f"residual{i}": residual for i, residual in enumerate(self.residuals)}
         arrays |= {f"model_{key}": value for key, value in self.model.to_arrays().items()}
-        arrays |= {f"search_{key}": value for key, value in self.search.to_arrays().items()}
+        search = replace(self.search, warnings=self.warnings)
+        arrays |= {f"search_{key}": value for key, value in search.to_arrays().items()}
         return arrays
 
     @classmethod

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from scipy.special import chdtri
 
+from ident.arrays import RealArray
 from ident.identification import Identification
 from ident.input_checks import advice, refuse_unusable
 from ident.integrators_prior import integrators_test
 from ident.least_squares import fit, linearisation
 from ident.model import GobfModel
+from ident.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
 from ident.options import IdentOptions
-from ident.order_selection import OrderSelection, Progress, effective_samples
+from ident.order_selection import OrderSelection, Progress
 from ident.pole_search import PoleSearch
 from ident.pole_warnings import pole_warnings
 from ident.poles import Poles
@@ -31,12 +33,10 @@ from ident.prior_tests import (
     too_few_poles,
 )
 from ident.record import Record
-from ident.regression import Regression, prepare, thinned
+from ident.regression import Regression, prepare, restructured, thinned
 from ident.search_trace import PolishedMinimum, SearchTrace
 from ident.structured_fit import structured_fit, structured_optimality
 
-# A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
-_NUISANCE_LEVEL = 0.99
 # Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
 _MISLED = 2.0
 
@@ -78,7 +78,9 @@ def identify(
     structure = options.structure()
     if in_mid_record:
         structure = replace(structure, estimate_initial_state=True)
-    outcome = _searched(prepare(part, structure), options, lambda f, message: report(0.4 * f, message))
+    if in_mid_record or len(part) < len(records):
+        data = prepare(part, structure)
+    outcome = _searched(data, options, lambda f, message: report(0.4 * f, message))
     if options.estimate_initial_state == "auto" and not in_mid_record:
         outcome = _searched_with_initial_state(part, outcome, report)
     report(0.85, "polish and tests on all samples")
@@ -92,13 +94,18 @@ def identify(
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    """A search that has come to an end on one structure; `free` is its end polished with initial states."""
+    """A search that has come to an end on one structure.
+
+    `from_rest` is the test that left the initial states out; where it took a descent with them, `free` is its
+    end.
+    """
 
     data: Regression
     search: PoleSearch
     selection: OrderSelection
     best: Polished
     free: Polished | None = None
+    from_rest: NuisanceTest | None = None
 
 
 def _searched(
@@ -109,49 +116,11 @@ def _searched(
     return _Outcome(data, search, selection, selection.run(start))
 
 
-@dataclass(frozen=True)
-class _NuisanceTest:
-    """Likelihood ratio Ne ln(J without / J with) of a nuisance against its chi-square quantile.
-
-    One degree of freedom per column; Ne is the number of independent samples the residual is worth
-    (`effective_samples`), so that slow disturbances do not pass for initial states.
-    """
-
-    name: str
-    columns: int
-    statistic: float
-
-    @property
-    def limit(self) -> float:
-        return float(chdtri(self.columns, 1 - _NUISANCE_LEVEL))
-
-    @property
-    def needed(self) -> bool:
-        return self.statistic > self.limit
-
-    def verdict(self) -> str:
-        return (
-            f"{self.name} {'estimated' if self.needed else 'left out'}: {self.columns} unknowns, "
-            f"test statistic {self.statistic:.1f} against {self.limit:.1f} at {_NUISANCE_LEVEL:.0%}"
-        )
-
-
-def _nuisance_test(
-    name: str, without: tuple[Regression, Polished], with_it: tuple[Regression, Polished]
-) -> _NuisanceTest:
-    order = without[1].poles.order
-    columns = with_it[0].n_parameters(order) - without[0].n_parameters(order)
-    data, end = with_it
-    worth = effective_samples(linearisation(data, end.poles).residual, data.starts)
-    ratio = max(without[1].rss, 1e-300) / max(end.rss, 1e-300)
-    return _NuisanceTest(name, columns, float(worth * np.log(ratio)))
-
-
 def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, report: Progress) -> _Outcome:
     """Search again with unknown initial states if the fit from rest is improbably worse than one with
     them."""
     data, options = outcome.data, outcome.search.options
-    free = prepare(records, replace(data.structure, estimate_initial_state=True))
+    free = restructured(records, data, replace(data.structure, estimate_initial_state=True))
     without = outcome.best
     if not free.n_samples > free.n_parameters(max(without.poles.order, 4)):
         return outcome
@@ -165,13 +134,25 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
         end = search.joint(n_real, min(1, most_pairs))
         without = PoleSearch(data, options).descend(end.poles, "from rest")
     else:
+        if without.poles.order > 0 and (
+            clear := _clearly_left_out(outcome, (data, without), free, outcome.selection.worth(without))
+        ):
+            return replace(outcome, from_rest=clear)
         end = search.descend(without.poles, "with initial state")
         polished = end
         # Transients no larger than the noise leave the search from rest its bearings: go on from its poles.
         start = end if without.rss < _MISLED * end.rss else None
-    if end.poles.order == 0 or not _nuisance_test("initial state", (data, without), (free, end)).needed:
+    if end.poles.order == 0 or not nuisance_test("initial state", (data, without), (free, end)).needed:
         return replace(outcome, free=polished)
     return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
+
+
+def _clearly_left_out(
+    outcome: _Outcome, without: tuple[Regression, Polished], free: Regression, worth: float
+) -> NuisanceTest | None:
+    fixed = outcome.search.fixed
+    n_fixed = fixed.real.size, fixed.pairs.size
+    return clearly_left_out("initial state", without, free, outcome.search.bounds, n_fixed, worth)
 
 
 def _fitted_on_all(
@@ -181,8 +162,10 @@ def _fitted_on_all(
     structure, search, best = outcome.data.structure, outcome.search, outcome.best
     if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
         structure = replace(structure, estimate_initial_state=False)
-    data = prepare(records, structure)
-    if data.n_samples != outcome.data.n_samples:
+    if outcome.data.n_samples == sum(record.n_samples - structure.input_delay_samples for record in records):
+        data = restructured(records, outcome.data, structure)
+    else:
+        data = prepare(records, structure)
         best = _moved(data, best, search)
     verdicts = []
     for name, key, chosen in (
@@ -191,8 +174,12 @@ def _fitted_on_all(
     ):
         if chosen != "auto":
             continue
+        if key == "estimate_initial_state" and outcome.from_rest and best is outcome.best:
+            verdicts.append(outcome.from_rest.verdict())
+            continue
         here = (data, best)
-        other_data = prepare(records, replace(data.structure, **{key: not getattr(data.structure, key)}))
+        other_structure = replace(data.structure, **{key: not getattr(data.structure, key)})
+        other_data = restructured(records, data, other_structure)
         order = best.poles.order
         if other_data.n_parameters(order) == data.n_parameters(order):
             continue  # the polynomials that integrators leave free contain the offset
@@ -203,7 +190,9 @@ def _fitted_on_all(
         else:
             there = (other_data, _moved(other_data, best, search))
         with_it, without = (here, there) if getattr(data.structure, key) else (there, here)
-        test = _nuisance_test(name, without, with_it)
+        known = with_it[1] is outcome.best and with_it[0].structure == outcome.data.structure
+        worth = outcome.selection.worth(outcome.best) if known else None
+        test = nuisance_test(name, without, with_it, worth)
         verdicts.append(test.verdict())
         data, best = with_it if test.needed else without
     return data, best, tuple(verdicts)
@@ -218,13 +207,14 @@ def _priors_judged(
     relative degree is judged with slow poles in their place.
     """
     options = outcome.search.options
+    stated = options.integrators or options.fixed_poles or options.relative_degree is not None
+    if best.poles.order == 0 or not (stated or "input_delay_samples" in options.model_fields_set):
+        return data, best, ()
     search = PoleSearch(data, options)
     search.minima = list(outcome.search.minima)
     given = judged = Fitted(data, best, search)
     searched = part, outcome.data.structure
     tests: list[PriorTest] = []
-    if best.poles.order == 0:
-        return data, best, ()
     if options.integrators:
         test, free = integrators_test(records, searched, given)
         tests.append(test)
@@ -314,15 +304,9 @@ def _result(
     ]
     fixed = search.fixed
     bounds = Bounds.from_options(options, data.longest, data.dt_s)
-    warnings = [
-        *advice(records, data, model, residuals, fixed),
-        *pole_warnings(best.poles, fixed, bounds, data.dt_s),
-        *(
-            test.verdict
-            for test in tests
-            if test.refused and (test.imposed or options.relative_degree != "auto")
-        ),
-    ]
+    refused = tuple(
+        test.verdict for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
+    )
     if relative_degree > 1:
         optimality = structured_optimality(
             data,
@@ -350,8 +334,24 @@ def _result(
         tangent_optimality=optimality,
         order_table=outcome.selection.table(outcome.best),
         verdicts=(*verdicts, *(test.verdict for test in tests)),
-        search=SearchTrace(
-            tuple(search.stages), tuple(search.minima), tuple(dict.fromkeys(warnings)), search.evaluations
-        ),
+        search=SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
         prior_tests=tests,
+        advise=partial(_advice, tuple(records), data, model, residuals, fixed, bounds, refused),
     )
+
+
+def _advice(
+    records: tuple[Record, ...],
+    data: Regression,
+    model: GobfModel,
+    residuals: tuple[RealArray, ...],
+    fixed: Poles,
+    bounds: Bounds,
+    refused: tuple[str, ...],
+) -> list[str]:
+    """All that `Identification.warnings` has to say."""
+    return [
+        *advice(records, data, model, residuals, fixed),
+        *pole_warnings(model.poles, fixed, bounds, data.dt_s),
+        *refused,
+    ]

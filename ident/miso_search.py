@@ -120,7 +120,7 @@ def polish(
     Stops when the decrease that the linearisation still promises is below `tolerance` of J.
     """
     n_free_real = poles.real.size - n_fixed[0]
-    x = clip_parameters(free_parameters(poles.real, poles.pairs, *n_fixed), n_free_real, bounds.array)
+    x = clip_parameters(free_parameters(*poles.writable(), *n_fixed), n_free_real, bounds.array)
     poles = _with_parameters(poles, x, n_fixed)
     here = linearisation(data, poles)
     if x.size == 0:
@@ -129,7 +129,7 @@ def polish(
     floor = 1e-26 * float(data.y @ data.y)
     damping, growth = 1e-3, 2.0
     for iteration in range(max_iterations):
-        chain = chain_rule(poles.real, poles.pairs, *n_fixed)
+        chain = chain_rule(*poles.writable(), *n_fixed)
         system, slope = chain.T @ here.normal @ chain, chain.T @ here.gradient
         free = np.flatnonzero(~blocked(x, slope, n_free_real, bounds.array))
         if here.rss <= floor or free.size == 0:

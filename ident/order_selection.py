@@ -70,6 +70,7 @@ class OrderSelection:
         self.options: IdentOptions = search.options
         self.progress = progress
         self._tried: dict[tuple[int, int], float] = {}
+        self._last_worth: tuple[Polished, float] | None = None
         self._n = search.data.n_samples
         self._power = float(search.data.y @ search.data.y)
 
@@ -96,12 +97,18 @@ class OrderSelection:
 
     def table(self, best: Polished) -> tuple[OrderStep, ...]:
         """Everything that was tried, by order, judged by the residual of the chosen model."""
-        worth = self._worth(best)
+        worth = self.worth(best)
         steps = [
             OrderStep(n_real, n_pairs, rss, self._criterion(rss, n_real + 2 * n_pairs, worth))
             for (n_real, n_pairs), rss in self._tried.items()
         ]
         return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
+
+    def worth(self, end: Polished) -> float:
+        """Independent samples that the residual of an end is worth; kept for the last end asked for."""
+        if self._last_worth is None or self._last_worth[0] is not end:
+            self._last_worth = end, self._worth(end)
+        return self._last_worth[1]
 
     def _grow_pairs(self, best: Polished, most_pairs: int) -> Polished:
         while (count := self._counts(best)[1]) < most_pairs and self._visible(best):

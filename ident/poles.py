@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -49,15 +50,17 @@ class Poles:
         object.__setattr__(self, "pairs", readonly_complex(self.pairs))
         if self.real.ndim != 1 or self.pairs.ndim != 1:
             raise ValueError(f"poles must be 1-d arrays; got shapes {self.real.shape} and {self.pairs.shape}")
-        for poles in (self.real, self.pairs):
-            if not (np.abs(poles) < 1).all():
-                pole = next(pole for pole in poles if not abs(pole) < 1)
+        # Number by number: a search makes tens of these, for a few poles each.
+        real, pairs = self.real.tolist(), self.pairs.tolist()
+        for pole in (*real, *pairs):
+            if not math.hypot(pole.real, pole.imag) < 1:
                 raise ValueError(
-                    f"every pole must lie inside the unit circle; got {pole:.6g} (|p| = {abs(pole):.6g})"
+                    f"every pole must lie inside the unit circle; got {pole:.6g} "
+                    f"(|p| = {math.hypot(pole.real, pole.imag):.6g})"
                 )
-        if not (self.pairs.imag > 0).all():
-            pole = next(pole for pole in self.pairs if not pole.imag > 0)
-            raise ValueError(f"a pair is given by its pole with positive imaginary part; got {pole:.6g}")
+        for pole in pairs:
+            if not pole.imag > 0:
+                raise ValueError(f"a pair is given by its pole with positive imaginary part; got {pole:.6g}")
 
     @classmethod
     def from_values(cls, values: Iterable[complex]) -> Poles:
@@ -126,6 +129,10 @@ class Poles:
         """All poles (B,): the real ones, then p, conj(p) for each pair."""
         both = np.column_stack([self.pairs, self.pairs.conj()]).ravel()
         return np.concatenate([self.real.astype(np.complex128), both])
+
+    def writable(self) -> tuple[RealArray, ComplexArray]:
+        """Copies of real and pairs as compiled code takes them (`ident.arrays.kernel_array`)."""
+        return self.real.copy(), self.pairs.copy()
 
     def doubled(self) -> Poles:
         """Every pole twice, neighbours equal: the poles of the tangent space Phi2 (design 4.2)."""

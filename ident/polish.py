@@ -65,7 +65,7 @@ class Bounds:
 
     def clip(self, poles: Poles, n_fixed_real: int = 0, n_fixed_pairs: int = 0) -> Poles:
         """The nearest poles inside the bounds; the first n_fixed ones of each type are left alone."""
-        x = free_parameters(poles.real, poles.pairs, n_fixed_real, n_fixed_pairs)
+        x = free_parameters(*poles.writable(), n_fixed_real, n_fixed_pairs)
         n_free_real = poles.real.size - n_fixed_real
         x = self.clip_parameters(x, n_free_real)
         pairs = np.exp(-x[n_free_real::2] + 1j * x[n_free_real + 1 :: 2])
@@ -109,7 +109,7 @@ def polish(
 
     Stops when the decrease that the linearisation still promises is below `tolerance` of J.
     """
-    real, pairs = poles.real.copy(), poles.pairs.copy()
+    real, pairs = poles.writable()
     rss, iterations, converged = descend(
         real,
         pairs,
@@ -135,7 +135,7 @@ def pole_system(
 ) -> tuple[RealArray, RealArray]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T
     r."""
-    chain = chain_rule(poles.real, poles.pairs, n_fixed_real, n_fixed_pairs)
+    chain = chain_rule(*poles.writable(), n_fixed_real, n_fixed_pairs)
     return chain.T @ here.normal @ chain, chain.T @ here.gradient
 
 
@@ -147,7 +147,7 @@ def free_optimality(
     0 at an optimum. With records from rest, nothing fixed and no bound active this is |Phi2^T r|/|r| with
     orthonormal Phi2 (the basis with every pole doubled), by the tangent identity of design 4.2.
     """
-    x = free_parameters(poles.real, poles.pairs, n_fixed_real, n_fixed_pairs)
+    x = free_parameters(*poles.writable(), n_fixed_real, n_fixed_pairs)
     if x.size == 0 or here.rss <= 0:
         return 0.0
     normal, gradient = pole_system(here, poles, n_fixed_real, n_fixed_pairs)

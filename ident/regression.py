@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,6 +44,10 @@ class Regression:
     def polynomials_q(self) -> RealArray:
         """The polynomial columns made orthonormal within each record, (Q, N)."""
         rows = np.zeros_like(self.polynomials)
+        if len(rows) == 1:  # constants, by far the most common: no factorisation
+            for here in map(self.segment, range(self.n_records)):
+                rows[0, here] = 1 / np.sqrt(here.stop - here.start)
+            return rows
         for here in map(self.segment, range(self.n_records)):
             q, _ = np.linalg.qr(self.polynomials[:, here].T)
             rows[: q.shape[1], here] = q.T
@@ -53,6 +57,8 @@ class Regression:
     def y_clear(self) -> RealArray:
         """The outputs without their part in the polynomial columns, (N,)."""
         y, rows = self.y.copy(), self.polynomials_q
+        if len(rows) == 0:
+            return y
         for here in map(self.segment, range(self.n_records)):
             y[here] -= rows[:, here].T @ (rows[:, here] @ y[here])
         return y
@@ -120,6 +126,19 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
         structure=structure,
         dt_s=dt_s,
     )
+
+
+def restructured(records: Sequence[Record], data: Regression, structure: Structure) -> Regression:
+    """`prepare(records, structure)`, the records having been prepared otherwise: where only nuisances differ,
+    their signals are not filtered anew."""
+    same = ("integrators", "input_delay_samples")
+    if any(getattr(structure, name) != getattr(data.structure, name) for name in same):
+        return prepare(records, structure)
+    if structure.n_polynomials == data.structure.n_polynomials:
+        return replace(data, structure=structure)
+    sizes = np.diff(data.starts)
+    polynomials = np.concatenate([_legendre(int(size), structure.n_polynomials) for size in sizes], axis=1)
+    return replace(data, structure=structure, polynomials=np.ascontiguousarray(polynomials))
 
 
 def _legendre(n_samples: int, count: int) -> RealArray:

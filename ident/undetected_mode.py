@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
-from ident.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
+from ident.arrays import ComplexArray, RealArray, kernel_array, readonly_complex, readonly_real
 from ident.basis import basis_response, block_parameters
 from ident.embedding_algebra import (
     KernelPosterior,
@@ -176,9 +176,9 @@ def pair_statistics(
         gram_here, states = np.zeros((3, poles.size)), np.zeros((2, poles.size))
         for start in range(0, block.signal.size, _BLOCK):
             part = slice(start, start + _BLOCK)
-            x1, x2 = _pair_rows(parameters, np.ascontiguousarray(block.signal[part]), states)
+            x1, x2 = _pair_rows(parameters, kernel_array(block.signal[part]), states)
             if start == 0 and block.head.size:
-                plain = _pair_rows(parameters, block.head, np.zeros((2, poles.size)))
+                plain = _pair_rows(parameters, kernel_array(block.head), np.zeros((2, poles.size)))
                 x1[: block.head.size], x2[: block.head.size] = (block.first @ x for x in plain)
             gram_here += _pair_gram(x1, x2)
             products[:, 0::2] += others[part].T @ x1
