@@ -248,6 +248,19 @@ def distance_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
     return nearest_distance(turned, size * ellipses.semi_major, size * ellipses.semi_minor)
 
 
+def scale_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
+    """Factor (F,) on each ellipse's axes with which it just reaches -1 with K: below 1 it covers -1, the
+    deeper the smaller; inf where no size of it does (K = 0, or an axis of no length in the way)."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        turned = (1.0 + loop_gain * ellipses.centre) * np.conj(ellipses.direction) / loop_gain
+        sides = [
+            np.where(part == 0, 0.0, np.abs(part) / axis)
+            for part, axis in ((turned.real, ellipses.semi_major), (turned.imag, ellipses.semi_minor))
+        ]
+    scale = np.hypot(*sides)
+    return np.asarray(np.where((loop_gain == 0) | np.isnan(scale), np.inf, scale), dtype=np.float64)
+
+
 def largest_disturbance_gain(loop_gain: Complex, ellipses: Ellipses, *, iterations: int = 60) -> Real:
     """max |G / (1 + G k)| over G in E at every frequency, (F,); inf where some member puts the loop on -1.
     Exact.

@@ -9,7 +9,7 @@ import numpy as np
 from control_design.angle_program import NlpPoint, Rows
 from control_design.biquads import SOLVER_SLACK, Cascade
 from control_design.controller import Controller
-from control_design.ellipses import Complex, Real
+from control_design.ellipses import Complex, Real, scale_to_minus_one
 from control_design.frequency_grid import frequency_grid, local_maxima, plant_grid
 from control_design.plant_set import Mode, UncertainPlant
 from control_design.specification import Specification, performance_modes
@@ -101,7 +101,12 @@ class Problem:
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
         """Whether every nominal loop is (poles of the full state space, strictly inside the circle)."""
         a, b, c, d = cascade.state_space(parameters)
-        return all(loop.stable(a, b, c, d) for loop in self._loops)
+        return all(bool(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0)) for loop in self._loops)
+
+    def closed_loop_poles(self, cascade: Cascade, parameters: Real) -> list[Complex]:
+        """Poles (n,) of every nominal loop; one infinite pole for an algebraic loop."""
+        a, b, c, d = cascade.state_space(parameters)
+        return [loop.poles(a, b, c, d) for loop in self._loops]
 
     def usable(self, cascade: Cascade, parameters: Real) -> bool:
         """Whether it can be built and every nominal loop is stable; false also where no anti-windup gain
@@ -146,7 +151,12 @@ class Problem:
         added = 0
         for position, data in enumerate(self.dense):
             omega = data.ellipses.omega_rad_s
-            worst = worst_of(data.weighted(cascade.response(parameters, omega)))
+            k = cascade.response(parameters, omega)
+            worst = worst_of(data.weighted(k))
+            covered = ~np.isfinite(worst)
+            if np.any(covered):  # those deepest over -1 first
+                depth = 2.0 - np.minimum(scale_to_minus_one(k * data.delay, data.ellipses)[covered], 1.0)
+                worst[covered] = depth * 2.0 * np.max(worst[~covered], initial=limit)
             index = [i for i in local_maxima(worst) if worst[i] > limit][:most]
             new = np.setdiff1d(omega[index], self.grids[position])
             self.grids[position] = np.union1d(self.grids[position], new)
@@ -217,12 +227,12 @@ class _Loop:
             c, d = np.hstack([c, d]), np.zeros((1, 1))
         self._a, self._b, self._c, self._d = a, b, c, float(d[0, 0])
 
-    def stable(self, a: Real, b: Real, c: Real, d: Real) -> bool:
-        """Whether the loop with this controller is; false for an algebraic loop."""
+    def poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
+        """Poles (n,) with this controller; one infinite pole for an algebraic loop."""
         loop = 1.0 + float(d[0, 0]) * self._d
-        n, m = self._a.shape[0], a.shape[0]
+        n = self._a.shape[0]
         if not (abs(loop) > 1e-12 and np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
-            return False
+            return np.array([np.inf + 0j])
         # u = (c x_k - d C x)/loop, e = -(C x + D u)
         u = np.hstack([(-float(d[0, 0]) / loop) * self._c, c / loop])
         e = -self._d * u
@@ -231,8 +241,8 @@ class _Loop:
         closed[:n, :n] += self._a
         closed[n:, n:] += a
         if not np.all(np.isfinite(closed)):
-            return False
-        return bool(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0) < 1.0) or n + m == 0
+            return np.array([np.inf + 0j])
+        return np.asarray(np.linalg.eigvals(closed), dtype=np.complex128)
 
 
 def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specification) -> float:

@@ -185,10 +185,7 @@ class StartMaker:
         return parameters
 
     def _with_gain(self, parameters: Real, factor: float) -> Real:
-        first = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 0}[self.cascade.sections[0]]
-        scaled = np.array(parameters)
-        scaled[:first] *= factor
-        return scaled
+        return with_gain(self.cascade, parameters, factor)
 
     def _random_sections(self) -> Real:
         """Sections with corners within a factor 5 of the scale, numerators near their denominators."""
@@ -249,6 +246,14 @@ class StartMaker:
         size = float(np.abs(loop[int(np.argmin(np.abs(omega - crossover_rad_s)))]))
         sign = 1.0 if (loop[0] * 1j**self.integrators).real >= 0 else -1.0
         return sign / max(size, 1e-12)
+
+
+def with_gain(cascade: Cascade, parameters: Real, factor: float) -> Real:
+    """The same controller times a factor (unchanged where the first section has no gain of its own)."""
+    first = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 0}[cascade.sections[0]]
+    scaled = np.array(parameters)
+    scaled[:first] *= factor
+    return scaled
 
 
 def with_cancelling_section(

@@ -15,6 +15,7 @@ from control_design.order_search import Candidate, OrderResult, OrderSearch
 from control_design.plant_set import UncertainPlant
 from control_design.problem import Problem
 from control_design.search_tasks import Workshop
+from control_design.shortfall import what_destabilises
 from control_design.specification import Specification
 from control_design.starts import with_cancelling_section
 from control_design.synthesis_options import SynthesisOptions
@@ -89,7 +90,7 @@ def synthesise(
         for number, r in enumerate(reports)
     )
     if result.best is None:
-        return _nothing_stable(problem, numbered)
+        return _nothing_stable(problem, cascade, result.nearest, numbered)
     best = result.best
     tell(1.0, f"gamma {best.gamma:.4g}")
     return SynthesisResult(
@@ -119,7 +120,10 @@ def _part(tell: Progress, number: int, count: int, order: int) -> Progress:
     return lambda fraction, message: tell((number + fraction) / count, f"order {order}: {message}")
 
 
-def _nothing_stable(problem: Problem, reports: tuple[StartReport, ...]) -> SynthesisResult:
+def _nothing_stable(
+    problem: Problem, cascade: Cascade, nearest: Real | None, reports: tuple[StartReport, ...]
+) -> SynthesisResult:
+    """No controller, and where the search came nearest to one: which requirement fails there."""
     zero = np.zeros((1, 1))
     nothing = Controller(
         np.zeros((0, 0)),
@@ -131,7 +135,8 @@ def _nothing_stable(problem: Problem, reports: tuple[StartReport, ...]) -> Synth
         name="none: no stable design found",
     )
     points = sum(grid.size for grid in problem.grids)
-    return SynthesisResult(Outcome.NOT_CONVERGED, nothing, float("inf"), (), reports, (), points)
+    blocking = () if nearest is None else what_destabilises(problem, cascade, nearest)
+    return SynthesisResult(Outcome.NOT_CONVERGED, nothing, float("inf"), blocking, reports, (), points)
 
 
 def _blocking(problem: Problem, cascade: Cascade, best: Candidate) -> tuple[BlockingPoint, ...]:

@@ -27,7 +27,11 @@ class SynthesisError(Exception):
 
 @dataclass(frozen=True)
 class BlockingPoint:
-    """A frequency at which a weight keeps gamma from getting smaller."""
+    """A frequency at which a requirement keeps gamma from getting smaller.
+
+    weight: one of `worst_case.KINDS`; without a stable design, one of the words of `shortfall`. value:
+    weighted worst case there, inf where the loop or a member of the ellipse is unstable.
+    """
 
     plant: str
     weight: str
@@ -78,9 +82,15 @@ class SynthesisResult:
 
     def explain(self) -> str:
         """One line: met, or how far and which frequency and requirement block it."""
-        if self.outcome is Outcome.NOT_CONVERGED:
-            return str(self.outcome.value)
         first = self.blocking[0] if self.blocking else None
+        if self.outcome is Outcome.NOT_CONVERGED:
+            nearest = (
+                ""
+                if first is None
+                else f"; where it came nearest, {first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} "
+                "rad/s blocks"
+            )
+            return f"{self.outcome.value}{nearest}"
         where = (
             ""
             if first is None

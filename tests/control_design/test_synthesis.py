@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import control
 import numpy as np
 import pytest
 
@@ -149,6 +150,27 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
         result.controller_or_raise()
     assert caught.value.result is result
     assert not certify(result.controller, [plant], specification).certified
+
+
+_FRUITLESS = SynthesisOptions(starts=2, exchange_rounds=1, iterations=60)
+
+
+def test_without_a_stable_design_the_unstable_pole_is_named():
+    """A pole at z = 1.05 right of one real zero outside the circle: no stable controller stabilises it."""
+    system = control.ss(control.zpk([1.02], [1.05, 0.5], 1.0, dt=0.01))
+    specification = Specification(modulus_margin=0.3, controller_order=2)
+    result = synthesise(
+        [UncertainPlant("unruly", system)], specification, _FRUITLESS, rng=np.random.default_rng(1)
+    )
+    assert result.outcome is Outcome.NOT_CONVERGED
+    first = result.blocking[0]
+    assert (first.plant, first.weight) == ("unruly", "stability of the nominal loop")
+    assert 0 < first.omega_rad_s <= np.pi / 0.01
+    assert "stability of the nominal loop of 'unruly' at" in result.explain()
+    with pytest.raises(SynthesisError, match="no start led to a stable loop"):
+        result.controller_or_raise()
+    copy = SynthesisResult.from_dict(json.loads(json.dumps(result.to_dict(), allow_nan=False)))
+    assert copy.blocking == result.blocking
 
 
 def test_contradictions_are_refused_before_any_optimisation():
