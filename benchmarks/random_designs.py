@@ -3,12 +3,12 @@
     OMP_NUM_THREADS=1 python -m benchmarks.random_designs --first 0 --count 20
     OMP_NUM_THREADS=1 python -m benchmarks.random_designs --summary
 
-Runs in parts (a results file each); --summary adds up the parts that are there. A case draws one to three flexible modes, up to two integrators, up to
-two samples of delay, a first-order lag, and a posterior over coefficients from spreads of gain, lag, mode
-frequencies and dampings plus a short impulse response; a specification; designs with low effort (with the
-default options where that finds nothing stable); certifies. Stability is then checked without any frequency
-response: plants drawn from inside the ellipses (a point of the generators' ball lies in the ellipse of every
-frequency) and the closed-loop poles by python-control.
+Runs in parts (a results file each); --summary adds up the parts that are there. A case draws one to three
+flexible modes, up to two integrators, up to two samples of delay, a first-order lag, and a posterior over
+coefficients from spreads of gain, lag, mode frequencies and dampings plus a short impulse response; a
+specification; designs with low effort (with the default options where that finds nothing stable); certifies.
+Stability is then checked without any frequency response: plants drawn from inside the ellipses (a point of
+the generators' ball lies in the ellipse of every frequency) and the closed-loop poles by python-control.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ SAMPLED = 60
 RADIUS = float(np.sqrt(-2 * np.log(0.05)))
 COUNTED = ("designs", "met", "proved", "unstable", "refused", "full effort", "not converged", "silent")
 MEANING = (
-    "(met: certified; proved: robust stability for all frequencies; unstable: designs with an unstable nominal\n"
-    "or sampled plant; refused: before optimising; silent: not met and no word on what blocks)"
+    "(met: certified; proved: robust stability for all frequencies; unstable: designs with an unstable\n"
+    "nominal or sampled plant; refused: before optimising; silent: not met and no word on what blocks)"
 )
 _WIDTH = 13
 
