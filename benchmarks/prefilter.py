@@ -20,7 +20,7 @@ from control_design import certify, synthesise
 from control_design.ellipses import Ellipses
 from control_design.example_plants import flexible_link, flexible_link_specification
 from control_design.prefilter import Prefilter, PrefilterOptions, design_prefilter
-from control_design.specification import RationalWeight
+from control_design.weights import RationalWeight
 
 MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 

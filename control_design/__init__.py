@@ -17,7 +17,7 @@ from control_design.joint_coverage import JointCoverage
 from control_design.margins import Margins
 from control_design.plant_set import Channel, Mode, UncertainPlant
 from control_design.prefilter import Prefilter, PrefilterOptions, design_prefilter
-from control_design.specification import RationalWeight, Specification, SpecificationError
+from control_design.specification import Specification, SpecificationError
 from control_design.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis_result import (
     BlockingPoint,
@@ -26,6 +26,7 @@ from control_design.synthesis_result import (
     SynthesisError,
     SynthesisResult,
 )
+from control_design.weights import RationalWeight
 from control_design.youla import YoulaBracket, YoulaOptions, youla_bracket
 
 __all__ = [

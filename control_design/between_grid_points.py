@@ -24,7 +24,6 @@ from control_design.first_order import FirstOrder, Intervals, cleared_integrator
 from control_design.frequency_grid import starting_edges
 from control_design.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.rational_response import RationalResponse
-from control_design.rational_weights import effort_weight, tracking_weight
 from control_design.set_expansion import ExpandableSet, OwnGridSet, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.stability import loop_integrators
@@ -293,7 +292,10 @@ def bound_all_frequencies(
         performance = expandable(plant.performance, 0, between_own_points)
         if performance is None:
             return AllFrequencies.nothing("the performance channel is known on its own frequencies only")
-    tracking = tracking_weight(specification, plant.dt_s, plant.n_integrators)
+    tracking, effort = (
+        None if weight is None else RationalResponse.from_weight(weight, plant.dt_s)
+        for weight in (specification.tracking_weight(plant.n_integrators), specification.limit_weight())
+    )
     infinite = tracking is not None and tracking.integrators > own + plant.n_integrators
     loop = _Loop(
         plant,
@@ -302,7 +304,7 @@ def bound_all_frequencies(
         members,
         performance,
         None if infinite else tracking,
-        effort_weight(specification, plant.dt_s),
+        effort,
         band,
         0.0 if band is None else float(specification.damping_magnitude(np.array([band[0]]), plant)[0]),
     )

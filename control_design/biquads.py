@@ -90,6 +90,13 @@ class Cascade:
             value = value * np.where(big, inverted, direct)
         return value
 
+    def roots(self, x: Sequence[float] | Real) -> Complex:
+        """Zeros and poles of all sections in z, (n,); those at infinity left out."""
+        h = self.dt_s * self.scale_rad_s / 2.0
+        p = np.concatenate([np.roots(part) for pair in self.split(x) for part in pair])
+        p = p[np.abs(1.0 - h * p) > 1e-12]
+        return np.asarray((1.0 + h * p) / (1.0 - h * p), dtype=np.complex128)
+
     def state_space(self, x: Sequence[float] | Real) -> tuple[Real, Real, Real, Real]:
         """Discrete (A, B, C, D) of the cascade, every section mapped exactly by p -> z.
 

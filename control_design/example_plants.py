@@ -20,7 +20,8 @@ from control_design.first_order import FirstOrder, Intervals, constant, pole_fac
 from control_design.plant_set import UncertainPlant, frequency_response
 from control_design.rational_response import RationalResponse
 from control_design.set_expansion import stacked
-from control_design.specification import RationalWeight, Specification
+from control_design.specification import Specification
+from control_design.weights import RationalWeight
 
 Scenario = Literal["A", "B", "C"]
 

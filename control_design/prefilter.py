@@ -38,8 +38,8 @@ from control_design.frequency_grid import frequency_grid, local_maxima, plant_gr
 from control_design.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
 from control_design.orthonormal_basis import basis_response, basis_state_space
 from control_design.plant_set import UncertainPlant, frequency_response
-from control_design.specification import RationalWeight
 from control_design.stability import closed_loop_poles
+from control_design.weights import RationalWeight
 
 _FORMAT = "flexlink-prefilter-1"
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up

@@ -10,13 +10,14 @@ from control_design.angle_program import NlpPoint, Rows
 from control_design.biquads import SOLVER_SLACK, Cascade
 from control_design.controller import Controller
 from control_design.ellipses import Complex, Real, scale_to_minus_one
-from control_design.frequency_grid import frequency_grid, local_maxima, plant_grid
-from control_design.plant_set import Mode, UncertainPlant
+from control_design.frequency_grid import frequency_grid, local_maxima, mode_points, plant_grid
+from control_design.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification, performance_modes
 from control_design.stability import closed_loop_poles
 from control_design.synthesis_options import SynthesisOptions
 from control_design.worst_case import KINDS, PlantData, worst_of
 
+_LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points of a dense grid
 _DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
 
 
@@ -93,10 +94,32 @@ class Problem:
         if not self.usable(cascade, parameters):
             return float("inf")
         worst = 0.0
-        for data in self.dense:
+        for _, data in self.checks(cascade, parameters):
             values = data.weighted(cascade.response(parameters, data.ellipses.omega_rad_s))
             worst = max(worst, float(np.max([np.max(values[kind]) for kind in kinds])))
         return worst
+
+    def checks(self, cascade: Cascade, parameters: Real) -> list[tuple[int, PlantData]]:
+        """(number of the plant, data) of the dense check of one controller: the dense grids, and points
+        around lightly damped poles and zeros of the controller and poles of its loops.
+
+        A controller may hide a resonance between the points of any grid that does not know it, and an
+        optimiser finds that out.
+        """
+        found = list(enumerate(self.dense))
+        roots = cascade.roots(parameters)
+        for number, (plant, poles) in enumerate(
+            zip(self.plants, self.closed_loop_poles(cascade, parameters), strict=True)
+        ):
+            light = modes_of(np.concatenate([roots, poles]), self.dt_s, zeta_below=_LIGHT)
+            if plant.own_grid is not None or not light:
+                continue
+            points = np.concatenate([_around(mode) for mode in light])
+            low, high = self.options.omega_min_rad_s, plant.nyquist_rad_s
+            points = np.unique(points[(points > low) & (points < high)])
+            if points.size:
+                found.append((number, PlantData.build(plant, self.spec, points)))
+        return found
 
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
         """Whether every nominal loop is (poles of the full state space, strictly inside the circle)."""
@@ -149,7 +172,7 @@ class Problem:
         """Put maxima of the dense check that exceed the grid's gamma on the grids; how many were new."""
         limit = gamma_grid * (1.0 + self.options.exchange_tolerance)
         added = 0
-        for position, data in enumerate(self.dense):
+        for position, data in self.checks(cascade, parameters):
             omega = data.ellipses.omega_rad_s
             k = cascade.response(parameters, omega)
             worst = worst_of(data.weighted(k))
@@ -243,6 +266,11 @@ class _Loop:
         if not np.all(np.isfinite(closed)):
             return np.array([np.inf + 0j])
         return np.asarray(np.linalg.eigvals(closed), dtype=np.complex128)
+
+
+def _around(mode: Mode) -> Real:
+    """Points around a pole or zero of either side of the circle."""
+    return mode_points(Mode(mode.omega_rad_s, abs(mode.zeta)), 25)
 
 
 def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specification) -> float:

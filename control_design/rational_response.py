@@ -19,7 +19,7 @@ from control_design.first_order import (
     shift_factor,
     zero_factor,
 )
-from control_design.specification import RationalWeight
+from control_design.weights import RationalWeight
 
 
 @dataclass(frozen=True, eq=False)

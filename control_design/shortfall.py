@@ -27,13 +27,14 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
     """
     unstable: list[tuple[float, BlockingPoint]] = []
     covered: list[tuple[float, BlockingPoint]] = []
-    poles = problem.closed_loop_poles(cascade, parameters)
-    for data, z in zip(problem.dense, poles, strict=True):
-        name, omega = data.plant.name, data.ellipses.omega_rad_s
-        k = cascade.response(parameters, omega)
+    loops = problem.closed_loop_poles(cascade, parameters)
+    for plant, z in zip(problem.plants, loops, strict=True):
         for pole in z[(np.abs(z) >= 1.0) & (z.imag >= 0) & np.isfinite(z)]:
             frequency = float(np.abs(np.log(pole))) / problem.dt_s
-            unstable.append((-float(np.abs(pole)), BlockingPoint(name, NOMINAL, frequency, np.inf)))
+            unstable.append((-float(np.abs(pole)), BlockingPoint(plant.name, NOMINAL, frequency, np.inf)))
+    for _, data in problem.checks(cascade, parameters):
+        name, omega = data.plant.name, data.ellipses.omega_rad_s
+        k = cascade.response(parameters, omega)
         late = [(ROBUST, np.ones(omega.size, dtype=np.complex128))]
         if problem.spec.delay_margin_s is not None:
             late.append((DELAYED, np.exp(-1j * omega * problem.spec.delay_margin_s)))

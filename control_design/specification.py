@@ -24,43 +24,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from control_design.biquads import SectionKind, imaginary_axis
 from control_design.ellipses import Complex, Real
 from control_design.plant_set import Mode, UncertainPlant, modes_of
+from control_design.weights import RationalWeight, bandwidth_weight, effort_limit_weight
 
-_INTEGRAL_SHARE = 0.05  # of the corner: where the controller's integrator takes over on an integrating plant
-_ROLLOFF_END = 40.0  # the effort weight flattens this far above its corner, so that it stays proper
+__all__ = ["RationalWeight", "Specification", "SpecificationError", "performance_modes"]
 
 
 class SpecificationError(ValueError):
     """The specification contradicts itself or the plant; no controller of any order can meet it."""
-
-
-class RationalWeight(BaseModel):
-    """W(s) = numerator(s)/denominator(s), coefficients of s with the highest power first; stable and
-    proper."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-    numerator: tuple[float, ...] = Field(min_length=1, description="coefficients, highest power of s first")
-    denominator: tuple[float, ...] = Field(min_length=1, description="coefficients, highest power of s first")
-
-    @model_validator(mode="after")
-    def _stable_and_proper(self) -> RationalWeight:
-        for name in ("numerator", "denominator"):
-            values = np.array(getattr(self, name))
-            if not (np.all(np.isfinite(values)) and values[0] != 0):
-                raise ValueError(f"{name} needs finite coefficients with a non-zero first one; got {values}")
-        if len(self.numerator) > len(self.denominator):
-            raise ValueError("the weight is improper: numerator of higher degree than the denominator")
-        roots = np.roots(self.denominator)
-        if np.any(roots.real > 0):
-            raise ValueError(
-                f"the weight is unstable: denominator root at {roots[np.argmax(roots.real)]:.4g} rad/s"
-            )
-        return self
-
-    def at(self, s: Complex) -> Complex:
-        """W at complex s (F,); infinite at a pole on the axis."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            value = np.polyval(self.numerator, s) / np.polyval(self.denominator, s)
-        return np.asarray(value, dtype=np.complex128)
 
 
 class Specification(BaseModel):
@@ -187,27 +157,29 @@ class Specification(BaseModel):
         pair: SectionKind = "notch" if self.structure == "pi_d_notch" else "second_order"
         return (*head, *real, *([pair] * ((rest - len(real)) // 2)))
 
-    def tracking_at(self, s: Complex, plant_integrators: int = 0) -> Complex:
-        """Rational part of W1 at complex s; the modulus margin where there is no tracking requirement.
+    def tracking_weight(self, plant_integrators: int = 0) -> RationalWeight | None:
+        """W1 without the modulus margin, or None where no tracking is asked for."""
+        if self.sensitivity_weight is not None or self.bandwidth_rad_s is None:
+            return self.sensitivity_weight
+        return bandwidth_weight(
+            self.bandwidth_rad_s,
+            self.modulus_margin,
+            0.0 if self.integrator else self.low_frequency_rejection,
+            integral_factors=plant_integrators if self.integrator else 0,
+        )
 
-        A plant that integrates by itself meets a weight of slope one without any action of the controller's
-        own integrator, which the optimiser would then make arbitrarily slow. Each plant integrator therefore
-        adds the factor (s + corner/20)/s when the integrator is asked for: integral action has to be there by
-        a twentieth of the bandwidth.
-        """
-        s = np.asarray(s, dtype=np.complex128)
-        if self.sensitivity_weight is not None:
-            return self.sensitivity_weight.at(s)
-        if self.bandwidth_rad_s is None:
-            return np.full(s.shape, self.modulus_margin, dtype=np.complex128)
-        m = self.modulus_margin
-        corner = self.bandwidth_rad_s * np.sqrt(2.0 - m**2)
-        floor = 0.0 if self.integrator else self.low_frequency_rejection
-        with np.errstate(divide="ignore", invalid="ignore"):
-            value = (m * s + corner) / (s + corner * floor)
-            if self.integrator:
-                value = value * ((s + _INTEGRAL_SHARE * corner) / s) ** plant_integrators
-        return np.asarray(value, dtype=np.complex128)
+    def limit_weight(self) -> RationalWeight | None:
+        """W3, or None where effort is not limited."""
+        if self.effort_weight is not None or self.effort_limit is None:
+            return self.effort_weight
+        return effort_limit_weight(self.effort_limit, self.effort_rolloff_rad_s)
+
+    def tracking_at(self, s: Complex, plant_integrators: int = 0) -> Complex:
+        """`tracking_weight` at complex s; the modulus margin where there is no tracking requirement."""
+        weight = self.tracking_weight(plant_integrators)
+        if weight is None:
+            return np.full(np.shape(s), self.modulus_margin, dtype=np.complex128)
+        return weight.at(np.asarray(s, dtype=np.complex128))
 
     def sensitivity_magnitude(self, omega_rad_s: Real, dt_s: float, plant_integrators: int = 0) -> Real:
         """|W1| (F,): tracking and modulus margin together."""
@@ -217,15 +189,8 @@ class Specification(BaseModel):
     def effort_magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
         """|W3| (F,); zeros where effort is not limited."""
         s = imaginary_axis(omega_rad_s, dt_s)
-        if self.effort_weight is not None:
-            return np.abs(self.effort_weight.at(s))
-        if self.effort_limit is None:
-            return np.zeros(s.shape)
-        weight = np.full(s.shape, 1.0 / self.effort_limit)
-        if self.effort_rolloff_rad_s is not None:
-            corner = self.effort_rolloff_rad_s
-            weight = weight * np.abs((s / corner + 1) / (s / (_ROLLOFF_END * corner) + 1))
-        return weight
+        weight = self.limit_weight()
+        return np.zeros(s.shape) if weight is None else np.abs(weight.at(s))
 
     def mode_band(self, plant: UncertainPlant) -> tuple[float, float] | None:
         """Band of the damping requirement for this plant, or None without one.

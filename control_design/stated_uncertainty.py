@@ -14,7 +14,7 @@ from control_design.first_order import FirstOrder, Intervals
 from control_design.plant_set import count_integrators, frequency_response
 from control_design.rational_response import RationalResponse
 from control_design.set_expansion import stacked
-from control_design.specification import RationalWeight
+from control_design.weights import RationalWeight
 from ident.uncertainty import FrequencyUncertainty
 
 

@@ -141,7 +141,7 @@ def _nothing_stable(
 
 def _blocking(problem: Problem, cascade: Cascade, best: Candidate) -> tuple[BlockingPoint, ...]:
     points = []
-    for data in problem.dense:
+    for _, data in problem.checks(cascade, best.parameters):
         omega = data.ellipses.omega_rad_s
         values = data.weighted(cascade.response(best.parameters, omega))
         for kind in KINDS:

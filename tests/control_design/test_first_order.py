@@ -13,7 +13,6 @@ from control_design.example_plants import LinkUncertainty
 from control_design.first_order import FirstOrder, Intervals, cleared_integrators, pole_factor, zero_factor
 from control_design.plant_set import frequency_response
 from control_design.rational_response import RationalResponse
-from control_design.rational_weights import effort_weight, tracking_weight
 from control_design.set_expansion import OwnGridSet, PosteriorSet
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
@@ -142,19 +141,21 @@ def test_weights_as_rational_functions_are_those_of_the_specification(integrator
         Specification(sensitivity_weight=RationalWeight(numerator=(-0.5, 200.0), denominator=(1.0, 0.1))),
     ]
     for specification in specifications:
-        tracking = tracking_weight(specification, _DT, integrators)
-        assert tracking is not None
+        weight = specification.tracking_weight(integrators)
+        assert weight is not None
+        tracking = RationalResponse.from_weight(weight, _DT)
         total = np.maximum(np.abs(tracking.at(omega)), specification.modulus_margin)
         np.testing.assert_allclose(
             total, specification.sensitivity_magnitude(omega, _DT, integrators), rtol=1e-9
         )
-        effort = effort_weight(specification, _DT)
-        if effort is not None:
+        limit = specification.limit_weight()
+        if limit is not None:
+            effort = RationalResponse.from_weight(limit, _DT)
             np.testing.assert_allclose(
                 np.abs(effort.at(omega)), specification.effort_magnitude(omega, _DT), rtol=1e-9
             )
-    assert tracking_weight(Specification(), _DT, 0) is None
-    assert effort_weight(Specification(), _DT) is None
+    assert Specification().tracking_weight() is None
+    assert Specification().limit_weight() is None
 
 
 def _posterior(rng: np.random.Generator, integrators: int = 1) -> ResponsePosterior:

@@ -17,7 +17,7 @@ from control_design.prefilter import (
     design_prefilter,
     worst_matching_error,
 )
-from control_design.specification import RationalWeight
+from control_design.weights import RationalWeight
 
 from .plants import RelativeDisc, hub_arm
 

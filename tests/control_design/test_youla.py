@@ -11,7 +11,8 @@ import pytest
 from control_design.example_plants import flexible_link, flexible_link_specification
 from control_design.orthonormal_basis import basis_response, basis_state_space
 from control_design.plant_set import UncertainPlant
-from control_design.specification import RationalWeight, Specification
+from control_design.specification import Specification
+from control_design.weights import RationalWeight
 from control_design.youla import YoulaBracket, YoulaOptions, youla_bracket
 from control_design.youla_basis import coprime_factors
 
