@@ -1,16 +1,21 @@
 """Why simulation and machine differ: which unmodelled effect, how sure, how far the gap shrinks with it."""
 
 from diagnosis.case import Case, Experiment
-from diagnosis.hypotheses import Hypothesis, probabilities
+from diagnosis.diagnosis import Diagnosis, NamedEffect, diagnose
+from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
 from diagnosis.residual import ResidualModel, pooled_rms
 from diagnosis.search import Search, search
 
 __all__ = [
     "Case",
+    "Diagnosis",
     "Experiment",
     "Hypothesis",
+    "NamedEffect",
+    "Probabilities",
     "ResidualModel",
     "Search",
+    "diagnose",
     "pooled_rms",
     "probabilities",
     "search",

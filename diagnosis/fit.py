@@ -133,6 +133,14 @@ def fit(
     return Fit(tuple(candidates), d, parts, e, J, cost, converged)
 
 
+def cost_at(
+    model: ResidualModel, candidates: Sequence[Candidate], coordinates: Sequence[Real], deviations: Real
+) -> float:
+    """|e|^2 + |d|^2 at a point."""
+    e = model.of(deviations, [c.effect_at(x) for c, x in zip(candidates, coordinates, strict=True)])
+    return float(e @ e + deviations @ deviations)
+
+
 def _jacobian(
     model: ResidualModel,
     d: Real,
@@ -201,8 +209,8 @@ def _inside(x: float, slope: float, spread: float, low: float, high: float) -> f
     """log of the integral of exp(-slope t - t^2/(2 spread^2)) inside the box, over spread sqrt(2 pi)."""
     if not np.isfinite(low):
         return min(0.0, float(np.log(2 * np.pi / (spread * np.sqrt(2 * np.pi)))))
-    # Complete the square only where a bound holds the coordinate; inside, the slope is rounding.
-    held = x <= low or x >= high
+    # Complete the square only where a bound holds the coordinate; elsewhere the slope is rounding, or a jag.
+    held = (x <= low and slope > 0) or (x >= high and slope < 0)
     centre = x - slope * spread**2 if held else x
     shift = 0.5 * (slope * spread) ** 2 if held else 0.0
     a, b = (low - centre) / spread, (high - centre) / spread

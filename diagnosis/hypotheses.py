@@ -24,6 +24,10 @@ _UNKNOWN_RANGE = (0.12, 100.0)
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
 _PRIOR_NONE, _PRIOR_UNKNOWN = 0.25, 0.1
 _PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
+_UNKNOWN = ("unknown",)
+# Where contacts switch, what two correct solvers disagree about is not white: further effects beside a jagged
+# one can follow some of it, so they have to gain more (in log weight) to be believed.
+_BESIDE_JAGGED = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +43,10 @@ class Hypothesis:
 
     @classmethod
     def of(cls, fit: Fit) -> Hypothesis:
-        return cls(fit, log_evidence(fit) + discrepancy_gain(fit) + log_prior(fit.names))
+        beside = len(fit.names) - 1
+        jagged = any(EFFECTS[name].dependence == "jagged" for name in fit.names)
+        allowed = _BESIDE_JAGGED * beside if jagged else 0.0
+        return cls(fit, log_evidence(fit) + discrepancy_gain(fit) + log_prior(fit.names) - allowed)
 
 
 def log_prior(names: Sequence[str]) -> float:
@@ -79,29 +86,58 @@ def _gain(delta: float, n: int, rss: float) -> float:
     return float(-0.5 * n * np.log1p(delta**2) + 0.5 * rss * delta**2 / (1 + delta**2))
 
 
-def probabilities(
-    hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0
-) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
-    """Over "none", every effect and "unknown" (sums to one), and over the sets of effects themselves.
+@dataclass(frozen=True, eq=False)
+class Probabilities:
+    """What the evidence says, in three views of the same numbers.
 
-    The probability of a set of several effects is shared equally by its members. temperature > 1 makes the
-    answer less sure than the bare evidence.
+    cause : over "none", every effect and "unknown", summing to one: the main cause of the gap. The
+        probability of a set of several effects belongs to its first member, found to explain most.
+    sets : over sets of effects (sorted names; () is none, ("unknown",) unknown), summing to one.
+    presence : effect -> probability that it is there at all, as the main cause or beside another.
     """
-    best: dict[tuple[str, ...], float] = {}
+
+    cause: dict[str, float]
+    sets: dict[tuple[str, ...], float]
+    presence: dict[str, float]
+
+    @property
+    def answer(self) -> str:
+        """The most probable cause."""
+        return max(self.cause, key=self.cause.__getitem__)
+
+
+def probabilities(hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0) -> Probabilities:
+    """Probabilities from the evidence of everything that was fitted.
+
+    temperature > 1 makes the answer less sure than the bare evidence.
+
+    Raises
+    ------
+    ValueError
+        If there is no hypothesis, or the temperature is not above zero.
+    """
+    if not hypotheses:
+        raise ValueError("probabilities need at least one hypothesis")
+    if not temperature > 0:
+        raise ValueError(f"temperature must be above zero; got {temperature}")
+    best: dict[tuple[str, ...], Hypothesis] = {}
     for hypothesis in hypotheses:
         key = tuple(sorted(hypothesis.names))
-        best[key] = max(best.get(key, -np.inf), hypothesis.log_weight)
+        if key not in best or hypothesis.log_weight > best[key].log_weight:
+            best[key] = hypothesis
     unknown = max(
         log_evidence(h.fit) + unknown_gain(h.fit) + log_prior(h.names) - log_prior(()) for h in hypotheses
     ) + np.log(_PRIOR_UNKNOWN)
-    keys = [*best, ("unknown",)]
-    logs = np.array([*best.values(), unknown]) / temperature
+    keys = [*best, _UNKNOWN]
+    logs = np.array([*(h.log_weight for h in best.values()), unknown]) / temperature
     weight = np.exp(logs - np.max(logs))
     weight /= weight.sum()
     sets = {key: float(p) for key, p in zip(keys, weight, strict=True)}
-    total = {"none": sets.get((), 0.0), **dict.fromkeys(EFFECTS, 0.0), "unknown": sets[("unknown",)]}
-    for key, p in sets.items():
-        if key not in ((), ("unknown",)):
-            for name in key:
-                total[name] += p / len(key)
-    return total, sets
+    cause = {"none": sets.get((), 0.0), **dict.fromkeys(EFFECTS, 0.0), "unknown": sets[_UNKNOWN]}
+    presence = dict.fromkeys(EFFECTS, 0.0)
+    for key, hypothesis in best.items():
+        for name in hypothesis.names[:1]:
+            cause[name] += sets[key]
+        for name in key:
+            presence[name] += sets[key]
+    return Probabilities(cause, sets, presence)

@@ -92,14 +92,15 @@ def test_probabilities_sum_to_one_and_prefer_what_explains_the_records():
     nothing = Hypothesis.of(
         Fit((), np.zeros(0), (), 2 * noise, np.zeros((5000, 0)), float(4 * noise @ noise), True)
     )
-    total, sets = probabilities([good, bad, nothing])
+    weighed = probabilities([good, bad, nothing])
+    total, sets = weighed.cause, weighed.sets
     assert sum(total.values()) == pytest.approx(1.0)
     assert sum(sets.values()) == pytest.approx(1.0)
     assert set(total) == {"none", "unknown", *EFFECTS}
     assert total["tip_payload"] > 0.9
-    without, _ = probabilities([bad, nothing])
+    without = probabilities([bad, nothing]).cause
     assert without["unknown"] > 0.99
-    cooler, _ = probabilities([good, bad, nothing], temperature=1e6)
+    cooler = probabilities([good, bad, nothing], temperature=1e6).cause
     assert cooler["tip_payload"] < 0.5
 
 

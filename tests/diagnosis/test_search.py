@@ -5,21 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis import ResidualModel, pooled_rms, probabilities, search
+from diagnosis import diagnose
 from tests.diagnosis.recorded import answer, recorded_case
 
 
 def _diagnosed(gap_cases, name, rig):
     folder = gap_cases / "labelled" / name
-    case = recorded_case(folder, rig)
-    found = search(case)
-    total, _ = probabilities(found.hypotheses)
-    return case, found, total, answer(folder)
-
-
-def _held_out(case, hypothesis):
-    fit = hypothesis.fit
-    return pooled_rms(ResidualModel(case).of(fit.deviations, fit.effects, case.held_out))
+    return diagnose(recorded_case(folder, rig)), answer(folder)
 
 
 @pytest.mark.parametrize(
@@ -33,38 +25,47 @@ def _held_out(case, hypothesis):
     ],
 )
 def test_one_effect_is_named_sized_and_closes_the_gap(gap_cases, name, rig):
-    case, found, total, truth = _diagnosed(gap_cases, name, rig)
-    assert found.best.names == (name,)
-    assert total[name] > 0.8
+    found, truth = _diagnosed(gap_cases, name, rig)
+    assert found.verdict == "effect"
+    assert found.combination == (name,)
+    assert found.effects[0].name == name
+    assert found.probabilities[name] > 0.8
     (expected,) = truth["effects"]
-    (candidate,), (x,) = found.best.fit.candidates, found.best.fit.coordinates
     for key, value in expected["parameters"].items():
         # 2 % and 3 % are what is asked with exact and uncertain nominals, median and 90th percentile apart.
-        assert candidate.parameters(x)[key] == pytest.approx(value, rel=0.03), key
+        assert found.effects[0].parameters[key] == pytest.approx(value, rel=0.03), key
+        low, high = found.effects[0].intervals[key]
+        assert low <= found.effects[0].parameters[key] <= high
     # Within three standard errors of what the true effect leaves: 2600 samples of two outputs.
     oracle = truth["pooled_gap"]["held_out_gap_after_oracle"]
-    assert _held_out(case, found.best) <= oracle + 3 / np.sqrt(2 * 5200)
+    assert found.gap_after <= oracle + 3 / np.sqrt(2 * 5200)
+    assert found.gap_before >= found.gap_refit > found.gap_after
+    low, high = found.gap_closed_interval
+    assert 0.9 < low <= found.gap_closed <= high <= 1.05
 
 
 @pytest.mark.parametrize("rig", ["rig.toml", pytest.param("rig_uncertain.toml", marks=pytest.mark.slow)])
 def test_no_effect_is_no_alarm(gap_cases, rig):
-    _, found, total, _ = _diagnosed(gap_cases, "none", rig)
-    assert found.best.names == ()
-    assert max(total, key=total.__getitem__) == "none"
+    found, _ = _diagnosed(gap_cases, "none", rig)
+    assert (found.verdict, found.detail_verdict, found.combination) == ("none", "none", ())
+    assert found.effects[0].name == "none"
+    assert np.isnan(found.gap_closed)
 
 
 @pytest.mark.slow
 def test_an_effect_outside_the_list_is_unknown(gap_cases):
-    _, _, total, _ = _diagnosed(gap_cases, "unlisted_effect", "rig.toml")
-    assert total["unknown"] > 0.9
+    found, _ = _diagnosed(gap_cases, "unlisted_effect", "rig.toml")
+    assert found.verdict == found.effects[0].name == "unknown"
+    assert found.probabilities["unknown"] > 0.9
+    assert found.combination == ()
 
 
 @pytest.mark.slow
 def test_two_effects_are_told_apart(gap_cases):
-    case, found, total, truth = _diagnosed(
-        gap_cases, "coulomb_friction_and_tip_payload", "rig_uncertain.toml"
-    )
-    assert set(found.best.names) == {"coulomb_friction", "tip_payload"}
-    assert total["coulomb_friction"] + total["tip_payload"] > 0.9
+    found, truth = _diagnosed(gap_cases, "coulomb_friction_and_tip_payload", "rig_uncertain.toml")
+    assert set(found.combination) == {"coulomb_friction", "tip_payload"}
+    assert {found.effects[0].name, found.effects[1].name} == set(found.combination)
+    assert min(entry.presence for entry in found.effects[:2]) > 0.9
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
     oracle = truth["pooled_gap"]["held_out_gap_after_oracle"]
-    assert _held_out(case, found.best) <= oracle + 3 / np.sqrt(2 * 5200)
+    assert found.gap_after <= oracle + 3 / np.sqrt(2 * 5200)

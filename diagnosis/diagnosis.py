@@ -1,0 +1,294 @@
+"""The answer about one case: is there a gap, which effect, how sure, how far the gap shrinks with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from diagnosis.candidates import Candidate
+from diagnosis.case import Case, Real
+from diagnosis.fit import Fit, fit
+from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
+from diagnosis.nominal import NominalParameters
+from diagnosis.residual import ResidualModel, pooled_rms
+from diagnosis.search import Progress, search
+from plant.effects import EFFECTS, Effect
+from plant.rig import Rig
+
+Verdict = Literal["none", "effect", "unknown"]
+DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
+
+NOISE_FLOOR = 1.0
+# Calibrated on generated cases (benchmarks.diagnosis_calibration): the evidence alone is a little too sure.
+TEMPERATURE = 1.0
+# A stated value that has to be off by more tolerances than this is a finding of its own.
+FAR_OFF = 3.0
+# Below this probability of the first answer, or with a rival above that one, the answer is called ambiguous.
+_SURE, _RIVAL = 0.8, 0.05
+_LAST_ITERATIONS = 30
+_DRAWS, _BLOCKS, _BLOCK = 4000, 2000, 50
+
+
+@dataclass(frozen=True, eq=False)
+class NamedEffect:
+    """One possible answer.
+
+    Attributes
+    ----------
+    name : effect id, or "none" or "unknown"
+    probability : float
+        That it is the main cause; over all answers the sum is one.
+    presence : float
+        That it is there at all, as the main cause or beside another (equals `probability` for none, unknown).
+    parameters, intervals : parameter -> value, 95 % interval (low, high)
+        From the most probable set of effects that holds it; empty for none and unknown, and where no size of
+        the effect was worth a fit.
+    gap_after : float
+        Pooled RMS of the held-out residuals over the noise with that set; nan without a fit.
+    """
+
+    name: str
+    probability: float
+    presence: float
+    parameters: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    gap_after: float
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What is wrong with a model, as far as its records tell.
+
+    Attributes
+    ----------
+    verdict, detail_verdict : str
+    effects : tuple of NamedEffect
+        Every effect, none and unknown; the answer first, then by presence, with none and unknown last unless
+        they are the answer.
+    combination : tuple of str
+        Effects that are accepted together; empty for the verdicts none and unknown.
+    ambiguous_with : tuple of str
+        Answers that the records cannot rule out beside the first.
+    gap_before, gap_refit, gap_after : float
+        Pooled RMS of (measured - model)/noise over the held-out experiments: rig as stated, stated values
+        moved within their tolerances, accepted effects added.
+    gap_closed, gap_closed_interval : float, (low, high)
+        1 - (R_after - 1)/(R_refit - 1) with R the held-out mean squares (design 6.2) and its 95 % bootstrap
+        interval over blocks of samples; nan without a gap to close.
+    deviations : key -> tolerances
+        How far the stated values are off, with the accepted effects in the model.
+    rig, repair : Rig, tuple of Effect
+        The repaired model: stated values moved, effects to add.
+    residuals_before, residuals_refit, residuals_after : experiment -> (T, 2)
+        Whitened, every experiment, hub before tip.
+    simulations : int
+        Number of simulated records.
+    """
+
+    case: Case
+    verdict: Verdict
+    detail_verdict: DetailVerdict
+    probabilities: dict[str, float]
+    sets: dict[tuple[str, ...], float]
+    effects: tuple[NamedEffect, ...]
+    combination: tuple[str, ...]
+    ambiguous_with: tuple[str, ...]
+    gap_before: float
+    gap_refit: float
+    gap_after: float
+    noise_floor: float
+    gap_closed: float
+    gap_closed_interval: tuple[float, float]
+    deviations: dict[str, float]
+    rig: Rig
+    repair: tuple[Effect, ...]
+    residuals_before: dict[str, Real]
+    residuals_refit: dict[str, Real]
+    residuals_after: dict[str, Real]
+    simulations: int
+
+
+def diagnose(
+    case: Case,
+    *,
+    progress: Progress | None = None,
+    rng: np.random.Generator | None = None,
+    temperature: float = TEMPERATURE,
+) -> Diagnosis:
+    """Search, weigh, and answer.
+
+    Parameters
+    ----------
+    progress
+        Called with the share done (0 to 1) and what is being done.
+    rng
+        Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
+    temperature
+        See `probabilities`.
+    """
+    rng = np.random.default_rng(0) if rng is None else rng
+    found = search(case, progress)
+    model = ResidualModel(case)
+    weighed = probabilities(found.hypotheses, temperature=temperature)
+    answer = weighed.answer
+    verdict: Verdict = "none" if answer == "none" else "unknown" if answer == "unknown" else "effect"
+    accepted = _accepted(found.hypotheses, answer)
+    last = _polished(model, accepted.fit)
+    before = model.by_experiment(np.zeros(model.nominal.count), ())
+    refit = model.by_experiment(found.base.deviations, ())
+    after = model.by_experiment(last.deviations, last.effects)
+    gap_before, gap_refit, gap_after = (_held_out(case, r) for r in (before, refit, after))
+    closed, interval = _closed(case, refit, after, rng)
+    ambiguous_with = _rivals(weighed, accepted.names, answer)
+    return Diagnosis(
+        case=case,
+        verdict=verdict,
+        detail_verdict=_detail(verdict, weighed, ambiguous_with, last),
+        probabilities=weighed.cause,
+        sets=weighed.sets,
+        effects=_named(model, found.hypotheses, weighed, accepted, last, rng),
+        combination=accepted.names if verdict == "effect" else (),
+        ambiguous_with=ambiguous_with,
+        gap_before=gap_before,
+        gap_refit=gap_refit,
+        gap_after=gap_after,
+        noise_floor=NOISE_FLOOR,
+        gap_closed=closed,
+        gap_closed_interval=interval,
+        deviations=dict(zip(model.nominal.keys, map(float, last.deviations), strict=True)),
+        rig=NominalParameters(case.rig).at(last.deviations),
+        repair=last.effects,
+        residuals_before=before,
+        residuals_refit=refit,
+        residuals_after=after,
+        simulations=found.simulations + model.simulations,
+    )
+
+
+def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
+    """The best hypothesis of the answer: nothing added for none and unknown, else the set it leads."""
+    names = () if answer in ("none", "unknown") else (answer,)
+    return max((h for h in hypotheses if h.names[:1] == names), key=lambda h: h.log_weight)
+
+
+def _polished(model: ResidualModel, end: Fit) -> Fit:
+    if not end.candidates and not end.deviations.size:
+        return end
+    last = fit(model, end.candidates, end.coordinates, end.deviations, iterations=_LAST_ITERATIONS)
+    return last if last.cost <= end.cost else end
+
+
+def _detail(verdict: Verdict, weighed: Probabilities, rivals: Sequence[str], last: Fit) -> DetailVerdict:
+    if not last.converged:
+        return "not_converged"
+    if verdict == "unknown":
+        return "unknown"
+    far = bool(last.deviations.size) and float(np.max(np.abs(last.deviations))) > FAR_OFF
+    if verdict == "none":
+        return "parametric" if far else "none"
+    return "ambiguous" if weighed.cause[weighed.answer] < _SURE or rivals else "effect"
+
+
+def _rivals(weighed: Probabilities, combination: Sequence[str], answer: str) -> tuple[str, ...]:
+    """Other answers that keep more than a few per cent, most probable first."""
+    share = {name: p for name, p in weighed.presence.items() if name not in combination}
+    share |= {name: weighed.cause[name] for name in ("none", "unknown")}
+    share.pop(answer, None)
+    return tuple(name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _RIVAL)
+
+
+def _named(
+    model: ResidualModel,
+    hypotheses: Sequence[Hypothesis],
+    weighed: Probabilities,
+    accepted: Hypothesis,
+    last: Fit,
+    rng: np.random.Generator,
+) -> tuple[NamedEffect, ...]:
+    entries = []
+    for name in EFFECTS:
+        holding = [h for h in hypotheses if name in h.names]
+        parameters: dict[str, float] = {}
+        intervals: dict[str, tuple[float, float]] = {}
+        gap = float("nan")
+        if holding:
+            end = last if name in last.names else max(holding, key=lambda h: h.log_weight).fit
+            k = end.names.index(name)
+            parameters = end.candidates[k].parameters(end.coordinates[k])
+            intervals = _intervals(end, k, rng)
+            held_out = model.of(end.deviations, end.effects, model.case.held_out)
+            gap = pooled_rms(held_out)
+        entries.append(
+            NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
+        )
+    answer = weighed.answer
+    order = {name: k for k, name in enumerate(accepted.names)}
+    entries.sort(key=lambda e: (order.get(e.name, len(order)), -e.presence, -e.probability))
+    others = [
+        NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
+        for name in ("none", "unknown")
+    ]
+    others.sort(key=lambda e: -e.probability)
+    first = [e for e in others if e.name == answer]
+    return (*first, *entries, *(e for e in others if e.name != answer))
+
+
+def _intervals(end: Fit, k: int, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
+    """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
+
+    What is left beyond the noise widens them in proportion.
+    """
+    candidate: Candidate = end.candidates[k]
+    at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
+    rows = slice(at, at + len(candidate.axes))
+    covariance = end.covariance()[rows, rows] * max(1.0, end.rms**2)
+    x = end.coordinates[k]
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    low, high = candidate.box
+    draws = np.clip(x + rng.standard_normal((_DRAWS, x.size)) @ root.T, low, high)
+    found = {}
+    centre = candidate.parameters(x)
+    sampled = [candidate.parameters(draw) for draw in draws]
+    for key, value in centre.items():
+        spread = np.array([p[key] for p in sampled]) - value
+        if key == "phase_rad":
+            spread = np.mod(spread + np.pi, 2 * np.pi) - np.pi
+        below, above = np.quantile(spread, [0.025, 0.975])
+        found[key] = (float(value + below), float(value + above))
+    return found
+
+
+def _held_out(case: Case, residuals: dict[str, Real]) -> float:
+    return pooled_rms(np.concatenate([residuals[e.name].ravel() for e in case.held_out]))
+
+
+def _closed(
+    case: Case, before: dict[str, Real], after: dict[str, Real], rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """Share of the explainable held-out energy that is gone, with a block bootstrap."""
+    pairs = []
+    for experiment in case.held_out:
+        T = experiment.voltage_V.size
+        for start in range(0, T, _BLOCK):
+            part = slice(start, start + _BLOCK)
+            a, b = before[experiment.name][part], after[experiment.name][part]
+            pairs.append((float(np.sum(a**2)), float(np.sum(b**2)), a.size))
+    sums = np.array(pairs)
+    drawn = sums[rng.integers(0, len(sums), (_BLOCKS, len(sums)))].sum(axis=1)
+
+    def share(total: Real) -> Real:
+        explainable = total[..., 0] / total[..., 2] - NOISE_FLOOR**2
+        left = total[..., 1] / total[..., 2] - NOISE_FLOOR**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(explainable > 0, 1 - left / explainable, np.nan))
+
+    # A gap that the noise of so many samples could make is none to close.
+    count = sums[:, 2].sum()
+    if sums[:, 0].sum() / count - NOISE_FLOOR**2 < 3 * np.sqrt(2 / count):
+        return float("nan"), (float("nan"), float("nan"))
+    low, high = np.nanquantile(share(drawn), [0.025, 0.975])
+    return float(share(sums.sum(axis=0))), (float(low), float(high))
