@@ -1,0 +1,283 @@
+"""What a gap means for a controller: designed on the rig as stated, and again on the repaired one.
+
+Both designs have the same specification, made from the rig as stated: bandwidth a tenth of its first flexible
+mode, modulus margin 0.5, voltages as large as in the records. Predicted is the linear model the design saw;
+achieved is the repaired machine with all its effects, which stands for the real one. Costs are the integral
+of the squared tip error over the squared move, for a step of the hub angle and then a short push by the
+voltage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import control
+import numpy as np
+import numpy.typing as npt
+
+from control_design.certificate import Certificate, certify
+from control_design.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
+from control_design.controller import Controller
+from control_design.plant_set import Channel, UncertainPlant, modes_of
+from control_design.specification import Specification, SpecificationError
+from control_design.stability import closed_loop_poles
+from control_design.synthesis import synthesise
+from control_design.synthesis_options import SynthesisOptions
+from control_design.synthesis_result import Outcome
+from diagnosis.case import Case
+from ident.record import Record
+from plant import Effect, Rig, SampledArm
+from workflow.diagnose.linear_machine import sampled_linear_machine
+from workflow.loop_sensitivity import measure_on, plan_sensitivity
+
+Real = npt.NDArray[np.float64]
+
+_BANDWIDTH_SHARE = 0.1  # of the first flexible mode
+_MODULUS_MARGIN = 0.5
+_ORDER = 2
+_STARTS = 2
+_ENOUGH = 0.9  # gamma at which the search for a controller ends
+_LEAD_IN = 0.05
+_SHORTEST, _LONGEST = 400, 3000
+_SETTLED = 0.1  # of the move: a run whose last tenth moves less has settled
+_SEED = 2006
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One closed loop: hub angle and tip position over the trial, cost [s], smallest distance from -1.
+
+    margin: nominal margin of the design on its own model, one over the largest measured |S| on the machine.
+    settles: at the end of the trial it moves by less than a tenth of the step.
+    """
+
+    design: str
+    machine: str
+    hub_angle_rad: Real
+    tip_m: Real
+    command_V: Real
+    cost_s: float
+    margin: float
+    settles: bool
+
+    def row(self) -> dict[str, Any]:
+        return {
+            "design": self.design,
+            "machine": self.machine,
+            "cost_s": self.cost_s,
+            "modulus_margin": self.margin,
+            "peak_command_V": float(np.max(np.abs(self.command_V))),
+            "settles": self.settles,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerCheck:
+    """Four runs on one trial: design on the stated rig predicted and achieved, design on the repaired one
+    likewise. reference (T,) [rad]; disturbance_V acts half-way for a twentieth of the trial."""
+
+    time_s: Real
+    reference_rad: Real
+    disturbance_V: float
+    arm_m: float
+    specification: Specification
+    certified: tuple[bool, bool]
+    runs: tuple[Run, Run, Run, Run]
+
+    def document(self) -> dict[str, Any]:
+        return {
+            "specification": {
+                "bandwidth_rad_s": self.specification.bandwidth_rad_s,
+                "modulus_margin": self.specification.modulus_margin,
+                "effort_limit_V_rad": self.specification.effort_limit,
+                "controller_order": self.specification.controller_order,
+            },
+            "step_rad": float(self.reference_rad[-1]),
+            "disturbance_V": self.disturbance_V,
+            "certified_on_own_model": {"as stated": self.certified[0], "repaired": self.certified[1]},
+            "runs": [run.row() for run in self.runs],
+        }
+
+
+class NoControllerError(Exception):
+    """No controller to compare with, and why."""
+
+
+def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> ControllerCheck:
+    """Design on `case.rig` and on the repaired rig with its effects, run both on the repaired machine.
+
+    Raises NoControllerError where a plant allows no controller of this kind.
+    """
+    plants = (_plant("as stated", case.rig, ()), _plant("repaired", rig, effects))
+    specification = _specification(case, plants[0])
+    designs = [_designed(plant, specification) for plant in plants]
+    certificates = [certify(k, [p.uncertain], specification) for k, p in zip(designs, plants, strict=True)]
+    trial = _Trial.of(case, designs[0], plants[0])
+    runs = []
+    for controller, plant, certificate in zip(designs, plants, certificates, strict=True):
+        runs.append(_predicted(trial, controller, plant, certificate))
+        runs.append(_achieved(trial, controller, plant, case, rig, effects))
+    return ControllerCheck(
+        time_s=trial.time_s,
+        reference_rad=trial.reference,
+        disturbance_V=float(np.max(trial.disturbance)),
+        arm_m=trial.arm_m,
+        specification=specification,
+        certified=(certificates[0].certified, certificates[1].certified),
+        runs=(runs[0], runs[1], runs[2], runs[3]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Plant:
+    """A linear machine with both outputs, and its hub channel for the design."""
+
+    both: control.StateSpace
+    uncertain: UncertainPlant
+
+
+def _plant(name: str, rig: Rig, effects: tuple[Effect, ...]) -> _Plant:
+    both = sampled_linear_machine(rig, effects)
+    hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
+    try:
+        return _Plant(both, UncertainPlant(name, hub, None, performance=Channel(tip)))
+    except ValueError as error:
+        raise NoControllerError(str(error)) from error
+
+
+def _specification(case: Case, plant: _Plant) -> Specification:
+    modes = modes_of(plant.uncertain.poles, plant.uncertain.dt_s)
+    if not modes:
+        raise NoControllerError("the rig as stated has no lightly damped mode to set a bandwidth by")
+    first = modes[0].omega_rad_s
+    return Specification(
+        bandwidth_rad_s=_BANDWIDTH_SHARE * first,
+        modulus_margin=_MODULUS_MARGIN,
+        effort_limit=_largest_voltage(case) / _step(case),
+        effort_rolloff_rad_s=2 * first,
+        input_limit=_largest_voltage(case),
+        controller_order=_ORDER,
+    )
+
+
+def _largest_voltage(case: Case) -> float:
+    return max(float(np.max(np.abs(e.voltage_V))) for e in case.experiments)
+
+
+def _step(case: Case) -> float:
+    """Half the spread of the hub angle in the records."""
+    return 0.5 * float(np.sqrt(np.mean([np.var(e.output[:, 0]) for e in case.estimation])))
+
+
+def _designed(plant: _Plant, specification: Specification) -> Controller:
+    options = SynthesisOptions(starts=_STARTS, sufficient_gamma=_ENOUGH)
+    try:
+        found = synthesise([plant.uncertain], specification, options, rng=np.random.default_rng(_SEED))
+    except SpecificationError as error:
+        raise NoControllerError(str(error)) from error
+    if found.outcome is Outcome.NOT_CONVERGED:
+        raise NoControllerError(f"{plant.uncertain.name}: {found.outcome.value}")
+    return found.controller
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A step after a lead-in, half-way a short push by the voltage as well; arrays (T,)."""
+
+    time_s: Real
+    reference: Real
+    disturbance: Real
+    arm_m: float
+
+    @classmethod
+    def of(cls, case: Case, controller: Controller, plant: _Plant) -> _Trial:
+        dt = case.rig.sampling.dt_s
+        radius = float(np.max(np.abs(closed_loop_poles(controller, plant.uncertain))))
+        # e^-7 is a thousandth: the slowest pole has died out by the end of either half.
+        wanted = 2 * 7 / -np.log(min(max(radius, 0.5), 1 - 1e-9))
+        k = np.arange(int(np.clip(round(wanted), _SHORTEST, _LONGEST)))
+        half = k.size // 2
+        voltage = float(np.sqrt(np.mean([np.mean(e.voltage_V**2) for e in case.estimation])))
+        return cls(
+            time_s=np.asarray(k * dt, dtype=np.float64),
+            reference=np.where(k >= round(_LEAD_IN * k.size), _step(case), 0.0),
+            disturbance=np.where((k >= half) & (k < half + k.size // 20), 0.2 * voltage, 0.0),
+            arm_m=case.rig.hub.radius_m + case.rig.link.length_m,
+        )
+
+    def run(
+        self, controller: Controller, machine: LinearMachine | _Watched, design: str, on: str, margin: float
+    ) -> Run:
+        found = simulate(controller, machine, self.reference, input_disturbance=self.disturbance)
+        place = np.array(machine.tips) if isinstance(machine, _Watched) else found.output[:, 1]
+        error = (self.arm_m * self.reference - place) / (self.arm_m * float(self.reference[-1]))
+        return Run(
+            design=design,
+            machine=on,
+            hub_angle_rad=found.output[:, 0],
+            tip_m=place,
+            command_V=found.command,
+            cost_s=float(np.sum(error**2)) * controller.dt_s,
+            margin=margin,
+            settles=self._settles(found),
+        )
+
+    def _settles(self, found: ClosedLoopTrajectory) -> bool:
+        step, n = float(self.reference[-1]), found.time_s.size
+        ends = [found.measured[stop - n // 20 : stop] for stop in (n // 2, n)]
+        return bool(all(np.ptp(end) <= _SETTLED * step for end in ends))
+
+
+class _Watched:
+    """The arm, with the true tip position kept aside at every sample of the last run."""
+
+    def __init__(self, arm: SampledArm) -> None:
+        self._arm = arm
+        self.tips: list[float] = []
+
+    @property
+    def dt_s(self) -> float:
+        return self._arm.dt_s
+
+    def reset(self) -> None:
+        self._arm.reset()
+        self.tips = []
+
+    def measure(self) -> Real:
+        self.tips.append(float(self._arm.true_output[1]))
+        return self._arm.measure()
+
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        self._arm.advance(u, hub_torque_Nm)
+
+
+def _predicted(trial: _Trial, controller: Controller, plant: _Plant, certificate: Certificate) -> Run:
+    margin = certificate.plants[0].nominal_margins.modulus
+    name = plant.uncertain.name
+    return trial.run(controller, LinearMachine(plant.both), name, "its own model", margin)
+
+
+def _achieved(
+    trial: _Trial, controller: Controller, plant: _Plant, case: Case, rig: Rig, effects: tuple[Effect, ...]
+) -> Run:
+    arm = SampledArm(rig, effects)
+    records = [
+        Record(
+            e.name, e.voltage_V[:, None], e.output, case.rig.sampling.dt_s, ("voltage_V",), arm.output_names
+        )
+        for e in case.estimation
+    ]
+    hub = [record.siso("voltage_V", "hub_angle_rad") for record in records]
+    plan = plan_sensitivity(controller, plant.uncertain, np.inf, hub, trial.time_s.size // 2)
+    seen = measure_on(
+        _Watched(arm),
+        controller,
+        plan,
+        np.random.default_rng(_SEED),
+        measured_index=0,
+        measurement_step=0.0,
+        command_step=0.0,
+    )
+    peak, _, _ = seen.peak
+    return trial.run(controller, _Watched(arm), plant.uncertain.name, "repaired machine", 1.0 / peak)

@@ -1,0 +1,151 @@
+"""The files of a diagnosis of one or several cases.
+
+    diagnose.json              inputs and options; a resumed diagnosis is held to them
+    <case>.json .html          the answer, for programs and for people
+    <case>.rig.toml            repaired rig; <case>.effects.toml the effects to add, where there are any
+    index.html                 overview of several cases
+    timings.json               seconds per case; the only file that differs from run to run
+
+The JSON file of a case is written last and names the hashes of the others: a case whose JSON file stands,
+made from the same inputs by the same code, is done.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from workflow import storage
+from workflow.code_version import code_digest
+from workflow.errors import InputError, naming
+from workflow.run_directory import first_difference
+
+LAYOUT_VERSION = 1
+MANIFEST = "diagnose.json"
+_OTHER_FILES = (MANIFEST, "index.html", "timings.json", "lock")
+_ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml")
+
+
+@cache
+def diagnosis_digest() -> str:
+    """SHA-256 over all code that an answer and its page depend on."""
+    root = Path(__file__).resolve().parents[2]
+    digest = hashlib.sha256(code_digest(drawing=True).encode())
+    for path in sorted((root / "diagnosis").rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class DiagnosisDirectory:
+    """Where answers are kept. Make one with `begin`."""
+
+    path: Path
+
+    @classmethod
+    def begin(
+        cls, path: Path, *, inputs: Mapping[str, str], options: Mapping[str, Any], resume: bool, replace: bool
+    ) -> DiagnosisDirectory:
+        """A new or empty directory, the same diagnosis with `resume`, or whatever diagnosis is there
+        replaced.
+
+        inputs: case -> hash. Raises InputError: not writable, not empty, holding something else, or begun
+        with other inputs or options.
+        """
+        place = cls(path)
+        document = {"layout": LAYOUT_VERSION, "inputs": dict(inputs), "options": dict(options)}
+        held = place._held()
+        if held and MANIFEST not in held:
+            what = "no diagnosis is there" if resume or replace else "not empty"
+            raise InputError(f"{path}: {what} (it holds {min(held)!r}); choose another --out")
+        if held and not (resume or replace):
+            raise InputError(
+                f"{path}: an earlier diagnosis is there; choose another --out, continue it with --resume or "
+                "start it afresh with --replace"
+            )
+        if held and not replace:
+            changed = first_difference(storage.read_json(path / MANIFEST), document)
+            if changed:
+                raise InputError(
+                    f"{path}: cannot resume, other inputs: {changed}; choose another --out or --replace"
+                )
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+        with naming(f"cannot write {path}"), place.locked():
+            if held and replace:
+                place._clear(held)
+            place.write(MANIFEST, (json.dumps(document, indent=1) + "\n").encode())
+        return place
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the directory against a second writer; the system lets go when the process dies."""
+        import fcntl
+
+        with open(self.path / "lock", "w") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise InputError(f"{self.path}: another process is writing this diagnosis") from error
+            storage.remove_leftovers(self.path)
+            yield
+
+    def write(self, name: str, content: bytes) -> None:
+        storage.write_bytes(self.path / name, content)
+
+    def save(self, case: str, files: Mapping[str, bytes]) -> None:
+        """All files of a case, its JSON file last; what an earlier answer had besides goes."""
+        answer = f"{case}.json"
+        (self.path / answer).unlink(missing_ok=True)
+        for ending in _ENDINGS:
+            if f"{case}{ending}" not in files:
+                (self.path / f"{case}{ending}").unlink(missing_ok=True)
+        for name in sorted(files, key=lambda name: name == answer):
+            self.write(name, files[name])
+
+    def finished(self, case: str, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The answer to a case if it is there, whole and made from this; else None."""
+        path = self.path / f"{case}.json"
+        try:
+            document = json.loads(path.read_bytes())
+        except (OSError, ValueError):
+            return None
+        if not isinstance(document, dict) or document.get("made_from") != made_from:
+            return None
+        for name, digest in document.get("files", {}).items():
+            file = self.path / name
+            if not file.is_file() or storage.sha256_of_file(file) != digest:
+                return None
+        return document
+
+    def timings(self) -> dict[str, Any]:
+        """Seconds per case so far; nothing where the file is not there or cannot be read."""
+        try:
+            found = json.loads((self.path / "timings.json").read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _held(self) -> set[str]:
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"cannot write {self.path}: it is not a directory")
+        try:
+            entries = {entry.name for entry in self.path.iterdir()} if self.path.exists() else set()
+        except OSError as error:
+            raise InputError(f"cannot read {self.path}: {error.strerror or error}") from error
+        return {name for name in entries if not name.endswith(storage.TEMPORARY_SUFFIX) and name != "lock"}
+
+    def _clear(self, held: set[str]) -> None:
+        """Files of the earlier diagnosis but its manifest, by which a second attempt knows what is left."""
+        earlier = storage.read_json(self.path / MANIFEST)
+        own = {f"{case}{ending}" for case in earlier.get("inputs", {}) for ending in _ENDINGS}
+        for name in sorted(held & (own | set(_OTHER_FILES)) - {MANIFEST}):
+            (self.path / name).unlink(missing_ok=True)

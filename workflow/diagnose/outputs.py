@@ -1,0 +1,104 @@
+"""One case from numbers to files: diagnosis, where, next experiment, controller, JSON, page, repaired rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from diagnosis.case import Case
+from diagnosis.diagnosis import Diagnosis, diagnose
+from diagnosis.where import where
+from workflow import storage
+from workflow.diagnose.case_files import LoadedCase
+from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
+from workflow.diagnose.document import document_of, json_text
+from workflow.diagnose.page import CasePage, case_page
+from workflow.diagnose.repaired_rig import effects_text, rig_text
+from workflow.errors import naming
+
+Report = Callable[[float, str], None]
+# Shares of a case's time, for the progress bar only.
+_ENGINE, _WHERE, _CONTROLLER = 0.8, 0.85, 0.9
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user chooses beyond the case; part of what a resumed case is held to."""
+
+    controller: bool = True
+
+    def document(self) -> dict[str, Any]:
+        return {"controller": self.controller}
+
+
+class Engine:
+    """What computes a diagnosis; tests put a quick one in its place."""
+
+    def __call__(self, case: Case, *, progress: Report | None = None) -> Diagnosis:
+        return diagnose(case, progress=progress)
+
+
+def files_of(
+    loaded: LoadedCase, options: Options, code_sha256: str, *, engine: Engine, report: Report
+) -> dict[str, bytes]:
+    """File name -> content; the JSON file names the others' hashes and is to be written last.
+
+    Raises InputError or StageError, one line.
+    """
+    case = loaded.case
+    with naming(f"case {case.name}"):
+        found = engine(case, progress=lambda f, m: report(_ENGINE * f, m))
+        report(_ENGINE, "where")
+        place = where(case, found.residuals_refit, found.probabilities)
+        remains = where(case, found.residuals_after)
+        following: dict[str, Any] = {}
+        report(_WHERE, "controller")
+        check, control = _control(case, found, options)
+    rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
+    effects = effects_text(case.name, found.repair) if found.repair else ""
+    rig = rig_text(case.name, case.rig, found.rig, found.deviations, effects_name if effects else "")
+    html = case_page(
+        CasePage(loaded, found, place, remains, following, control, check, rig, effects),
+        lambda f, m: report(_CONTROLLER + (1 - _CONTROLLER) * f, f"drawing {m}"),
+    )
+    files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
+    if effects:
+        files[effects_name] = effects.encode()
+    document = document_of(
+        loaded, found, where=place.to_dict(), next_experiment=following, controller=control
+    )
+    document["remains"] = remains.to_dict()
+    document["made_from"] = made_from(loaded, options, code_sha256)
+    document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
+    return {**files, f"{case.name}.json": json_text(document).encode()}
+
+
+def made_from(loaded: LoadedCase, options: Options, code_sha256: str) -> dict[str, Any]:
+    """What the answer depends on: equal entries, equal answer."""
+    return {"input_sha256": loaded.input_sha256, "code_sha256": code_sha256, "options": options.document()}
+
+
+def _control(
+    case: Case, found: Diagnosis, options: Options
+) -> tuple[ControllerCheck | None, Mapping[str, Any]]:
+    reason = ""
+    if not options.controller:
+        reason = "Not looked at: --no-controller was given."
+    elif found.verdict == "none":
+        reason = (
+            "Nothing is missing in the model, so a controller designed on it meets the machine it was made "
+            "for, as far as these records can tell."
+        )
+    elif found.verdict == "unknown" or found.detail_verdict == "not_converged":
+        reason = (
+            "The repaired model does not explain the machine, so no closed loop can be predicted with it: a "
+            "controller designed on either model has to be tried with care."
+        )
+    if reason:
+        return None, {"skipped": reason}
+    try:
+        check = check_controller(case, found.rig, found.repair)
+    except NoControllerError as error:
+        return None, {"skipped": f"No controller to compare: {error}."}
+    return check, check.document()

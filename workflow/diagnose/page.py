@@ -1,0 +1,414 @@
+"""The page of one case: answers in the order a person asks for them, in words first, pictures beside."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from diagnosis.diagnosis import Diagnosis
+from diagnosis.where_records import Where
+from plant.modal import linear_arm
+from workflow.diagnose import findings
+from workflow.diagnose.case_files import LoadedCase
+from workflow.diagnose.controller_check import ControllerCheck
+from workflow.diagnose.document import gaps_by_experiment
+from workflow.diagnose.words import GROUPS, effect_words, key_words, probability_words, unit_of
+from workflow.figures.gap_answer import draw_probabilities, draw_waterfall
+from workflow.figures.gap_controller import LoopRun, draw_controller_check
+from workflow.figures.gap_records import ResidualRecord, draw_residual_spectra, draw_residual_traces
+from workflow.figures.gap_where import draw_bands_and_experiments, draw_curves, draw_regimes
+from workflow.figures.style import Picture, render
+from workflow.report.page import Block, Code, Plot, Section, Table, Text, maybe
+from workflow.report.rendering import page
+from workflow.report.words import count, number
+
+_MOST_REGIMES = 6
+_LEAST_PRESENCE = 0.01  # of an effect in the table
+
+
+@dataclass(frozen=True, eq=False)
+class CasePage:
+    """Everything the page is made of; the documents stand in the JSON file as well.
+
+    where: of the gap that is left when the stated values are moved within their tolerances; remains: of what
+    the effects leave. check is None where there was nothing to compare, control says why.
+    """
+
+    loaded: LoadedCase
+    found: Diagnosis
+    where: Where
+    remains: Where
+    next_experiment: Mapping[str, Any]
+    control: Mapping[str, Any]
+    check: ControllerCheck | None
+    rig_text: str
+    effects_text: str
+
+
+def case_page(content: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
+    """One self-contained HTML page; equal content gives equal bytes."""
+    drawers = _drawers(content)
+    pictures: dict[str, Picture] = {}
+    for position, (name, draw) in enumerate(drawers.items()):
+        if progress is not None:
+            progress(position / len(drawers), name)
+        pictures[name] = render(draw())
+    found = content.found
+    sections = [
+        _gap(content),
+        _where(content),
+        _which(content),
+        _closure(content),
+        _remains(content),
+        _next(content),
+        _controller(content),
+        _not_checked(content),
+        _reproduce(content),
+    ]
+    return page(
+        "identify.html.j2",
+        title=content.loaded.case.name,
+        sections=[_drawn_only(section, pictures) for section in sections],
+        pictures=pictures,
+        headline=findings.headline(found),
+        findings=_summary(content),
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    title: str
+    items: tuple[str, ...]
+
+
+def _summary(content: CasePage) -> list[_Part]:
+    """The head of the page: one or two sentences for each of the questions."""
+    found = content.found
+    parts = [
+        ("Is there a gap?", findings.gap_sentences(found)[:2]),
+        ("Where?", [content.where.headline] if found.verdict != "none" else []),
+        ("Which effect?", findings.which_sentences(found)),
+        ("How far does the gap shrink?", findings.closure_sentences(found) if found.combination else []),
+        ("What next?", _next_words(content)[:1]),
+    ]
+    return [_Part(title, tuple(items)) for title, items in parts if items]
+
+
+def _drawn_only(section: Section, pictures: Mapping[str, Picture]) -> Section:
+    """Without the plots that there was nothing to draw for."""
+    blocks = tuple(b for b in section.blocks if not isinstance(b, Plot) or b.name in pictures)
+    return Section(section.anchor, section.title, section.short, blocks)
+
+
+def _paragraphs(sentences: list[str]) -> list[Block]:
+    return [Text(sentence) for sentence in sentences]
+
+
+def _gap(content: CasePage) -> Section:
+    blocks = _paragraphs(findings.gap_sentences(content.found))
+    blocks.append(
+        Plot(
+            "waterfall",
+            "Root mean square of (measured - model) over the sensor noise for the three models. 1 is what "
+            "white noise of the stated size leaves. Held-out experiments were never fitted.",
+        )
+    )
+    return Section("gap", "Is there a gap beyond noise?", "Gap", tuple(blocks))
+
+
+def _where(content: CasePage) -> Section:
+    where = content.where
+    blocks: list[Block] = [Text(where.headline)]
+    # The subsystem is said with the causes, of which it is the sum.
+    blocks += _paragraphs([words for axis, words in where.sentences.items() if axis != "subsystem"])
+    blocks += [
+        Plot(
+            "bands",
+            "Size of the gap with the sensor noise taken off, after moving the stated values within their "
+            "tolerances. Pale: no more than chance gives. The frequency panel ends at 0.05; less is drawn "
+            "there.",
+        ),
+        Plot("curves", "The gap read as one missing function: what would have to be added, and where."),
+        Plot(
+            "regimes",
+            "Residual energy while a variable lies in a range. Grey: what the same energy gives when it is "
+            "shifted in time. A dot outside says that the gap depends on the variable.",
+        ),
+        Plot("traces", "Residuals over noise in every experiment, rig as stated and with the effects added."),
+    ]
+    return Section("where", "Where does it lie?", "Where", tuple(blocks))
+
+
+def _which(content: CasePage) -> Section:
+    found = content.found
+    sentences = findings.which_sentences(found) + findings.suspicion_sentences(
+        found, content.loaded.suspected
+    )
+    rows = tuple(
+        (GROUPS.get(name, name), probability_words(p))
+        for name, p in sorted(content.where.subsystem.items(), key=lambda item: -item[1])
+    )
+    blocks = _paragraphs(sentences)
+    blocks.append(
+        Plot("probabilities", "Probabilities over no effect, every effect of the list, and none of them.")
+    )
+    table = _effect_table(found)
+    blocks += [table] if table.rows else []
+    blocks.append(Table(("subsystem", "probability"), rows, "The same, added up by subsystem."))
+    return Section("which", "Which effect, and how sure?", "Which", tuple(blocks))
+
+
+def _effect_table(found: Diagnosis) -> Table:
+    rows = []
+    for effect in found.effects:
+        if effect.presence < _LEAST_PRESENCE or not effect.parameters:
+            continue
+        for position, (key, value) in enumerate(effect.parameters.items()):
+            low, high = effect.intervals[key]
+            once = (effect.name, probability_words(effect.probability), probability_words(effect.presence))
+            rows.append(
+                (
+                    *(once if position == 0 else ("", "", "")),
+                    key,
+                    f"{number(value, 5)} {unit_of(key)}".rstrip(),
+                    f"{number(low, 5)} to {number(high, 5)}",
+                    number(effect.gap_after, 4) if position == 0 else "",
+                )
+            )
+    return Table(
+        ("effect", "main cause", "there at all", "parameter", "value", "95 % interval", "gap after"),
+        tuple(rows),
+        "Effects that the records leave possible, with fitted parameters. Gap after: held-out residual over "
+        "noise with the best set of effects that holds the effect.",
+    )
+
+
+def _closure(content: CasePage) -> Section:
+    found = content.found
+    by_experiment = gaps_by_experiment(found)
+    roles = {e.name: e.role.replace("_", " ") for e in content.loaded.case.experiments}
+    rows = tuple(
+        (name, roles[name], *(number(entry[model], 4) for model in ("stated", "refit", "repaired")))
+        for name, entry in by_experiment.items()
+    )
+    pooled = (
+        "held out, together",
+        "",
+        *(number(v, 4) for v in (found.gap_before, found.gap_refit, found.gap_after)),
+    )
+    blocks = _paragraphs(findings.closure_sentences(found))
+    blocks.append(
+        Table(
+            ("experiment", "role", "as stated", "values moved", "effects added"),
+            (*rows, pooled),
+            "Residual over noise, RMS.",
+        )
+    )
+    return Section("closure", "How far does the gap shrink?", "Closure", tuple(blocks))
+
+
+def _remains(content: CasePage) -> Section:
+    found = content.found
+    blocks = _paragraphs([*findings.remaining_sentences(found), content.remains.headline])
+    blocks += _paragraphs(list(content.remains.sentences.values()))
+    blocks.append(
+        Plot(
+            "spectra",
+            "Spectra of the residuals over noise, all experiments together; 1 is white sensor noise.",
+        )
+    )
+    rows = tuple(
+        (
+            key_words(key),
+            f"{number(content.loaded.case.rig.value(key), 5)} {unit_of(key)}".rstrip(),
+            f"{number(found.rig.value(key), 5)} {unit_of(key)}".rstrip(),
+            f"{d:+.2f}",
+        )
+        for key, d in found.deviations.items()
+    )
+    if rows:
+        blocks.append(
+            Table(
+                ("stated value", "as stated", "repaired", "moved by [tolerances]"),
+                rows,
+                "Values that the rig file gives a tolerance for.",
+            )
+        )
+    return Section("remains", "What remains?", "Remains", tuple(blocks))
+
+
+def _next_words(content: CasePage) -> list[str]:
+    return [str(words) for words in content.next_experiment.get("sentences", ())]
+
+
+def _next(content: CasePage) -> Section:
+    words = _next_words(content)
+    if not words:
+        words = [
+            "No further experiment is needed to tell the answers apart."
+            if content.found.verdict != "unknown"
+            else "No experiment is proposed: there is no pair of answers it could tell apart."
+        ]
+    return Section("next", "Which experiment to run next?", "Next", tuple(_paragraphs(words)))
+
+
+def _controller(content: CasePage) -> Section:
+    blocks = _paragraphs(findings.control_sentences(content.control))
+    if content.check is not None:
+        asked = content.control["specification"]
+        blocks.append(
+            Plot(
+                "controller",
+                "A step of the hub angle, then a short push by the voltage. Left the design on the rig as "
+                "stated, right the same specification on the repaired rig.",
+            )
+        )
+        rows = tuple(
+            (
+                run["design"],
+                run["machine"],
+                number(run["cost_s"], 4),
+                number(run["modulus_margin"], 4),
+                number(run["peak_command_V"], 4),
+                "yes" if run["settles"] else "NO",
+            )
+            for run in content.control["runs"]
+        )
+        blocks.append(
+            Table(
+                ("designed on", "run on", "cost [s]", "distance from -1", "peak voltage [V]", "settles"),
+                rows,
+                "Cost: integral of the squared tip error over the squared move. Specification: bandwidth "
+                f"{number(asked['bandwidth_rad_s'])} rad/s, modulus margin "
+                f"{number(asked['modulus_margin'])}, effort {number(asked['effort_limit_V_rad'])} V/rad, "
+                f"{count(asked['controller_order'], 'state')}. On the machine the distance from -1 is one "
+                "over the largest sensitivity measured there.",
+            )
+        )
+    return Section("controller", "What does it mean for the controller?", "Controller", tuple(blocks))
+
+
+def _not_checked(content: CasePage) -> Section:
+    words = [
+        "Only effects of the list are named. A cause outside it that looks like one of them would be called "
+        "by the wrong name; the residuals above are what speaks against that.",
+        "Noise levels are taken from the rig file. If they are wrong, so is every statement about noise.",
+        "Every record is taken to start from rest at zero angle.",
+    ]
+    if content.check is not None:
+        words.append(
+            "The repaired model stands for the machine in closed loop: nothing was run on the machine "
+            "itself, and the designs know no uncertainty."
+        )
+    if not any(e.closed_loop for e in content.loaded.case.experiments):
+        words.append("No experiment was made in closed loop.")
+    if not content.found.deviations:
+        words.append("The stated values are taken as exact; a wrong one would show up as an effect.")
+    return Section("unchecked", "What was not checked", "Not checked", maybe(tuple(words), "warning"))
+
+
+def _reproduce(content: CasePage) -> Section:
+    loaded = content.loaded
+    rows = tuple(
+        (
+            e.name,
+            e.role.replace("_", " "),
+            e.kind,
+            "closed loop" if e.closed_loop else "open loop",
+            str(e.voltage_V.size),
+            loaded.descriptions.get(e.name, ""),
+        )
+        for e in loaded.case.experiments
+    )
+    versions = tuple((name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba"))
+    blocks: list[Block] = [
+        Table(("experiment", "role", "input", "loop", "samples", "description"), rows),
+        Table(
+            ("what", "value"),
+            (
+                ("rig file", loaded.rig_file),
+                ("SHA-256 of all inputs", loaded.input_sha256),
+                ("simulations", f"{content.found.simulations}"),
+                *versions,
+                ("python", sys.version.split()[0]),
+            ),
+            "The result is deterministic: the same files and versions give the same page.",
+        ),
+        Code("Repaired rig file", content.rig_text),
+    ]
+    if content.effects_text:
+        blocks.append(Code("Effects to add", content.effects_text))
+    return Section("made", "To reproduce this", "Reproduce", tuple(blocks))
+
+
+# Pictures
+
+
+def _drawers(content: CasePage) -> dict[str, Callable[[], Figure]]:
+    found, case, where = content.found, content.loaded.case, content.where
+    dt = case.rig.sampling.dt_s
+    regimes = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
+    curves = [curve for curve in where.curves if curve.found]
+    ranked = sorted(found.probabilities.items(), key=lambda item: -item[1])
+    accepted = set(found.combination) or {"none" if found.verdict == "none" else "unknown"}
+    drawers: dict[str, Callable[[], Figure]] = {
+        "waterfall": lambda: draw_waterfall(
+            {"stated": found.gap_before, "refit": found.gap_refit, "repaired": found.gap_after},
+            gaps_by_experiment(found),
+            found.noise_floor,
+        ),
+        "bands": lambda: draw_bands_and_experiments(where.bands, where.experiments),
+        "traces": lambda: draw_residual_traces(
+            [
+                ResidualRecord(
+                    e.name,
+                    e.role == "held_out",
+                    found.residuals_before[e.name],
+                    found.residuals_after[e.name],
+                )
+                for e in case.experiments
+            ],
+            dt,
+        ),
+        "probabilities": lambda: draw_probabilities(
+            [effect_words(name) for name, _ in ranked],
+            [p for _, p in ranked],
+            [name in accepted for name, _ in ranked],
+        ),
+        "spectra": lambda: draw_residual_spectra(
+            {
+                "stated": list(found.residuals_before.values()),
+                "refit": list(found.residuals_refit.values()),
+                "repaired": list(found.residuals_after.values()),
+            },
+            _modes_Hz(content),
+            dt,
+        ),
+    }
+    if regimes:
+        drawers["regimes"] = lambda: draw_regimes(regimes)
+    if curves:
+        drawers["curves"] = lambda: draw_curves(curves)
+    check = content.check
+    if check is not None:
+        drawers["controller"] = lambda: draw_controller_check(
+            check.time_s,
+            check.arm_m * check.reference_rad,
+            tuple(
+                LoopRun("repaired" if i > 1 else "stated", i % 2 == 1, run.tip_m, run.command_V)
+                for i, run in enumerate(check.runs)
+            ),
+        )
+    return drawers
+
+
+def _modes_Hz(content: CasePage) -> list[float]:
+    poles = linear_arm(content.loaded.case.rig).poles_rad_s()
+    upper = poles[poles.imag > 0]
+    return sorted(float(abs(pole)) / (2 * np.pi) for pole in upper)

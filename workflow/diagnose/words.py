@@ -1,0 +1,124 @@
+"""Effects, parameters and shares in words a person can read aloud."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from workflow.report.words import number
+
+_EFFECTS: Mapping[str, str] = {
+    "coulomb_friction": "dry (Coulomb) friction",
+    "stribeck_friction": "dry friction that falls with speed (Stribeck)",
+    "viscous_friction": "additional viscous friction",
+    "actuator_saturation": "saturation of the actuator",
+    "actuator_dead_zone": "a dead zone of the actuator",
+    "input_delay": "a delay of the command",
+    "actuator_gain": "a wrong gain of the actuator",
+    "tip_payload": "an additional mass at the tip",
+    "link_stiffness": "a wrong bending stiffness of the link",
+    "structural_damping": "wrong damping of the link",
+    "sensor_gain": "a wrong gain of the tip sensor",
+    "sensor_drift": "a drift of the tip sensor",
+    "quantisation": "coarse steps of the tip sensor",
+    "hub_inertia": "a wrong inertia of the hub",
+    "actuator_lag": "a lag of the actuator",
+    "torque_ripple": "torque ripple over the hub angle",
+    "periodic_disturbance": "a periodic disturbance torque",
+    "hardening_spring": "a hardening spring at the hub (cable, hose)",
+    "joint_compliance": "a compliant joint between hub and link",
+    "base_compliance": "a compliant base under the motor",
+    "backlash": "play (backlash) in the gear",
+    "gravity": "gravity in a tilted plane",
+    "sensor_lag": "a lag of the tip sensor",
+}
+_OTHERS: Mapping[str, str] = {"none": "no effect at all", "unknown": "a cause outside the list"}
+
+GROUPS: Mapping[str, str] = {
+    "actuator": "actuator",
+    "joint": "joint and hub",
+    "link": "link",
+    "sensor": "tip sensor",
+    "environment": "from outside",
+    "none": "nothing missing",
+    "unknown": "outside the list",
+}
+
+# Longest ending first: "stiffness_Nm_rad" is no "rad".
+_UNITS: Mapping[str, str] = {
+    "_Nm_rad3": "N m/rad³",
+    "_Nm_rad": "N m/rad",
+    "_Nm_A": "N m/A",
+    "_Vs_rad": "V s/rad",
+    "_kg_m2": "kg m²",
+    "_kg_m3": "kg/m³",
+    "_rad_s": "rad/s",
+    "_m_s2": "m/s²",
+    "_m_s": "m/s",
+    "_Nms": "N m s",
+    "_Nm": "N m",
+    "_kg": "kg",
+    "_Pa": "Pa",
+    "_Hz": "Hz",
+    "_ohm": "ohm",
+    "_rad": "rad",
+    "_V": "V",
+    "_s": "s",
+    "_m": "m",
+}
+
+
+def effect_words(name: str) -> str:
+    """An effect, "none" or "unknown" in words; a user's own effect by its id without underscores."""
+    return _EFFECTS.get(name) or _OTHERS.get(name) or name.replace("_", " ")
+
+
+def unit_of(parameter: str) -> str:
+    """Unit from the ending of a parameter's name; empty for pure numbers."""
+    name = parameter.rpartition(".")[2]
+    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
+
+
+def parameter_name(parameter: str) -> str:
+    """`stribeck_velocity_rad_s` as "stribeck velocity"."""
+    name = parameter.rpartition(".")[2]
+    ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
+    return name.removesuffix(ending).replace("_", " ")
+
+
+def parameter_words(parameter: str, value: float, interval: Sequence[float] | None) -> str:
+    """Name, value, unit and 95 % interval."""
+    text = f"{parameter_name(parameter)} {number(value, 4)} {unit_of(parameter)}".rstrip()
+    if interval is None:
+        return text
+    return f"{text} (95 %: {number(interval[0], 4)} to {number(interval[1], 4)})"
+
+
+def key_words(key: str) -> str:
+    """A dotted key of the rig file: "hub.inertia_kg_m2" as "inertia of the hub"."""
+    section, _, name = key.partition(".")
+    what = parameter_name(name)
+    return what if re.search(rf"\b{section}\b", what) else f"{what} ({section})"
+
+
+def probability_words(p: float) -> str:
+    """A probability in percent, without claiming 100 or 0."""
+    percent = 100 * p
+    if percent > 99.9:
+        return "over 99.9 %"
+    if percent < 0.1:
+        return "under 0.1 %"
+    return f"{percent:.3g} %" if percent < 99 else f"{percent:.1f} %"
+
+
+def sureness(p: float) -> str:
+    """How sure that is, in a word."""
+    for limit, word in (
+        (0.99, "practically certain"),
+        (0.9, "very likely"),
+        (0.66, "likely"),
+        (0.33, "possible"),
+    ):
+        if p >= limit:
+            return word
+    return "unlikely"

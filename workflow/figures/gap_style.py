@@ -1,0 +1,26 @@
+"""Colours of the gap pages: one per model, the same in every picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from workflow.figures import style
+
+# The three models a gap is measured against, in the order of the waterfall, each with a line style.
+STATED: dict[str, Any] = {"color": "#CC79A7", "ls": (0, (3, 1.5)), "lw": 1.2}
+REFIT: dict[str, Any] = {"color": "#E69F00", "ls": (0, (5, 1.5, 1, 1.5)), "lw": 1.3}
+REPAIRED: dict[str, Any] = {"color": style.MODEL, "ls": "-", "lw": 1.3}
+FLOOR: dict[str, Any] = {"color": style.REFERENCE, "ls": (0, (1, 1.5)), "lw": 1.1}
+
+WORDS: Mapping[str, str] = {
+    "stated": "rig as stated",
+    "refit": "values moved within tolerances",
+    "repaired": "effects added",
+    "floor": "sensor noise",
+}
+MODELS: Mapping[str, Mapping[str, Any]] = {"stated": STATED, "refit": REFIT, "repaired": REPAIRED}
+SENSOR_WORDS = ("hub angle", "tip position")
+SENSOR_MARKERS = ("o", "s")
+# Of a share or probability bar that is not the first answer.
+PALE = "#b9c2cc"
