@@ -338,6 +338,65 @@ def study(
     _leave(summary.certified, summary.verdict)
 
 
+@app.command(short_help="Why machine and model differ: cause, size, closure.")
+def diagnose(
+    case: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Case folder with case.toml, rig.toml and logs, or a TOML file like case.toml with a column "
+            "map beside logs of your own; several give an overview as well.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            help="Rig file in the case folder, e.g. rig_uncertain.toml [default: what the case file names, "
+            "or rig.toml]",
+            show_default=False,
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the diagnosis in --out; finished cases are taken up.")
+    ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Delete an earlier diagnosis in --out first.")
+    ] = False,
+    controller: Annotated[
+        bool,
+        typer.Option(help="Compare controllers designed on the rig as stated and on the repaired one."),
+    ] = True,
+    as_json: Json = False,
+) -> None:
+    """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
+    from workflow.console import TerminalProgress, print_summary
+    from workflow.diagnose.command import diagnose_cases
+
+    with TerminalProgress() as progress:
+        found = diagnose_cases(
+            case,
+            out,
+            rig=rig,
+            jobs=jobs,
+            resume=resume,
+            replace=replace,
+            controller=controller,
+            progress=progress,
+        )
+    if as_json:
+        _print_json(found.to_document())
+    else:
+        print_summary(found.summary)
+    for line in found.complaints():
+        print(f"flexlink: {line}", file=sys.stderr)  # noqa: T201
+    if found.exit_code != EXIT_OK:
+        raise typer.Exit(found.exit_code)
+
+
 def _degree(text: str | None) -> int | str | None:
     """A number where one was given, so that the settings' own complaint names what is allowed."""
     return int(text) if text is not None and text.isdigit() else text
@@ -384,7 +443,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _interrupted(arguments: Sequence[str]) -> int:
     command = arguments[0]
-    hint = f"; `flexlink {command} --out DIR --resume` continues" if command in ("run", "study") else ""
+    hint = (
+        f"; `flexlink {command} --out DIR --resume` continues"
+        if command in ("run", "study", "diagnose")
+        else ""
+    )
     return _complain(f"interrupted{hint}", _EXIT_INTERRUPTED)
 
 
