@@ -12,6 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.case import Case, Real
+from diagnosis.distortion import periodic_findings
+from diagnosis.linear_correction import linear_correction
+from diagnosis.missing_function import missing_functions
 from diagnosis.regimes import motions, regime_axes, regime_findings
 from diagnosis.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
 from diagnosis.where_records import Where
@@ -67,10 +70,10 @@ def where(
         bands=band_gaps(e, case.rig.sampling.dt_s, level),
         regimes=regime_findings(e, regime_axes(moved, ripple_cycles_per_rev), level, rng),
         drift=drift_findings(case, e, level),
-        curves=(),
-        periodic=(),
+        curves=missing_functions(case, e, moved, level, rng),
+        periodic=periodic_findings(case, e, level),
         amplitude=amplitude_finding(case, e, level, rng),
-        linear=None,
+        linear=linear_correction(case, e),
         subsystem=subsystem_mass(probabilities) if probabilities else {},
         sentences={},
         level=level,

@@ -34,7 +34,7 @@ def sentences(found: Where) -> dict[str, str]:
         "frequency": _frequency(found),
         "regimes": _regimes(found.regimes),
         "time": " ".join(d.sentence for d in found.drift if d.sentence),
-        "amplitude": "" if found.amplitude is None else found.amplitude.sentence,
+        "amplitude": _amplitude(found),
         "curves": _curves(found.curves),
         "linear": "" if found.linear is None else found.linear.sentence,
         "periodic": " ".join(p.sentence for p in found.periodic if p.sentence),
@@ -63,6 +63,9 @@ def headline(found: Where) -> str:
         places.append(f"{percent(band[2])} of its energy {frequencies(band[0], band[1], found)}")
     if any(d.sentence for d in found.drift):
         places.append("it grows steadily with time")
+    elif found.linear is not None and found.linear.sentence:
+        follows = "follows" if found.linear.share >= 0.9 else "does not follow"
+        places.append(f"it {follows} the voltage linearly")
     curve = best_curve(found.curves)
     if curve is not None:
         places.append(
@@ -230,7 +233,22 @@ def _regimes(regimes: Sequence[RegimeFinding]) -> str:
 
 def _curves(curves: Sequence[EquivalentCurve]) -> str:
     best = best_curve(curves)
-    return "" if best is None else best.sentence
+    if best is None:
+        return ""
+    near = [c for c in curves if c.found and c is not best and c.share >= 0.8 * min(best.share, 1.0)]
+    if not near:
+        return best.sentence
+    others = [f"{ROUTES[c.route]} over {AXES[c.axis]} ({percent(c.share)})" for c in near]
+    return f"{best.sentence} Not far behind: {listed(others)}."
+
+
+def _amplitude(found: Where) -> str:
+    """Silent where a linear correction explains the gap: two inputs never excite it quite alike."""
+    if found.amplitude is None or (
+        found.amplitude.growth != "linear" and found.linear is not None and found.linear.share >= 0.9
+    ):
+        return ""
+    return found.amplitude.sentence
 
 
 def _subsystem(mass: dict[str, float]) -> str:

@@ -7,11 +7,15 @@ import json
 import numpy as np
 import pytest
 
-from diagnosis import ResidualModel
+from diagnosis import Case, Experiment, ResidualModel
+from diagnosis.distortion import period_of, periodic_findings
+from diagnosis.regimes import motions
 from diagnosis.where import subsystem_mass, where
-from plant import EFFECTS
+from diagnosis.where_sentences import best_curve
+from plant import EFFECTS, multisine, multisine_lines, simulate
+from plant.effects import CoulombFriction, HardeningSpring, LinkStiffness, TipPayload
 from tests.diagnosis.recorded import recorded_case
-from tests.diagnosis.synthetic_residuals import DT, made, white
+from tests.diagnosis.synthetic_residuals import DT, MODEL, PERIOD, RIG, inputs, made, white
 
 
 def _sum(a, b):
@@ -50,6 +54,125 @@ def test_a_band_is_found_in_the_sensor_it_was_put_in():
     assert f"between {band.low_Hz:g} and {band.high_Hz:g} Hz" in found.sentences["frequency"]
     tip = next(s.gap for s in found.sensors if s.sensor == "tip")
     assert tip.interval[0] <= 2.0 <= tip.interval[1]
+
+
+def test_a_gap_near_reversals_is_found_there():
+    base = white(np.random.default_rng(5))
+    near = {name: motion.near_reversal for name, motion in motions(made(base), base).items()}
+
+    def more_noise(name, T):
+        # Independent of the white part: its own stream, twice the noise, only near reversals.
+        extra = 2.0 * np.random.default_rng(len(name)).standard_normal(T)
+        return np.column_stack([extra * near[name], np.zeros(T)])
+
+    residuals = _gap(more_noise)
+    case = made(residuals)
+    found = where(case, residuals)
+    reversal = next(r for r in found.regimes if r.axis == "reversal" and r.sensor == "hub_angle")
+    assert reversal.found
+    # mean of e^2 is 1 away from reversals and 1 + 4 near them
+    away, at = reversal.bins
+    for regime, energy in ((away, 1.0), (at, 5.0)):
+        assert regime.energy == pytest.approx(energy, rel=5 * np.sqrt(2 / regime.samples))
+    assert "near reversals" in found.sentences["regimes"]
+    assert not any(r.found for r in found.regimes if r.sensor == "tip")
+
+
+def test_a_drift_is_found_with_its_rate():
+    rate = 0.5 * 8e-4  # m/s: half a noise deviation per second, 2 to 3.5 at the end of a record
+
+    def drift(name, T):
+        return np.column_stack([np.zeros(T), rate / 8e-4 * DT * np.arange(T)])
+
+    residuals = _gap(drift)
+    found = where(made(residuals), residuals)
+    (tip,) = (d for d in found.drift if d.found)
+    assert tip.sensor == "tip"
+    # Student with three degrees of freedom: 99.9 % at 12.9 standard errors, 95 % at 3.18.
+    half = (tip.interval[1] - tip.interval[0]) / 2
+    assert abs(tip.rate - rate) < 12.9 / 3.18 * half
+    assert "drifts away" in found.sentences["time"]
+    curve = best_curve(found.curves)
+    assert (curve.route, curve.axis) == ("tip", "time")
+
+
+def _of_effect(*effects):
+    """Residuals of noisy records of a rig with effects against the nominal rig."""
+    noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
+    rng = np.random.default_rng(8)
+    residuals = {
+        name: (simulate(RIG, voltage, effects, rng=rng).output - MODEL[name]) / noise
+        for name, voltage in inputs().items()
+    }
+    return where(made(residuals), residuals)
+
+
+def test_a_torque_that_depends_on_the_angle_is_read_off():
+    k3 = 0.05
+    found = _of_effect(HardeningSpring(cubic_Nm_rad3=k3))
+    curve = next(c for c in found.curves if (c.route, c.axis) == ("hub_torque", "angle"))
+    assert curve.found
+    assert curve.share > 0.9
+    assert curve.share == pytest.approx(max(c.share for c in found.curves), abs=0.02)
+    # The curve at its outermost node against -k3 theta^3, within a third: piecewise linear, first order.
+    theta, torque = curve.centres[-1], curve.values[-1]
+    assert torque == pytest.approx(-k3 * theta**3, rel=0.35)
+
+
+def test_linear_and_nonlinear_causes_are_told_apart():
+    heavier = _of_effect(TipPayload(mass_kg=0.02))
+    assert heavier.linear.share > 0.9
+    assert "follows the voltage linearly" in heavier.headline
+    friction = _of_effect(CoulombFriction(torque_Nm=0.01))
+    assert friction.linear.share < 0.6
+    assert friction.amplitude.exponent < 0.5
+
+
+def test_a_periodic_record_shows_the_response_and_the_distortion():
+    found = _of_effect(LinkStiffness(ratio=0.9))
+    (periodic,) = found.periodic
+    assert (periodic.experiment, periodic.period_samples, periodic.periods) == ("multisine", PERIOD, 2)
+    assert any(b.found for b in periodic.bands)
+    # A linear machine answers at no line that was not excited, and every line below 35 Hz is.
+    assert not any(g.found for g in periodic.groups)
+    assert not periodic.even_odd_separable
+
+
+def test_even_and_odd_distortion_come_apart_on_an_odd_multisine():
+    rng = np.random.default_rng(4)
+    lines = multisine_lines(PERIOD, DT, (0.2, 12.0), "odd_random", rng)
+    voltage = multisine(lines, PERIOD, 0.8, rng, periods=3)
+    noise = rng.standard_normal((voltage.size, 2))
+    even = np.tile(0.5 * np.sqrt(2) * np.cos(2 * np.pi * 20 / PERIOD * np.arange(PERIOD)), 3)
+    output = simulate(RIG, voltage).output
+    residual = noise + np.column_stack([np.zeros_like(even), even])
+    experiments = [
+        Experiment(name, role, voltage, output + residual * (1e-3, 8e-4), "multisine")
+        for name, role in (("odd", "estimation"), ("again", "held_out"))
+    ]
+    case = Case("odd", RIG, tuple(experiments))
+    finding = periodic_findings(case, {"odd": residual, "again": residual}, 0.01)[0]
+    assert finding.even_odd_separable
+    found = {(g.sensor, g.group) for g in finding.groups if g.found}
+    assert found == {("tip", "not excited, even")}
+    assert "even distortion" in finding.sentence
+    # Noise that does not repeat, measured without the rig file: 1 within its own 99.99 %.
+    low, high = finding.unrepeated_interval
+    assert all(abs(u - 1) < 2 * (high - low) for u in finding.unrepeated)
+
+
+@pytest.mark.parametrize(
+    ("signal", "period"),
+    [
+        (np.tile(np.sin(np.arange(50.0)), 4), 50),
+        (np.r_[np.tile(np.sin(np.arange(50.0)), 3), np.sin(np.arange(20.0))], 50),
+        (np.sin(np.arange(200.0) ** 1.5), 0),
+        (np.zeros(200), 0),
+        (np.ones(200), 0),
+    ],
+)
+def test_period_of_an_input(signal, period):
+    assert period_of(signal) == period
 
 
 def test_a_result_is_json():
@@ -119,3 +242,34 @@ def test_recorded_case_without_effect_has_no_place(gap_cases):
 def test_recorded_saturation_shows_in_the_one_experiment_that_saturates(gap_cases):
     found = _recorded(gap_cases, "actuator_saturation")
     assert [x.experiment for x in found.experiments if x.gap.found] == ["experiments/03_multisine.csv"]
+
+
+@pytest.mark.parametrize(
+    ("name", "route", "axis"),
+    [("gravity", "hub_torque", "angle"), ("sensor_drift", "tip", "time")],
+)
+def test_recorded_gap_is_read_as_a_function_of_its_own_variable(gap_cases, name, route, axis):
+    curve = best_curve(_recorded(gap_cases, name).curves)
+    assert (curve.route, curve.axis) == (route, axis)
+    assert curve.share > 0.95
+
+
+def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):
+    found = _recorded(gap_cases, "coulomb_friction")
+    curve = next(c for c in found.curves if (c.route, c.axis) == ("hub_torque", "speed"))
+    assert curve.found
+    # The node below which half the samples of a side lie: a torque against the motion on both sides.
+    backwards = [v for x, v in zip(curve.centres, curve.values, strict=True) if x < 0][-1]
+    forwards = [v for x, v in zip(curve.centres, curve.values, strict=True) if x > 0][0]
+    assert backwards > 0 > forwards
+    assert found.amplitude.growth == "offset"
+
+
+@pytest.mark.parametrize(
+    ("name", "linear"),
+    [("tip_payload", True), ("input_delay", True), ("link_stiffness", True), ("backlash", False)],
+)
+def test_recorded_linear_causes_are_called_linear(gap_cases, name, linear):
+    found = _recorded(gap_cases, name)
+    assert (found.linear.share > 0.9) == linear
+    assert (found.linear.share < 0.6) == (not linear)
