@@ -1,0 +1,1 @@
+"""The blind protocol: cases from a simulator of its own, labels under seal, predictions, then scores."""

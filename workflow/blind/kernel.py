@@ -1,0 +1,420 @@
+"""Compiled time stepping of the blind protocol's machine: classical Runge-Kutta, four stages.
+
+Rotary bodies are base, motor side, hub and link root; a matrix maps the free angles to these four, so that a
+rigid coupling is a missing coordinate and not a stiff spring.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Real = npt.NDArray[np.float64]
+
+BASE, MOTOR, HUB, ROOT = 0, 1, 2, 3
+
+
+class Physics(NamedTuple):
+    """Constants of a machine in SI units; an effect that is absent has its neutral value."""
+
+    # rig
+    radius_m: float
+    length_m: float
+    kelvin_voigt_s: float
+    motor_inertia: float
+    hub_inertia: float
+    viscous: float
+    gear: float
+    torque_constant: float
+    back_emf: float
+    resistance: float
+    gravity: float
+    # joint
+    dry_static: float  # of two friction elements, as in the README: Coulomb ...
+    dry_minus: float  # ... its level in the negative direction ...
+    stribeck_static: float
+    stribeck_coulomb: float
+    stribeck_velocity: float
+    pre_sliding: float
+    ripple: float
+    ripple_cycles: float
+    ripple_phase: float
+    disturbance: float
+    disturbance_omega: float
+    disturbance_phase: float
+    cubic_spring: float
+    linear_spring: float
+    joint_stiffness: float
+    joint_damping: float
+    base_stiffness: float
+    base_damping: float
+    base_inertia: float
+    play: float  # negative: none
+    contact_stiffness: float
+    contact_damping: float
+    # voltage and motor
+    lag: float
+    inductance: float
+    current_limit: float
+    cogging: float
+    cogging_cycles: float
+    cogging_phase: float
+    heating_1_s: float
+    # link and sensor
+    drag: float  # N s^2/m^3
+    sensor_lag: float
+
+
+@numba.njit(cache=True)
+def _level(p: Physics, speed: float) -> float:
+    fall = np.exp(-abs(speed) / p.stribeck_velocity)
+    return float(p.stribeck_coulomb + (p.stribeck_static - p.stribeck_coulomb) * fall)
+
+
+@numba.njit(cache=True)
+def _clipped(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+@numba.njit(cache=True)
+def _coulomb(p: Physics, stretch: float) -> float:
+    """Stretch of the pre-sliding spring after the slider has moved along."""
+    return _clipped(stretch, -p.pre_sliding * p.dry_minus / max(p.dry_static, 1e-300), p.pre_sliding)
+
+
+@numba.njit(cache=True)
+def _stribeck(p: Physics, stretch: float, speed: float) -> float:
+    limit = p.pre_sliding * _level(p, speed) / max(p.stribeck_static, 1e-300)
+    return _clipped(stretch, -limit, limit)
+
+
+@numba.njit(cache=True)
+def _accelerations(
+    p: Physics,
+    couple: Real,
+    angle: Real,
+    arms: Real,
+    integral: Real,
+    lumps: Real,
+    weights: Real,
+    stiffness: Real,
+    q: Real,
+    v: Real,
+    current: float,
+    voltage: float,
+    time: float,
+    dry: Real,
+    from_angle: float,
+    work: Real,
+    M: Real,
+    a: Real,
+) -> float:
+    """Fill a with the accelerations; returns the derivative of the motor current."""
+    G, n = angle.shape
+    R = couple.shape[1]
+    size = R + n
+    body = np.zeros(4)
+    speed = np.zeros(4)
+    for i in range(4):
+        for k in range(R):
+            body[i] += couple[i, k] * q[k]
+            speed[i] += couple[i, k] * v[k]
+    alpha, alpha_dot = body[ROOT], speed[ROOT]
+    # Directions in the frame of the link root.
+    cosine, sine, bend_x, bend_y = work[0], work[1], work[2], work[3]
+    for h in range(G):
+        turn = 0.0
+        rate = alpha_dot
+        for i in range(n):
+            turn += angle[h, i] * q[R + i]
+            rate += angle[h, i] * v[R + i]
+        cosine[h] = np.cos(turn)
+        sine[h] = np.sin(turn)
+        bend_x[h] = -rate * rate * cosine[h]
+        bend_y[h] = -rate * rate * sine[h]
+    for i in range(size):
+        a[i] = 0.0
+        for j in range(size):
+            M[i, j] = 0.0
+    ux, uy = np.cos(alpha), -np.sin(alpha)  # direction of in-plane gravity in this frame
+    dx, dy = work[4], work[5]
+    for g in range(G + 1):
+        x, y = p.radius_m, 0.0
+        bx, by = -p.radius_m * alpha_dot * alpha_dot, 0.0
+        for h in range(G):
+            w = integral[g, h]
+            x += w * cosine[h]
+            y += w * sine[h]
+            bx += w * bend_x[h]
+            by += w * bend_y[h]
+        dx[0], dy[0] = -y, x
+        for i in range(n):
+            sx, sy = 0.0, 0.0
+            for h in range(G):
+                w = arms[i, g, h]
+                sx -= w * sine[h]
+                sy += w * cosine[h]
+            dx[1 + i], dy[1 + i] = sx, sy
+        lump = lumps[g]
+        fx, fy = lump * (p.gravity * ux - bx), lump * (p.gravity * uy - by)
+        if p.drag > 0.0 and g < G:
+            vx, vy = dx[0] * alpha_dot, dy[0] * alpha_dot
+            for i in range(n):
+                vx += dx[1 + i] * v[R + i]
+                vy += dy[1 + i] * v[R + i]
+            drag = p.drag * weights[g] * np.sqrt(vx * vx + vy * vy)
+            fx -= drag * vx
+            fy -= drag * vy
+        # Root first; it is spread over the free angles below.
+        root_force = dx[0] * fx + dy[0] * fy
+        root_mass = lump * (dx[0] * dx[0] + dy[0] * dy[0])
+        for k in range(R):
+            c = couple[ROOT, k]
+            if c != 0.0:
+                a[k] += c * root_force
+                for m in range(R):
+                    M[k, m] += c * couple[ROOT, m] * root_mass
+        for i in range(n):
+            a[R + i] += dx[1 + i] * fx + dy[1 + i] * fy
+            coupling = lump * (dx[0] * dx[1 + i] + dy[0] * dy[1 + i])
+            for k in range(R):
+                M[R + i, k] += couple[ROOT, k] * coupling
+            for j in range(i + 1):
+                M[R + i, R + j] += lump * (dx[1 + i] * dx[1 + j] + dy[1 + i] * dy[1 + j])
+    for i in range(n):
+        a[R + i] -= stiffness[i] * (q[R + i] + p.kelvin_voigt_s * v[R + i])
+    # Motor, between base and motor side.
+    slip = speed[MOTOR] - speed[BASE]
+    shaft = body[MOTOR] - body[BASE]
+    kt = p.torque_constant
+    if p.cogging != 0.0:
+        kt *= 1.0 + p.cogging * np.cos(p.cogging_cycles * shaft + p.cogging_phase)
+    resistance = p.resistance * (1.0 + p.heating_1_s * time)
+    drive = voltage - p.gear * p.back_emf * slip
+    current_rate = 0.0
+    if p.inductance > 0.0:
+        current_rate = (drive - resistance * current) / p.inductance
+        amps = current
+    else:
+        amps = drive / resistance
+    amps = _clipped(amps, -p.current_limit, p.current_limit)
+    torque = p.gear * kt * amps - p.viscous * slip
+    if p.dry_static > 0.0:
+        stretch = _coulomb(p, dry[0] + shaft - from_angle)
+        torque -= p.dry_static / p.pre_sliding * stretch
+    if p.stribeck_static > 0.0:
+        stretch = _stribeck(p, dry[1] + shaft - from_angle, slip)
+        torque -= p.stribeck_static / p.pre_sliding * stretch
+    if p.ripple != 0.0:
+        torque += p.ripple * np.sin(p.ripple_cycles * shaft + p.ripple_phase)
+    force = np.zeros(4)
+    force[MOTOR] += torque
+    force[BASE] -= torque + p.base_stiffness * body[BASE] + p.base_damping * speed[BASE]
+    force[MOTOR] -= p.cubic_spring * body[MOTOR] ** 3 + p.linear_spring * body[MOTOR]
+    if p.disturbance != 0.0:
+        force[HUB] += p.disturbance * np.sin(p.disturbance_omega * time + p.disturbance_phase)
+    twist = p.joint_stiffness * (alpha - body[HUB]) + p.joint_damping * (alpha_dot - speed[HUB])
+    force[HUB] += twist
+    force[ROOT] -= twist
+    if p.play >= 0.0:
+        lead = body[MOTOR] - body[HUB]
+        closing = speed[MOTOR] - speed[HUB]
+        push = 0.0
+        if lead > 0.5 * p.play:
+            push = max(p.contact_stiffness * (lead - 0.5 * p.play) + p.contact_damping * closing, 0.0)
+        elif lead < -0.5 * p.play:
+            push = -max(p.contact_stiffness * (-lead - 0.5 * p.play) - p.contact_damping * closing, 0.0)
+        force[MOTOR] -= push
+        force[HUB] += push
+    for k in range(R):
+        for i in range(4):
+            a[k] += couple[i, k] * force[i]
+        for m in range(R):
+            M[k, m] += (
+                couple[BASE, k] * couple[BASE, m] * p.base_inertia
+                + couple[MOTOR, k] * couple[MOTOR, m] * p.motor_inertia
+                + couple[HUB, k] * couple[HUB, m] * p.hub_inertia
+            )
+    # Cholesky in the lower triangle, then the two triangular systems.
+    for j in range(size):
+        for k in range(j):
+            M[j, j] -= M[j, k] * M[j, k]
+        M[j, j] = np.sqrt(M[j, j])
+        for i in range(j + 1, size):
+            for k in range(j):
+                M[i, j] -= M[i, k] * M[j, k]
+            M[i, j] /= M[j, j]
+    for i in range(size):
+        for k in range(i):
+            a[i] -= M[i, k] * a[k]
+        a[i] /= M[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            a[i] -= M[k, i] * a[k]
+        a[i] /= M[i, i]
+    return current_rate
+
+
+@numba.njit(cache=True)
+def _outputs(p: Physics, couple: Real, angle: Real, integral: Real, q: Real) -> tuple[float, float]:
+    """Hub angle as an encoder sees it, and (r + L) theta + deflection across the turned hub axis."""
+    G, n = angle.shape
+    R = couple.shape[1]
+    base, hub, root = 0.0, 0.0, 0.0
+    for k in range(R):
+        base += couple[BASE, k] * q[k]
+        hub += couple[HUB, k] * q[k]
+        root += couple[ROOT, k] * q[k]
+    x, y = p.radius_m, 0.0
+    for h in range(G):
+        turn = 0.0
+        for i in range(n):
+            turn += angle[h, i] * q[R + i]
+        x += integral[G, h] * np.cos(turn)
+        y += integral[G, h] * np.sin(turn)
+    ahead = root - hub
+    deflection = x * np.sin(ahead) + y * np.cos(ahead)
+    return hub - base, (p.radius_m + p.length_m) * hub + deflection
+
+
+@numba.njit(cache=True)
+def run(
+    p: Physics,
+    couple: Real,
+    angle: Real,
+    integral: Real,
+    lumps: Real,
+    weights: Real,
+    stiffness: Real,
+    acting: Real,
+    commanded: Real,
+    late_s: float,
+    dt_s: float,
+    substeps: int,
+    feedback: Real,
+    static: Real,
+    hub_noise: Real,
+    reference: Real,
+    delay_samples: int,
+    outputs: Real,
+) -> bool:
+    """Step through T samples; outputs (T, 2) hub angle and tip behind a sensor lag, before every other error.
+
+    acting: (T,) voltage behind the static part of the amplifier, which acts late_s + delay_samples dt later;
+    with a `feedback` of (proportional, derivative, filter pole) that is not empty, `commanded` and `acting`
+    are filled in on the way: the command of row k + 1 is computed from the noisy hub angle of row k.
+    static: (gain, dead zone, limit, cubic part). Returns whether everything stayed finite and within a turn.
+    """
+    G, n = angle.shape
+    R = couple.shape[1]
+    size = R + n
+    arms = np.empty((n, G + 1, G))
+    for i in range(n):
+        for g in range(G + 1):
+            for h in range(G):
+                arms[i, g, h] = integral[g, h] * angle[h, i]
+    q, v = np.zeros(size), np.zeros(size)
+    q_stage, v_stage = np.zeros(size), np.zeros(size)
+    kv = np.zeros((4, size))
+    kq = np.zeros((4, size))
+    ki = np.zeros(4)
+    M = np.zeros((size, size))
+    work = np.zeros((6, max(G, n + 1) + 1))
+    dry = np.zeros(2)
+    current, filtered, seen_tip, rate = 0.0, 0.0, 0.0, 0.0
+    before = 0.0
+    fractions = np.array([0.0, 0.5, 0.5, 1.0])
+    T = commanded.size
+    for k in range(T):
+        hub, tip = _outputs(p, couple, angle, integral, q)
+        if not (abs(hub) < 7.0 and abs(tip) < 50.0):
+            return False
+        outputs[k, 0] = hub
+        outputs[k, 1] = seen_tip if p.sensor_lag > 0.0 else tip
+        if feedback.size:
+            measured = hub + hub_noise[k]
+            rate = feedback[2] * rate + (1 - feedback[2]) * (measured - before) / dt_s
+            before = measured
+            if k + 1 < T:
+                command = feedback[0] * (reference[k] - measured) - feedback[1] * rate
+                commanded[k + 1] = np.round(command * 1e4) * 1e-4
+                value = static[0] * commanded[k + 1]
+                value += static[3] * value**3
+                size_V = min(max(abs(value) - static[1], 0.0), static[2])
+                acting[k + 1] = size_V if value >= 0 else -size_V
+        for piece in range(2):
+            span = late_s if piece == 0 else dt_s - late_s
+            if span <= 1e-12:
+                continue
+            at = k - delay_samples - (1 if piece == 0 else 0)
+            held = acting[at] if at >= 0 else 0.0
+            begin = k * dt_s + (0.0 if piece == 0 else late_s)
+            count = max(1, int(np.ceil(substeps * span / dt_s - 1e-9)))
+            step = span / count
+            for s in range(count):
+                time = begin + s * step
+                shaft = 0.0
+                for m in range(R):
+                    shaft += (couple[MOTOR, m] - couple[BASE, m]) * q[m]
+                for stage in range(4):
+                    f = fractions[stage] * step
+                    amps = current
+                    if stage == 0:
+                        for i in range(size):
+                            q_stage[i], v_stage[i] = q[i], v[i]
+                    else:
+                        for i in range(size):
+                            q_stage[i] = q[i] + f * kq[stage - 1, i]
+                            v_stage[i] = v[i] + f * kv[stage - 1, i]
+                        amps = current + f * ki[stage - 1]
+                    voltage = held
+                    if p.lag > 0.0:
+                        voltage = held + (filtered - held) * np.exp(-f / p.lag)
+                    for i in range(size):
+                        kq[stage, i] = v_stage[i]
+                    ki[stage] = _accelerations(
+                        p,
+                        couple,
+                        angle,
+                        arms,
+                        integral,
+                        lumps,
+                        weights,
+                        stiffness,
+                        q_stage,
+                        v_stage,
+                        amps,
+                        voltage,
+                        time + f,
+                        dry,
+                        shaft,
+                        work,
+                        M,
+                        kv[stage],
+                    )
+                for i in range(size):
+                    q[i] += step / 6 * (kq[0, i] + 2 * kq[1, i] + 2 * kq[2, i] + kq[3, i])
+                    v[i] += step / 6 * (kv[0, i] + 2 * kv[1, i] + 2 * kv[2, i] + kv[3, i])
+                current += step / 6 * (ki[0] + 2 * ki[1] + 2 * ki[2] + ki[3])
+                current = _clipped(current, -p.current_limit, p.current_limit)
+                if p.lag > 0.0:
+                    filtered = held + (filtered - held) * np.exp(-step / p.lag)
+                turned, slip = -shaft, 0.0
+                for m in range(R):
+                    turned += (couple[MOTOR, m] - couple[BASE, m]) * q[m]
+                    slip += (couple[MOTOR, m] - couple[BASE, m]) * v[m]
+                if p.dry_static > 0.0:
+                    dry[0] = _coulomb(p, dry[0] + turned)
+                if p.stribeck_static > 0.0:
+                    dry[1] = _stribeck(p, dry[1] + turned, slip)
+                if p.sensor_lag > 0.0:
+                    # Exact for a tip that moves linearly over the substep.
+                    _, now = _outputs(p, couple, angle, integral, q)
+                    slope = (now - tip) / step
+                    decay = np.exp(-step / p.sensor_lag)
+                    seen_tip = now - slope * p.sensor_lag + (seen_tip - tip + slope * p.sensor_lag) * decay
+                    tip = now
+    return True
