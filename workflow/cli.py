@@ -30,6 +30,7 @@ from workflow.errors import (
 )
 
 _EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
+_BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 app = typer.Typer(
     name="flexlink",
@@ -323,6 +324,9 @@ def study(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the study in --out; finished points are taken up.")
     ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Delete an earlier study in --out first.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
@@ -330,7 +334,9 @@ def study(
     from workflow.study.run import run_study
 
     with TerminalProgress() as progress:
-        summary = run_study(config, out, jobs=jobs, scheduler=scheduler, resume=resume, progress=progress)
+        summary = run_study(
+            config, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
+        )
     if as_json:
         _print_json(summary.to_document())
     else:
@@ -423,6 +429,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif argv is None:
         # An error is one line. Called from Python (tests!) warnings stay what the caller made of them.
         warnings.simplefilter("ignore")
+    if argv is None and not any(name in os.environ for name in _BLAS_THREADS):
+        # Matrices here are small: threads would only wait for one another, beside another busy process for
+        # most of the time. Read by the libraries when they load, which is after this line.
+        os.environ.update(dict.fromkeys(_BLAS_THREADS, "1"))
     if not arguments:
         arguments = ["--help"]
     try:

@@ -15,6 +15,7 @@ from control_design.specification import Specification
 from control_design.synthesis import SynthesisOptions
 from ident.embedding import EmbeddingOptions
 from ident.options import IdentOptions
+from workflow.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
 from workflow.excitations import Excitation
 from workflow.rig_settings import EffectTable, RigChoice
 from workflow.settings import InputPath, check, read_toml
@@ -221,10 +222,11 @@ class ClosedLoopOptions(Section):
     measurement_step: float = Field(0.0, ge=0, description="step of the measured output, e.g. an encoder's")
     duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
+    sensitivity: bool = Field(True, description="on the simulated arm: measure S, predicted beside measured")
     conditions: bool = Field(
         True,
-        description="on the simulated arm: measure S, and run slew, push at the tip, payloads 0 to 200 %, "
-        "delay, friction, coarse converters and a step beyond the voltage limit",
+        description="on the simulated arm: run slew, push at the tip, payloads 0 to 200 %, delay, friction, "
+        "coarse converters and a step beyond the voltage limit",
     )
 
 
@@ -244,6 +246,11 @@ class RunConfig(Section):
     closed_loop_data: ClosedLoopData = Field(default_factory=ClosedLoopData)
     specification: Specification
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
+    certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
+    yardstick: YardstickOptions = Field(default_factory=lambda: YardstickOptions.model_validate({}))
+    prefilter: PrefilterSettings | None = Field(
+        None, description="second degree of freedom; none: the reference goes to the loop as it is"
+    )
     closed_loop: ClosedLoopOptions = Field(default_factory=ClosedLoopOptions)
     notes: Notes = Field(default_factory=Notes)
 

@@ -32,7 +32,8 @@ from ident.model_files import FORMAT, ModelFile
 from ident.options import IdentOptions
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow import storage
-from workflow.config import Section
+from workflow.config import RunConfig, Section
+from workflow.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
 from workflow.errors import InputError, naming
 from workflow.pipeline import config_of
 from workflow.run_directory import RunDirectory
@@ -122,6 +123,9 @@ class DesignFile:
     synthesis: SynthesisOptions | None = None
     plant: PlantSection = field(default_factory=PlantSection)
     uncertainty: StatedUncertainty | None = None
+    certificate: CertificateOptions | None = None
+    yardstick: YardstickOptions | None = None
+    prefilter: PrefilterSettings | None = None
     path: Path | None = None
 
     @property
@@ -131,10 +135,18 @@ class DesignFile:
 
 def read_design_file(path: Path) -> DesignFile:
     """TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
-    [uncertainty] and [synthesis]; of a run's configuration specification and synthesis are taken. Raises
-    InputError."""
+    [uncertainty], [synthesis], [certificate], [yardstick] and [prefilter]; of a run's configuration all of
+    these but the first two are taken. Raises InputError."""
     _, document = read_toml(path)
-    known = {"specification", "plant", "uncertainty", "synthesis"}
+    known = {
+        "specification",
+        "plant",
+        "uncertainty",
+        "synthesis",
+        "certificate",
+        "yardstick",
+        "prefilter",
+    }
     if "specification" not in document:
         wanted = {key: value for key, value in document.items() if key not in known}
     else:
@@ -154,19 +166,27 @@ def read_design_file(path: Path) -> DesignFile:
         synthesis=table("synthesis", SynthesisOptions),
         plant=table("plant", PlantSection) or PlantSection.model_validate({}),
         uncertainty=table("uncertainty", StatedUncertainty),
+        certificate=table("certificate", CertificateOptions),
+        yardstick=table("yardstick", YardstickOptions),
+        prefilter=table("prefilter", PrefilterSettings),
         path=path,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class DesignSource:
-    """A plant as read; remarks say what is worth knowing about it; a run brings its own specification."""
+    """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
+    options (`config`)."""
 
     plant: UncertainPlant
     origin: str
     remarks: tuple[str, ...] = ()
-    specification: Specification | None = None
-    synthesis: SynthesisOptions | None = None
+    config: RunConfig | None = None
+
+    @property
+    def specification(self) -> Specification | None:
+        """What the run was asked for."""
+        return None if self.config is None else self.config.specification
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
@@ -206,12 +226,7 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
     if path.is_dir():
         run = RunDirectory.open(path)
         config = config_of(run)
-        return DesignSource(
-            load_plant(run, config),
-            "run directory",
-            specification=config.specification,
-            synthesis=config.synthesis,
-        )
+        return DesignSource(load_plant(run, config), "run directory", config=config)
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _measured(path, design)

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from control_design.c_code import c_source
-from control_design.certificate import Certificate, certify
+from control_design.certificate import Certificate
 from control_design.controller import Controller
 from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis_result import Outcome
-from control_design.youla import youla_bracket
 from ident.record import Record
 from workflow import storage
 from workflow.config import RunConfig, SimulatedSource, load_config
+from workflow.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
 from workflow.design_source import DesignFile, DesignSource, load_sources, read_design_file
 from workflow.errors import InputError, naming
 from workflow.pipeline import config_of, run_pipeline
 from workflow.progress import Progress
 from workflow.randomness import stage_rng
+from workflow.reference_filter import find_prefilter, prefilter_bytes, prefilter_file, prefilter_of
 from workflow.run_directory import RunDirectory, default_directory
 from workflow.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 from workflow.summary import (
@@ -36,7 +37,15 @@ from workflow.summary import (
     Section,
     certificate_rows,
     design_rows,
+    gamma_of,
+    prefilter_sections,
+    whole_rows,
+    yardstick_rows,
 )
+from workflow.whole_responses import certify_whole, joint_numbers
+from workflow.yardstick import bracket_numbers, find_bracket, order_advice
+
+BetweenPoints = Literal["nothing", "linear"]
 
 
 def built_in_config() -> tuple[RunConfig, str]:
@@ -144,6 +153,81 @@ _CONTROLLER_FILES: dict[str, Callable[[Controller], bytes]] = {
 }
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """What a design is to be: from the design file, else from the first plant's run, else the defaults."""
+
+    specification: Specification
+    synthesis: SynthesisOptions
+    certificate: CertificateOptions
+    yardstick: YardstickOptions
+    prefilter: PrefilterSettings | None
+
+    @classmethod
+    def of(cls, file: DesignFile, run: RunConfig | None, paths: Sequence[Path]) -> _Asked:
+        """Raises InputError where nothing says what to design for."""
+        specification = file.specification
+        if specification is None:
+            if len(paths) > 1:
+                raise InputError(f"{len(paths)} plants, no specification for all of them: give --spec FILE")
+            if run is None:
+                raise InputError(f"{paths[0]} holds no specification: give --spec FILE")
+            specification = run.specification
+        if run is None:
+            return cls(
+                specification,
+                file.synthesis or SynthesisOptions(),
+                file.certificate or CertificateOptions.model_validate({}),
+                file.yardstick or YardstickOptions.model_validate({}),
+                file.prefilter,
+            )
+        return cls(
+            specification,
+            file.synthesis or run.synthesis,
+            file.certificate or run.certificate,
+            file.yardstick or run.yardstick,
+            # A design file without [prefilter] asks for none; it has no other way to.
+            run.prefilter if file.path is None else file.prefilter,
+        )
+
+
+@dataclass(frozen=True)
+class _Designed:
+    """Documents of a design, as the stages of a run leave them, and the controller itself."""
+
+    design: dict[str, Any]
+    yardstick: dict[str, Any]
+    certificate: Certificate | None = None
+    controller: Controller | None = None
+    whole: Mapping[str, Any] = field(default_factory=dict)
+    prefilter: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _design(
+    plants: Sequence[UncertainPlant], asked: _Asked, between_own_points: BetweenPoints, seed: int
+) -> _Designed:
+    with naming("design"):
+        try:
+            result = synthesise(plants, asked.specification, asked.synthesis, rng=stage_rng(seed, "design"))
+        except SpecificationError as impossible:
+            reason = f"specification not met: {impossible}"
+            return _Designed({"synthesis": None, "met": False, "reason": reason}, {})
+        design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": result.explain()}
+        yardstick = find_bracket(plants, asked.specification, asked.yardstick)
+        if result.outcome is Outcome.NOT_CONVERGED:
+            return _Designed(design, yardstick)
+        certificate, whole = certify_whole(
+            result.controller,
+            plants,
+            asked.specification,
+            asked.certificate,
+            stage_rng(seed, "certify"),
+            between_own_points=between_own_points,
+        )
+        prefilter = find_prefilter(result.controller, plants, asked.prefilter)
+        return _Designed(design, yardstick, certificate, result.controller, whole, prefilter)
+
+
 def design_controller(
     sources: Path | Sequence[Path],
     specification_path: Path | None,
@@ -154,63 +238,30 @@ def design_controller(
     """Design and certify one controller for one or several plants (files: `workflow.design_source`).
 
     Without a design file the source must be a run directory, whose own specification is taken. With `out` the
-    controller is written, by its ending as JSON, MAT file or C source; one that is not certified carries that
-    in its name. A specification that no controller can meet is a result (not certified, the reason in
-    `verdict`), as in a run. Raises InputError.
+    controller is written, by its ending as JSON, MAT file or C source, and beside it a prefilter if there is
+    one; a controller that is not certified carries that in its name. A specification that no controller can
+    meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
     """
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(path) for path in sources]
     if not paths:
         raise InputError("nothing to design for: give at least one run directory or file with a plant")
     if out is not None:
-        if out.suffix.lower() not in _CONTROLLER_FILES:
-            raise InputError(f"--out {out}: the ending must be one of {', '.join(_CONTROLLER_FILES)}")
-        storage.check_writable(out)
-        if out.absolute() in [path.absolute() for path in paths]:
-            raise InputError(f"--out {out} is a source; give the controller a name of its own")
+        _check_out(out, paths)
     for path in paths:
         if not path.exists():
             raise InputError(f"cannot read {path}: no such file or directory")
-    asked = read_design_file(specification_path) if specification_path is not None else DesignFile()
-    found = load_sources(paths, asked)
-    specification, options = asked.specification, asked.synthesis or found[0].synthesis or SynthesisOptions()
-    if specification is None:
-        if len(paths) > 1:
-            raise InputError(f"{len(paths)} plants, no specification for all of them: give --spec FILE")
-        specification = found[0].specification
-    if specification is None:
-        raise InputError(f"{paths[0]} holds no specification: give --spec FILE")
+    file = read_design_file(specification_path) if specification_path is not None else DesignFile()
+    found = load_sources(paths, file)
+    asked = _Asked.of(file, found[0].config, paths)
     plants = [source.plant for source in found]
-    certificate: Certificate | None = None
-    advice: str | None = None
-    design: dict[str, Any]
-    with naming("design"):
-        try:
-            result = synthesise(plants, specification, options, rng=stage_rng(seed, "design"))
-        except SpecificationError as impossible:
-            reason = f"specification not met: {impossible}"
-            design = {"synthesis": None, "met": False, "reason": reason}
-        else:
-            reason = result.explain()
-            design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": reason}
-            if result.outcome is Outcome.NOT_CONVERGED:
-                reason = f"{reason}; {_NO_CONTROLLER}"
-            else:
-                certificate = certify(
-                    result.controller, plants, specification, between_own_points=asked.plant.between_points
-                )
-                if result.outcome is Outcome.NOT_MET:
-                    advice = order_advice(plants, specification, result.gamma)
-            if certificate is not None and out is not None:
-                written = result.controller
-                if not certificate.certified:
-                    written = replace(written, name=f"{written.name} (NOT CERTIFIED)")
-                storage.write_bytes(out, _CONTROLLER_FILES[out.suffix.lower()](written))
+    done = _design(plants, asked, file.plant.between_points, seed)
+    certificate, order = done.certificate, asked.specification.controller_order
     certified = certificate is not None and certificate.certified
-    if certificate is not None and not certified:
-        missed = [item.sentence() for item in certificate.items if not item.met]
-        reason = "not certified: " + ("; ".join(missed) or "unstable, or an ellipse reaches -1")
-        if advice is not None:
-            reason += f"; {advice}"
+    files = _write_controller(done, out) if out is not None and done.controller is not None else []
+    gamma, advice = gamma_of(done.design), None
+    if gamma is not None and gamma > 1:
+        advice = order_advice(done.yardstick, gamma, order)
+    reason = _reason(done, advice)
     verdict = {
         "certificate": None if certificate is None else certificate.to_dict(),
         "certified": certified,
@@ -225,18 +276,71 @@ def design_controller(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
         sections=(
             Section("plants", tuple(row for source in found for row in _plant_rows(source))),
-            Section("design", (*design_rows(design), *([Row("order", advice)] if advice else []))),
-            Section("certificate", (*certificate_rows(verdict), *_not_checked_rows(certificate))),
+            Section(
+                "design",
+                (
+                    *design_rows(done.design),
+                    *yardstick_rows(done.yardstick, done.design, order),
+                    *([Row("order", advice)] if advice else []),
+                ),
+            ),
+            Section(
+                "certificate",
+                (*certificate_rows(verdict), *whole_rows(done.whole), *_not_checked_rows(certificate)),
+            ),
+            *prefilter_sections(done.prefilter),
+            *([Section("written", tuple(Row("", str(path)) for path in files))] if files else []),
         ),
         numbers={
             "plants": about,
-            "design": {**design, "order_advice": advice},
+            "design": {**done.design, "order_advice": advice},
+            "yardstick": bracket_numbers(done.yardstick, gamma),
             **verdict,
-            "file": str(out) if out is not None and certificate else None,
+            "whole_responses": joint_numbers(done.whole),
+            "prefilter": done.prefilter.get("prefilter"),
+            "file": str(files[0]) if files else None,
+            "prefilter_file": str(files[1]) if len(files) > 1 else None,
         },
         certified=certified,
         verdict=reason,
     )
+
+
+def _check_out(out: Path, sources: Sequence[Path]) -> None:
+    """Refuse a place for the controller before anything is computed."""
+    if out.suffix.lower() not in _CONTROLLER_FILES:
+        raise InputError(f"--out {out}: the ending must be one of {', '.join(_CONTROLLER_FILES)}")
+    storage.check_writable(out)
+    for path in (out, prefilter_file(out)):
+        if path.absolute() in [source.absolute() for source in sources]:
+            raise InputError(f"--out {out}: {path} is a source; give the controller a name of its own")
+
+
+def _write_controller(done: _Designed, out: Path) -> list[Path]:
+    """The controller, and beside it the prefilter; the files written."""
+    written, suffix = done.controller, out.suffix.lower()
+    assert written is not None
+    if done.certificate is None or not done.certificate.certified:
+        written = replace(written, name=f"{written.name} (NOT CERTIFIED)")
+    content = {out: _CONTROLLER_FILES[suffix](written)}
+    prefilter = prefilter_of(done.prefilter)
+    if prefilter is not None:
+        content[prefilter_file(out)] = prefilter_bytes(prefilter, suffix)
+    for path, data in content.items():
+        storage.write_bytes(path, data)
+    return list(content)
+
+
+def _reason(done: _Designed, advice: str | None) -> str:
+    """How the design stands, in one line."""
+    certificate, reason = done.certificate, str(done.design["reason"])
+    if certificate is None:
+        return reason if done.design["synthesis"] is None else f"{reason}; {_NO_CONTROLLER}"
+    if certificate.certified:
+        return reason
+    missed = [item.sentence() for item in certificate.items if not item.met]
+    text = "not certified: " + ("; ".join(missed) or "unstable, or an ellipse reaches -1")
+    return f"{text}; {advice}" if advice else text
 
 
 def _not_checked_rows(certificate: Certificate | None) -> list[Row]:
@@ -246,29 +350,3 @@ def _not_checked_rows(certificate: Certificate | None) -> list[Row]:
 
 def _plant_rows(source: DesignSource) -> list[Row]:
     return [Row(source.plant.name, source.origin), *(Row("", remark) for remark in source.remarks)]
-
-
-def order_advice(plants: Sequence[UncertainPlant], specification: Specification, gamma: float) -> str | None:
-    """Whether a higher order could meet what was missed, from the Youla bracket; None where it says nothing.
-
-    The bracket knows neither structure nor damping of the controller's poles, and with several plants it is
-    what one controller per plant reaches: more than that no order gives.
-    """
-    try:
-        bracket = youla_bracket(plants, specification)
-    except (ValueError, ArithmeticError):  # plants the parametrisation cannot take; the verdict stands alone
-        return None
-    reached = bracket.ellipse
-    if not np.isfinite(reached):
-        return None
-    order = specification.controller_order
-    if reached > 1.0:
-        return (
-            f"a higher order does not help: a controller of very high order reaches {reached:.4g} here "
-            f"(this one {gamma:.4g}, 1 is needed); ask for less"
-        )
-    several = ", one for each plant" if len(plants) > 1 else ""
-    return (
-        f"controller_order = {order} is too low: controllers of very high order{several} reach {reached:.4g} "
-        f"(this one {gamma:.4g}, at most 1 is needed)"
-    )

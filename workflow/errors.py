@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 EXIT_OK = 0
 EXIT_INTERNAL = 1
 EXIT_BAD_INPUT = 2
@@ -48,11 +46,14 @@ def naming(where: str) -> Iterator[None]:
     The rooms raise `ValueError` for what the user gave. `LinAlgError` is a `ValueError` too, but it is the
     computation that failed there and not the input, so it becomes a `StageError`.
     """
+    # Not at the top: the command line settles how many threads numpy takes before numpy is loaded.
+    from numpy.linalg import LinAlgError
+
     try:
         yield
     except (InputError, StageError):
         raise
-    except np.linalg.LinAlgError as error:
+    except LinAlgError as error:
         raise StageError(f"{where}: linear algebra failed: {error}") from error
     except ValueError as error:
         # Some complaints of the rooms begin with the file already.

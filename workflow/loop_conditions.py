@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from control_design.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate
 from control_design.controller import Controller
+from control_design.prefilter import Prefilter
 from ident.uncertainty import ResponsePosterior
 from plant import Rig, parse_effect
 from plant import simulate as simulate_arm
@@ -108,8 +109,9 @@ class _Pushed:
 class ConditionBench:
     """Everything the conditions share.
 
-    reference: (T,) step after a lead-in; options: effects and steps of the closed-loop check; rng: noise of
-    run number k comes from the k-th spawned generator.
+    reference: (T,) step after a lead-in; prefilter: what every reference goes through, if any; options:
+    effects and steps of the closed-loop check; rng: noise of run number k comes from the k-th spawned
+    generator.
     """
 
     controller: Controller
@@ -120,6 +122,7 @@ class ConditionBench:
     reference: Real
     measured: int
     rng: np.random.Generator
+    prefilter: Prefilter | None = None
 
     @property
     def effects(self) -> dict[str, dict[str, Any]]:
@@ -147,7 +150,7 @@ class ConditionBench:
         if holds:
             law = replace(law, computational_delay_samples=law.computational_delay_samples - 1)
         machine: SampledMachine = model if clip is None else ClippedMachine(model, clip)
-        run = simulate(law, machine, reference, output_disturbance=output_disturbance)
+        run = simulate(law, machine, self._given(reference), output_disturbance=output_disturbance)
         if holds:
             return replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
         return run
@@ -172,11 +175,15 @@ class ConditionBench:
         return simulate(
             law or self.controller,
             machine,
-            reference,
+            self._given(reference),
             measured_index=self.measured,
             measurement_step=measurement,
             command_step=command,
         )
+
+    def _given(self, reference: Real) -> Real:
+        """What the loop is given for a reference."""
+        return reference if self.prefilter is None else self.prefilter.filtered(reference)
 
     @property
     def step(self) -> float:

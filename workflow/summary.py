@@ -8,7 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from workflow.config import RunConfig
+from workflow.reference_filter import prefilter_of, prefilter_words
 from workflow.run_directory import RunDirectory
+from workflow.stages.results import load_document
+from workflow.whole_responses import joint_numbers, joint_words
+from workflow.yardstick import bracket_numbers, order_advice, yardstick_words
 
 
 @dataclass(frozen=True)
@@ -73,13 +77,16 @@ def summarise(run: RunDirectory, config: RunConfig) -> RunSummary:
             )
         )
     design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
+    yardstick, prefilter = (load_document(run, name) for name in ("yardstick", "prefilter"))
+    order = config.specification.controller_order
     unit = _unit(documents["records"], config.control_channel.output)
     command_unit = _unit(documents["records"], config.control_channel.input)
     sections = (
         Section("records", record_rows(documents["records"])),
         *channels,
-        Section("design", design_rows(design)),
-        Section("certificate", certificate_rows(certify)),
+        Section("design", (*design_rows(design), *yardstick_rows(yardstick, design, order))),
+        Section("certificate", (*certificate_rows(certify), *whole_rows(certify.get("whole", {})))),
+        *prefilter_sections(prefilter),
         Section("closed loop", closed_loop_rows(loop, unit, command_unit)),
     )
     certified = (
@@ -97,18 +104,32 @@ def summarise(run: RunDirectory, config: RunConfig) -> RunSummary:
             ],
             "design": {"met": design["met"], "reason": design["reason"], **_gamma(design)},
             "certificate": certify["certificate"],
+            "yardstick": bracket_numbers(yardstick, gamma_of(design)),
+            "whole_responses": joint_numbers(certify.get("whole", {})),
+            "prefilter": prefilter.get("prefilter"),
             "closed_loop": loop,
         },
         certified=certified,
-        verdict=verdict_of(design, certify, loop),
+        verdict=verdict_of(design, certify, loop, yardstick, order),
         report_path=str(run.report_path) if run.report_path.is_file() else None,
     )
 
 
-def verdict_of(design: Mapping[str, Any], certify: Mapping[str, Any], loop: Mapping[str, Any]) -> str:
-    """One line: certified, or what is missed, by how much and at which frequency."""
+def verdict_of(
+    design: Mapping[str, Any],
+    certify: Mapping[str, Any],
+    loop: Mapping[str, Any],
+    yardstick: Mapping[str, Any] | None = None,
+    order: int | None = None,
+) -> str:
+    """One line: certified, or what is missed, by how much and at which frequency, and, where the yardstick is
+    given, whether a higher order would help."""
     if not design["met"]:
-        return f"specification not met: {design['reason']}"
+        gamma = gamma_of(design)
+        advice = None
+        if yardstick is not None and order is not None and gamma is not None:
+            advice = order_advice(yardstick, gamma, order)
+        return f"specification not met: {design['reason']}" + (f"; {advice}" if advice else "")
     if not certify["certified"]:
         return f"not certified: {certify['reason']}"
     if loop["skipped"] is not None:
@@ -245,6 +266,34 @@ def certificate_rows(certify: Mapping[str, Any]) -> tuple[Row, ...]:
         value = f"{_text(item['achieved'])} against {_text(item['required'])} {item['unit']}".rstrip()
         rows.append(Row(item["requirement"], f"{value}{where}: {state}"))
     return tuple(rows)
+
+
+def gamma_of(design: Mapping[str, Any]) -> float | None:
+    """Weighted worst case of the design on its own grid; None without a controller."""
+    synthesis = design["synthesis"]
+    return None if synthesis is None else float(synthesis["gamma"])
+
+
+def yardstick_rows(yardstick: Mapping[str, Any], design: Mapping[str, Any], order: int) -> tuple[Row, ...]:
+    """How far the order chosen is from what any order could reach."""
+    words = yardstick_words(yardstick, gamma_of(design), order)
+    return (Row("against any order", words),) if words else ()
+
+
+def whole_rows(whole: Mapping[str, Any]) -> tuple[Row, ...]:
+    """For how many whole responses the worst case holds."""
+    words = joint_words(whole)
+    return (Row("whole responses", words),) if words else ()
+
+
+def prefilter_sections(document: Mapping[str, Any]) -> tuple[Section, ...]:
+    """The prefilter, if one was asked for."""
+    words = prefilter_words(document)
+    if words is None:
+        return ()
+    found = prefilter_of(document)
+    label = "none" if found is None else "model matching"
+    return (Section("prefilter", (Row(label, words),)),)
 
 
 def margin_text(margins: Mapping[str, Any]) -> str:

@@ -11,8 +11,10 @@ import numpy as np
 from control_design.certificate import certify
 from control_design.closed_loop import ClosedLoopTrajectory as LoopTrajectory
 from control_design.controller import Controller
+from control_design.joint_coverage import JointCoverage
 from control_design.plant_set import Channel, UncertainPlant
 from control_design.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
+from control_design.youla import PlantBracket, YoulaBracket
 from ident.basis import basis_response
 from ident.identify import Identification
 from ident.model import GobfModel
@@ -357,10 +359,13 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
     )
     document = {"synthesis": result.to_dict(), "met": met, "reason": result.explain()}
     run.save_stage("design", StageData(document=document), "00")
+    run.save_stage("yardstick", StageData(document=bracket_document()), "00")
+    run.save_stage("prefilter", StageData(document={"prefilter": None, "reason": None}), "00")
     run.save_stage(
         "certify",
         StageData(
             document={
+                "whole": whole_document(certificate.gamma),
                 "certificate": certificate.to_dict(),
                 "certified": certificate.certified,
                 "reason": "; ".join(item.sentence() for item in certificate.items if not item.met) or "met",
@@ -369,6 +374,33 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         "00",
     )
     run.save_stage("closed_loop", closed_loop_data(settings, settled), "00")
+
+
+def bracket_document(reached: float = 0.8) -> dict[str, Any]:
+    """What a controller of any order reaches, made up."""
+    return {
+        "bracket": YoulaBracket(
+            (PlantBracket("hub", reached - 0.002, reached, reached + 0.002, reached - 0.003, 0.81, 57, True),)
+        ).to_dict(),
+        "reason": None,
+    }
+
+
+def whole_document(gamma: float, *, level: float = 0.9, calibrated: bool = False) -> dict[str, Any]:
+    """Whole responses, made up: the worst case holds for 990 of 1000."""
+    joint = JointCoverage(
+        coverage=0.95,
+        draws=1000,
+        gamma=0.99 * gamma,
+        level=level,
+        given_level=0.95,
+        gamma_given=gamma,
+        coverage_given=0.99,
+        simultaneous_given=0.4,
+        simultaneous_level=0.998,
+        stable_share=1.0,
+    )
+    return {"joint": joint.to_dict(), "calibrated": calibrated, "reason": None}
 
 
 def closed_loop_data(settings: RunConfig, settled: int, draws: int = 3) -> StageData:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from tests.workflow.command import FAST_ARM, start_flexlink
+from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
 from workflow.cli import main
 from workflow.errors import InputError
 
@@ -457,3 +460,19 @@ def test_terminal_codes_in_names_are_shown_as_text(refused, tmp_path):
     line = refused("identify", tmp_path / "log.csv", "--input", "u", "--output", "y", "--time", "t")
     assert "\x1b" not in line
     assert r"\x1b[31mu" in line
+
+
+@pytest.mark.parametrize("given", [{}, {"OMP_NUM_THREADS": "2"}])
+def test_numpy_is_loaded_after_its_threads_are_settled(given):
+    code = (
+        "import os, sys, workflow.cli; loaded = 'numpy' in sys.modules; "
+        "sys.argv = ['flexlink', '--version']; workflow.cli.main(); "
+        "print(loaded, os.environ.get('OMP_NUM_THREADS'), "
+        "os.environ.get('OPENBLAS_NUM_THREADS'))"
+    )
+    kept = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    answer = subprocess.run(
+        [sys.executable, "-c", code], env=kept | given, cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    expected = "False 2 None" if given else "False 1 1"
+    assert answer.stdout.splitlines()[-1] == expected

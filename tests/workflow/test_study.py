@@ -9,15 +9,18 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.workflow.command import FAST_ARM, start_flexlink
 from tests.workflow.study_examples import SMALL_STUDY, assert_same_study, point_bytes, write_study
 from workflow.config import load_config
+from workflow.errors import InputError
 from workflow.pipeline import config_of
 from workflow.progress import Silence
 from workflow.run_directory import RunDirectory
+from workflow.study.directory import StudyDirectory
 from workflow.study.run import run_study
 from workflow.summary import RunSummary
 
@@ -370,8 +373,40 @@ def test_places_that_are_taken_are_refused(refused, small_study, tmp_path):
     line = refused("study", "--config", study, "--out", small_study[0])
     assert "an earlier study is there" in line
     assert "--resume" in line
-    line = refused("study", "--config", study, "--out", tmp_path / "other", "--resume")
-    assert "no study is there" in line
+    for option in ("--resume", "--replace"):
+        line = refused("study", "--config", study, "--out", tmp_path / "other", option)
+        assert "no study is there" in line
+    assert (tmp_path / "other" / "thesis.tex").is_file()
+    line = refused("study", "--config", study, "--out", small_study[0], "--resume", "--replace")
+    assert "--resume and --replace contradict each other" in line
+
+
+def test_replacing_a_study_deletes_what_was_its_own_and_nothing_else(tmp_path):
+    base = SimpleNamespace(config=load_config(FAST_ARM)[0], inputs={}, digests={}, run=None)
+    first = StudyDirectory.begin(tmp_path / "out", text="first", base=base, resume=False)
+    (first.points_path / "old").mkdir()
+    (first.path / "table.csv").write_text("old")
+    (first.path / "notes.txt").write_text("mine")
+    other = SimpleNamespace(**{**vars(base), "digests": {"records": "other"}})
+    with pytest.raises(InputError, match=r"the base changed.*--replace"):
+        StudyDirectory.begin(first.path, text="second", base=other, resume=True)
+    with first.locked(), pytest.raises(InputError, match="another process is writing this study"):
+        StudyDirectory.begin(first.path, text="second", base=other, resume=False, replace=True)
+    assert (first.points_path / "old").is_dir()
+    second = StudyDirectory.begin(first.path, text="second", base=other, resume=False, replace=True)
+    held = {path.name for path in second.path.iterdir()}
+    assert held == {"study.toml", "study.json", "plants", "points", "lock", "notes.txt"}
+    assert not any(second.points_path.iterdir())
+    assert (second.path / "study.toml").read_text() == "second"
+
+
+def test_a_study_is_not_replaced_by_one_that_starts_from_a_run_in_it(tmp_path):
+    base = SimpleNamespace(config=load_config(FAST_ARM)[0], inputs={}, digests={}, run=None)
+    first = StudyDirectory.begin(tmp_path / "out", text="first", base=base, resume=False)
+    own = SimpleNamespace(**{**vars(base), "run": RunDirectory(first.points_path / "best")})
+    with pytest.raises(InputError, match="--replace would delete the base"):
+        StudyDirectory.begin(first.path, text="second", base=own, resume=False, replace=True)
+    assert (first.path / "study.json").is_file()
 
 
 def test_resuming_with_another_base_is_refused(refused, small_study, tmp_path):

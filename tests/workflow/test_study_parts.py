@@ -8,12 +8,15 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 
+from control_design.prefilter import Prefilter
 from tests.workflow.command import FAST_ARM, ROOT
+from tests.workflow.report_examples import bracket_document, whole_document
 from tests.workflow.study_examples import assert_same_study, write_study
 from workflow.config import RunConfig, load_config
 from workflow.entry import built_in_config
@@ -168,15 +171,49 @@ def test_margins_in_the_units_of_the_table():
         "closed_loop_modes": [{"omega_rad_s": 40.0, "zeta": 0.2}, {"omega_rad_s": 200.0, "zeta": 0.1}],
     }
     certify = {"certificate": {"plants": [verdict], "gamma": "inf", "gamma_bound": None}}
-    skipped = {"skipped": "why not"}
-    found = numbers_of({"synthesis": {"gamma": 0.8}}, certify, skipped, (30.0, 100.0))
+    documents = {
+        "design": {"synthesis": {"gamma": 0.8}},
+        "yardstick": {},
+        "certify": certify,
+        "prefilter": {},
+        "closed_loop": {"skipped": "why not"},
+    }
+    found = numbers_of(documents, (30.0, 100.0))
     assert found["gain_margin_dB"] == pytest.approx(6.0206, abs=1e-4)  # down to a half: the nearer side
     assert found["nominal_gain_margin_dB"] == pytest.approx(12.0412, abs=1e-4)
     assert found["phase_margin_deg"] == pytest.approx(57.29578)
     assert found["delay_margin_ms"] is None
     assert found["worst_gamma"] is None
     assert (found["mode_damping"], found["mode_omega_rad_s"]) == (0.2, 40.0)
-    assert numbers_of({"synthesis": None}, certify, skipped, None)["mode_damping"] == 0.1
+    assert (found["design_gamma"], found["any_order_gamma"], found["matching_error"]) == (0.8, None, None)
+    nothing = documents | {"design": {"synthesis": None}}
+    assert numbers_of(nothing, None)["mode_damping"] == 0.1
+
+
+def test_numbers_beyond_the_margins():
+    filtered = Prefilter(
+        np.array([[0.9]]), np.array([[0.1]]), np.array([[1.0]]), np.array([[0.0]]), 0.01, 0.95, 0.2, 3.0
+    )
+    measured = {"nominal_peak": 1.4, "measured": [{"peak": 1.42}, {"peak": 1.1}]}
+    loop = {"skipped": None, "settled_draws": 1, "draws": 1, "sensitivity": measured, "achieved": [_METRICS]}
+    documents = {
+        "design": {"synthesis": {"gamma": 0.88}},
+        "yardstick": bracket_document(0.8),
+        "certify": {"certificate": None, "whole": whole_document(0.9)},
+        "prefilter": {"prefilter": filtered.to_dict(), "reason": None},
+        "closed_loop": loop,
+    }
+    found = numbers_of(documents, None)
+    assert found["any_order_gamma"] == 0.8
+    assert found["above_any_order_percent"] == pytest.approx(10.0)
+    assert (found["whole_held_percent"], found["whole_stable_percent"]) == (99.0, 100.0)
+    assert (found["matching_error"], found["matching_error_unfiltered"]) == (0.2, 0.95)
+    assert (found["predicted_peak_sensitivity"], found["measured_peak_sensitivity"]) == (1.4, 1.42)
+
+
+_METRICS = dict.fromkeys(
+    ("settling_time_s", "rise_time_s", "overshoot_percent", "peak_command", "disturbance_peak"), 1.0
+)
 
 
 def test_picture_tells_certified_from_uncertified():

@@ -34,7 +34,10 @@ class LoopTraces:
 
 @dataclass(frozen=True, eq=False)
 class LoopScene:
-    """What was asked of the loop, and the axes' words: (name, unit) per signal."""
+    """What was asked of the loop, and the axes' words: (name, unit) per signal.
+
+    model: answer (T,) of the model that a prefilter makes the loop follow.
+    """
 
     time_s: Real
     reference: Real
@@ -43,6 +46,7 @@ class LoopScene:
     command: tuple[str, str]
     performance: tuple[str, str] | None = None
     command_limit: float | None = None
+    model: Real | None = None
 
 
 def draw_closed_loop(
@@ -182,6 +186,8 @@ def _draw_row(
         axes.plot(
             time, scene.reference[part], **style.REFERENCE_LINE, drawstyle="steps-post", label="reference"
         )
+        if scene.model is not None:
+            axes.plot(time, scene.model[part], **style.MODEL_LINE, ls=":", label="model to follow")
 
 
 def _limits(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from workflow.stages.results import (
     RunRecord,
     channel_result,
     load_certificate,
+    load_document,
     load_plant,
     load_records,
     load_synthesis,
@@ -54,7 +55,7 @@ class ChannelData:
 @dataclass(frozen=True, eq=False)
 class RunData:
     """A run's results. `synthesis`, `certificate`, `closed_loop` and `plant` are None where a run did not get
-    there."""
+    there; `yardstick`, `whole` (responses) and `prefilter` are documents of their stages, empty likewise."""
 
     config: RunConfig
     records: tuple[RunRecord, ...]
@@ -67,6 +68,9 @@ class RunData:
     plant: UncertainPlant | None
     manifest: Mapping[str, Any]
     config_text: str
+    yardstick: Mapping[str, Any] = field(default_factory=dict)
+    whole: Mapping[str, Any] = field(default_factory=dict)
+    prefilter: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def has_controller(self) -> bool:
@@ -77,6 +81,13 @@ class RunData:
     def level(self) -> float:
         """Level of the ellipses of the channel that is fed back."""
         return self.control.frequency.level
+
+    @property
+    def certified_level(self) -> float:
+        """Level of the ellipses that were certified: calibrated to whole responses where that was asked
+        for."""
+        joint = None if self.certificate is None else self.certificate.joint
+        return self.level if joint is None else max(self.level, joint.level)
 
     @property
     def control(self) -> ChannelData:
@@ -148,4 +159,7 @@ def load(run: RunDirectory, config: RunConfig) -> RunData:
         plant=load_plant(run, config) if synthesis is not None else None,
         manifest=run.manifest(),
         config_text=text.read_text(encoding="utf-8") if text.is_file() else "",
+        yardstick=load_document(run, "yardstick"),
+        whole=load_document(run, "certify").get("whole", {}),
+        prefilter=load_document(run, "prefilter"),
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from control_design.synthesis_result import Outcome
+from workflow.report.beyond_margins import order_blocks, prefilter_blocks, whole_blocks
 from workflow.report.data import RunData
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text, maybe
 from workflow.report.words import count, decibels, frequency, listing, number, percent, quantity, sentence
@@ -54,6 +55,7 @@ def design_section(data: RunData) -> Section:
             "controller_order, or improve the model where its ellipses are widest."
         )
         blocks.append(Remarks((advice,), "warning"))
+        blocks += order_blocks(data)
         return Section("design", "Controller design", "Design", tuple(blocks))
     if result.blocking:
         places = [(b.weight, b.plant, frequency(b.omega_rad_s), number(b.value, 4)) for b in result.blocking]
@@ -77,7 +79,9 @@ def design_section(data: RunData) -> Section:
             f"Closed-loop gains: nominal, worst over the {level} ellipses, and what the specification "
             "allows.",
         ),
+        *order_blocks(data),
         Code("Controller as JSON (state space, limits, anti-windup)", result.controller.to_json()),
+        *prefilter_blocks(data),
     ]
     return Section("design", "Controller design", "Design", tuple(blocks))
 
@@ -100,7 +104,7 @@ def margins_section(data: RunData) -> Section:
             "margins", "Margins and certificate", "Margins", (Text("There is no controller to certify."),)
         )
     asked = data.config.specification
-    level = percent(100 * data.level, 4)
+    level = percent(100 * data.certified_level, 4)
     blocks: list[Block] = []
     for verdict in certificate.plants:
         nominal, worst = verdict.nominal_margins, verdict.worst_margins
@@ -173,6 +177,7 @@ def margins_section(data: RunData) -> Section:
             )
         )
     blocks += [
+        *whole_blocks(data),
         Remarks(tuple(map(sentence, certificate.checked)), "good", "What was checked"),
         Remarks(tuple(map(sentence, certificate.not_checked)), "warning", "What was not checked"),
     ]
@@ -236,6 +241,11 @@ def closed_loop_section(data: RunData) -> Section:
         lead += f", commands rounded to {quantity(document['quantisation'], data.unit(channel.input))}"
     lead += f": {settled} of {draws} settled."
     blocks: list[Block] = [Text(lead)]
+    if document.get("prefiltered"):
+        words = (
+            "Every reference goes through the prefilter; the errors below are against the reference itself."
+        )
+        blocks.append(Text(words))
     if not document["tracking"]:
         blocks.append(Text("The specification asks for no tracking; the step only shows what the loop does."))
     if simulated and data.config.closed_loop.effects:

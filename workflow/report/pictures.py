@@ -352,6 +352,7 @@ def _closed_loop(data: RunData) -> Figure:
     scene = LoopScene(
         time_s=time,
         reference=reference,
+        model=data.loop_array("model"),
         disturbance=data.loop_array("disturbance"),
         output=signal(config.control_channel.output),
         command=signal(config.control_channel.input),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from workflow.report.beyond_margins import beyond_words
 from workflow.report.data import ChannelData, RunData
 from workflow.report.page import Block, Code, Section, Table, Text
 from workflow.report.words import count, frequency, listing, number, percent, sentence
@@ -44,7 +45,7 @@ def _certified(data: RunData) -> tuple[str, list[str]]:
         return "Not certified: there is no controller", [
             str(data.design.get("reason", "the run ended before design"))
         ]
-    level = percent(100 * data.level, 4)
+    level = percent(100 * data.certified_level, 4)
     if certificate.certified:
         worst = min(verdict.worst_margins.modulus for verdict in certificate.plants)
         at = min(certificate.plants, key=lambda verdict: verdict.worst_margins.modulus)
@@ -62,6 +63,7 @@ def _certified(data: RunData) -> tuple[str, list[str]]:
             f"the loop stays {number(worst)} away from -1 or farther (asked for: "
             f"{number(data.config.specification.modulus_margin)}), nearest at "
             f"{frequency(at.worst_margin_omega_rad_s)}",
+            *beyond_words(data),
         ]
     reasons = []
     for verdict in certificate.plants:
@@ -88,7 +90,7 @@ def _certified(data: RunData) -> tuple[str, list[str]]:
             f"the design comes within a factor {number(data.synthesis.gamma)} of the specification; "
             f"{first.weight} at {frequency(first.omega_rad_s)} blocks it"
         )
-    return "Not certified", reasons
+    return "Not certified", reasons + beyond_words(data)
 
 
 def _in_time(data: RunData) -> tuple[str, list[str]]:

@@ -2,7 +2,7 @@
 
 Every stage reads typed results of the stages before it, makes one library call per channel, and saves typed
 results. Read them back with `workflow.stages.results` (load_records, load_identification, load_posterior,
-load_frequency, load_empirical, load_plant, load_synthesis, load_certificate), or raw with
+load_frequency, load_empirical, load_plant, load_synthesis, load_certificate, load_document), or raw with
 `RunDirectory.load_stage(name)`, which gives a `StageData`: `.arrays` (flat names, parts separated by '/') and
 `.document` (JSON-able; non-finite floats survive). Below, k counts channels and i records, both from 0 in the
 order of the configuration unless said otherwise.
@@ -44,20 +44,29 @@ design.json
               start; met (bool); reason (one line: met, or how far, and which frequency and requirement
               block it)
 
+yardstick.json
+    document  bracket: YoulaBracket.to_dict() (what a controller of any order could reach), or null; reason
+              null or why there is none
+
 certify.json
     document  certificate: Certificate.to_dict(), or null with nothing to certify; certified (bool);
-              reason (one line)
+              reason (one line); whole: {joint: JointCoverage.to_dict()|null, calibrated (bool), reason:
+              null or why no responses were drawn}, empty with nothing to certify
+
+prefilter.json
+    document  prefilter: Prefilter.to_dict(), or null; reason: null (none asked for) or why there is none
 
 closed_loop.npz, or closed_loop.json when there was nothing to run
     document  skipped: null or the reason; machine "simulated"|"identified"; if not skipped also tracking
               (asked for), draws, settled_draws, reference_step, disturbance, quantisation,
-              measurement_step, input_limit|null, predicted: {StepMetrics.to_dict(), disturbance_peak,
-              disturbance_left, settled}, achieved: list of the same, one per draw
+              measurement_step, input_limit|null, prefiltered (bool), predicted: {StepMetrics.to_dict(),
+              disturbance_peak, disturbance_left, settled}, achieved: list of the same, one per draw
     arrays    time_s, reference, disturbance  (T,); the disturbance adds to the plant's input from T // 2 on
+              model                           (T,): answer of the prefilter's reference model, if there is one
               predicted/output, /command, /limited, /performance  (1, T): on the posterior mean
               achieved/...                    (R, T): R runs on the machine
               performance is absent without a performance channel
-    on a simulated arm also (else sensitivity null, conditions empty)
+    on a simulated arm, where asked for (else sensitivity null, conditions empty)
     document  sensitivity: {nominal_peak, nominal_omega_rad_s, certified_peak, band_rad_s, measured: [{name,
               reference_rms, peak, peak_std, omega_rad_s, off_nominal_percent, off_certified_percent,
               peak_command, limited_fraction}]}; conditions: [Condition.row()]
@@ -70,7 +79,17 @@ report.json
 
 from __future__ import annotations
 
-from workflow.stages import certify, closed_loop, design, identify, records, report, uncertainty
+from workflow.stages import (
+    certify,
+    closed_loop,
+    design,
+    identify,
+    prefilter,
+    records,
+    report,
+    uncertainty,
+    yardstick,
+)
 from workflow.stages.base import Stage, StageInput
 
 __all__ = ["STAGES", "Stage", "StageInput"]
@@ -87,6 +106,13 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage("design", ("identify", "uncertainty"), design.settings, design.design_controller, expected_s=15.0),
     Stage(
+        "yardstick",
+        ("identify", "uncertainty"),
+        yardstick.settings,
+        yardstick.find_yardstick,
+        expected_s=2.5,
+    ),
+    Stage(
         "certify",
         ("identify", "uncertainty", "design"),
         certify.settings,
@@ -94,15 +120,31 @@ STAGES: tuple[Stage, ...] = (
         expected_s=1.0,
     ),
     Stage(
+        "prefilter",
+        ("identify", "uncertainty", "design", "certify"),
+        prefilter.settings,
+        prefilter.design_filter,
+        expected_s=0.1,
+    ),
+    Stage(
         "closed_loop",
-        ("records", "identify", "uncertainty", "design", "certify"),
+        ("records", "identify", "uncertainty", "design", "certify", "prefilter"),
         closed_loop.settings,
         closed_loop.run_closed_loop,
         expected_s=5.0,
     ),
     Stage(
         "report",
-        ("records", "identify", "uncertainty", "design", "certify", "closed_loop"),
+        (
+            "records",
+            "identify",
+            "uncertainty",
+            "design",
+            "yardstick",
+            "certify",
+            "prefilter",
+            "closed_loop",
+        ),
         report.settings,
         report.write_page,
         expected_s=7.0,

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from control_design.certificate import certify
 from control_design.synthesis_result import Outcome
 from workflow.config import RunConfig
 from workflow.errors import naming
 from workflow.run_directory import StageData
 from workflow.stages.base import StageInput
 from workflow.stages.results import load_plant, load_synthesis
+from workflow.whole_responses import certify_whole
 
 
 def settings(config: RunConfig) -> Mapping[str, Any]:
-    """Nothing beyond what the stages before it depend on."""
-    return {}
+    """What is asked about whole responses."""
+    return {"certificate": config.certificate.model_dump(mode="json")}
 
 
 def certify_controller(stage: StageInput) -> StageData:
@@ -24,10 +24,16 @@ def certify_controller(stage: StageInput) -> StageData:
     result = load_synthesis(stage.results)
     if result is None or result.outcome is Outcome.NOT_CONVERGED:
         reason = stage.results.load_stage("design").document["reason"]
-        return StageData(document={"certificate": None, "certified": False, "reason": reason})
+        return StageData(document={"certificate": None, "certified": False, "reason": reason, "whole": {}})
     with naming("certify"):
         plant = load_plant(stage.results, stage.config)
-        certificate = certify(result.controller, [plant], stage.config.specification)
+        certificate, whole = certify_whole(
+            result.controller,
+            [plant],
+            stage.config.specification,
+            stage.config.certificate,
+            stage.rng("certify"),
+        )
     missed = [item.sentence() for item in certificate.items if not item.met]
     unstable = [verdict.plant for verdict in certificate.plants if not verdict.stable]
     reason = "; ".join([*(f"{name}: nominal closed loop unstable" for name in unstable), *missed])
@@ -36,5 +42,6 @@ def certify_controller(stage: StageInput) -> StageData:
             "certificate": certificate.to_dict(),
             "certified": certificate.certified,
             "reason": reason or ("every item is met" if certificate.certified else "an ellipse reaches -1"),
+            "whole": whole,
         }
     )

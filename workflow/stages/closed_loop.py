@@ -11,19 +11,24 @@ import numpy.typing as npt
 
 from control_design.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate, step_metrics
 from control_design.controller import Controller
-from control_design.plant_set import UncertainPlant
+from control_design.prefilter import Prefilter
 from control_design.stability import closed_loop_poles
-from ident.record import Record
 from ident.uncertainty import ResponsePosterior
 from workflow.config import ClosedLoopOptions, RunConfig, SimulatedSource
 from workflow.errors import naming
-from workflow.loop_conditions import ConditionBench, condition_arrays
-from workflow.loop_sensitivity import measure_on, plan_sensitivity, sensitivity_row
+from workflow.reference_filter import model_answer, prefilter_of
 from workflow.run_directory import StageData
 from workflow.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 from workflow.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
+from workflow.stages.arm_checks import check_on_arm
 from workflow.stages.base import StageInput
-from workflow.stages.results import load_plant, load_posterior, load_records, load_synthesis
+from workflow.stages.results import (
+    fitted_records,
+    load_document,
+    load_plant,
+    load_posterior,
+    load_synthesis,
+)
 
 Real = npt.NDArray[np.float64]
 
@@ -47,7 +52,7 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
 @dataclass(frozen=True, eq=False)
 class Trial:
     """What is asked of the loop: reference step after the lead-in, input disturbance from half-way on; (T,)
-    each."""
+    each. prefiltered: the reference behind the prefilter, which the loop is then given; None without one."""
 
     time_s: Real
     reference: Real
@@ -55,6 +60,7 @@ class Trial:
     step: float
     half: int
     tracking: bool
+    prefiltered: Real | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +97,8 @@ def run_closed_loop(stage: StageInput) -> StageData:
             return StageData(
                 document={"skipped": "the nominal closed loop is unstable", "machine": config.machine}
             )
-        trial = make_trial(stage, controller.dt_s, radius)
+        prefilter = prefilter_of(load_document(stage.results, "prefilter"))
+        trial = make_trial(stage, controller.dt_s, radius, prefilter)
         posterior = load_posterior(stage.results, config.control_index)
         performance = config.performance_index
         tip = None if performance is None else load_posterior(stage.results, performance)
@@ -102,7 +109,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
             if config.machine == "simulated"
             else run_on_posterior(stage, controller, posterior, tip, trial)
         )
-        beyond = _beyond_the_trial(stage, controller, plant, posterior, trial, certificate)
+        beyond = check_on_arm(stage, controller, prefilter, plant, posterior, trial.reference[: trial.half])
     rows = describe(achieved, trial)
     document = {
         "skipped": None,
@@ -115,6 +122,7 @@ def run_closed_loop(stage: StageInput) -> StageData:
         "quantisation": config.closed_loop.quantisation,
         "measurement_step": config.closed_loop.measurement_step,
         "input_limit": controller.input_limit,
+        "prefiltered": prefilter is not None,
         "predicted": describe(predicted, trial)[0],
         "achieved": rows,
         **beyond.document,
@@ -127,92 +135,19 @@ def run_closed_loop(stage: StageInput) -> StageData:
         **achieved.arrays("achieved"),
         **beyond.arrays,
     }
+    if prefilter is not None and config.prefilter is not None:
+        model = config.prefilter.reference_model
+        arrays["model"] = model_answer(model, trial.reference, controller.dt_s)
     return StageData(arrays, document)
 
 
-def _beyond_the_trial(
-    stage: StageInput,
-    controller: Controller,
-    plant: UncertainPlant,
-    posterior: ResponsePosterior,
-    trial: Trial,
-    certificate: Mapping[str, Any],
-) -> StageData:
-    """S measured on the arm, and the loop under other conditions; nothing where the arm is not simulated."""
-    config = stage.config
-    source = config.source
-    if not (isinstance(source, SimulatedSource) and config.machine == "simulated"):
-        return StageData(document={"sensitivity": None, "conditions": []})
-    if not config.closed_loop.conditions:
-        return StageData(document={"sensitivity": None, "conditions": []})
-    options = config.closed_loop
-    measured = OUTPUT_NAMES.index(config.control_channel.output)
-    stage.progress.update("closed_loop", 0.8, "sensitivity")
-    certified = float(certificate["certificate"]["plants"][0]["worst_peak_sensitivity"])
-    plan = plan_sensitivity(controller, plant, certified, _fitted_records(stage), trial.half)
-    arms: list[tuple[str, tuple[dict[str, Any], ...], bool]] = [
-        ("arm as identified", (), False),
-        ("arm as identified, a tenth of the size", (), True),
-    ]
-    if options.effects:
-        arms.append(("arm of the closed-loop check", options.effects, False))
-    rows, arrays = [], {}
-    for number, (name, effects, small) in enumerate(arms):
-        arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
-        found = measure_on(
-            ClippedMachine(arm, FINITE),
-            controller,
-            plan,
-            stage.rng("closed_loop", "sensitivity", str(number)),
-            measured_index=measured,
-            measurement_step=options.measurement_step,
-            command_step=options.quantisation,
-            small=small,
-        )
-        rows.append(sensitivity_row(name, found, plan))
-        at = f"sensitivity/{number}"
-        arrays[f"{at}/omega_rad_s"] = found.omega_rad_s
-        arrays[f"{at}/magnitude"] = np.abs(found.response)
-        arrays[f"{at}/std"] = found.std
-    stage.progress.update("closed_loop", 0.9, "conditions")
-    conditions = ConditionBench(
-        controller=controller,
-        posterior=posterior,
-        source=source,
-        options=options,
-        rig=rig_of(source),
-        reference=trial.reference[: trial.half],
-        measured=measured,
-        rng=stage.rng("closed_loop", "conditions"),
-    ).run_all()
-    document = {
-        "sensitivity": {
-            "nominal_peak": plan.nominal_peak,
-            "nominal_omega_rad_s": plan.nominal_omega_rad_s,
-            "certified_peak": plan.certified_peak,
-            "band_rad_s": list(plan.band_rad_s),
-            "measured": rows,
-        },
-        "conditions": [condition.row() for condition in conditions],
-    }
-    return StageData({**arrays, **condition_arrays(conditions)}, document)
-
-
-def _fitted_records(stage: StageInput) -> list[Record]:
-    """The estimation records of the channel that is fed back."""
-    channel = stage.config.control_channel
-    return [
-        item.record.siso(channel.input, channel.output)
-        for item in load_records(stage.results)
-        if item.role == "estimation"
-    ]
-
-
-def make_trial(stage: StageInput, dt_s: float, pole_radius: float) -> Trial:
+def make_trial(
+    stage: StageInput, dt_s: float, pole_radius: float, prefilter: Prefilter | None = None
+) -> Trial:
     """Half the record for the step, half for the disturbance, each long enough for the slowest closed-loop
     pole."""
     options, config = stage.config.closed_loop, stage.config
-    used = _fitted_records(stage)
+    used = fitted_records(stage.results, config)
     if options.duration_s is not None:
         samples = round(options.duration_s / dt_s)
     else:
@@ -225,14 +160,16 @@ def make_trial(stage: StageInput, dt_s: float, pole_radius: float) -> Trial:
         disturbance = 0.1 * float(np.sqrt(np.mean([np.var(r.input) for r in used])))
     k = np.arange(samples)
     half = samples // 2
+    reference = np.where(k >= round(_LEAD_IN * samples), step, 0.0)
     return Trial(
         time_s=np.asarray(k * dt_s, dtype=np.float64),
-        reference=np.where(k >= round(_LEAD_IN * samples), step, 0.0),
+        reference=reference,
         disturbance=np.where(k >= half, disturbance, 0.0),
         step=step,
         half=half,
         tracking=config.specification.bandwidth_rad_s is not None
         or config.specification.sensitivity_weight is not None,
+        prefiltered=None if prefilter is None else prefilter.filtered(reference),
     )
 
 
@@ -329,7 +266,7 @@ def _loop(
     return simulate(
         controller,
         machine,
-        trial.reference,
+        trial.reference if trial.prefiltered is None else trial.prefiltered,
         measured_index=measured,
         input_disturbance=disturbance,
         measurement_step=0.0 if steps is None else steps.measurement_step,

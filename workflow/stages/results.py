@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from control_design.certificate import Certificate
 from control_design.plant_set import Channel as PlantChannel
@@ -38,6 +40,16 @@ def load_records(run: RunDirectory) -> list[RunRecord]:
             about["remark"],
         )
         for index, about in enumerate(data.document["records"])
+    ]
+
+
+def fitted_records(run: RunDirectory, config: RunConfig) -> list[Record]:
+    """The estimation records of the channel that is fed back."""
+    channel = config.control_channel
+    return [
+        item.record.siso(channel.input, channel.output)
+        for item in load_records(run)
+        if item.role == "estimation"
     ]
 
 
@@ -127,3 +139,8 @@ def load_certificate(run: RunDirectory) -> Certificate | None:
     """The certificate, or None where there is no controller to certify."""
     document = run.load_stage("certify").document
     return Certificate.from_dict(document["certificate"]) if document["certificate"] else None
+
+
+def load_document(run: RunDirectory, stage: str) -> Mapping[str, Any]:
+    """The document of a stage; empty where the run was made before there was such a stage."""
+    return {} if run.stage_file(stage) is None else run.load_stage(stage).document

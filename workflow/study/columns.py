@@ -7,6 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from workflow.reference_filter import prefilter_of
+from workflow.summary import gamma_of
+from workflow.whole_responses import joint_numbers
+from workflow.yardstick import bracket_numbers
+
 Number = float | int | None
 
 
@@ -42,6 +47,14 @@ _ALL = (
     Column("settled_draws", "runs that settle"),
     Column("draws", "runs"),
     Column("design_gamma", "gamma of the design", "", "smaller"),
+    Column("any_order_gamma", "gamma of any order", "", "smaller"),
+    Column("above_any_order_percent", "above any order", "%", "smaller"),
+    Column("whole_held_percent", "whole responses within gamma", "%", "larger"),
+    Column("whole_stable_percent", "whole responses stable", "%", "larger"),
+    Column("matching_error", "model-matching error", "", "smaller"),
+    Column("matching_error_unfiltered", "model-matching error without prefilter", "", "smaller"),
+    Column("predicted_peak_sensitivity", "peak of S, predicted", "", "smaller"),
+    Column("measured_peak_sensitivity", "peak of S, measured", "", "smaller"),
     Column("nominal_modulus_margin", "modulus margin, nominal", "", "larger"),
     Column("nominal_gain_margin_dB", "gain margin, nominal", "dB", "larger"),
     Column("nominal_phase_margin_deg", "phase margin, nominal", "deg", "larger"),
@@ -51,19 +64,30 @@ COLUMNS: Mapping[str, Column] = {column.name: column for column in _ALL}
 
 
 def numbers_of(
-    design: Mapping[str, Any],
-    certify: Mapping[str, Any],
-    loop: Mapping[str, Any],
+    documents: Mapping[str, Mapping[str, Any]],
     mode_band_rad_s: tuple[float, float] | None,
 ) -> dict[str, Number]:
-    """Numbers of a point from the documents of its stages; None where there is none.
+    """Numbers of a point from the documents of its stages by name; None where there is none.
 
     Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
-    loop, inside the band of the specification where it names one.
+    loop, inside the band of the specification where it names one. The measured peak of S is that of the arm
+    that was identified, at the larger of two sizes.
     """
+    design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
     if design["synthesis"] is not None:
         found["design_gamma"] = design["synthesis"]["gamma"]
+    bracket = bracket_numbers(documents["yardstick"], gamma_of(design))
+    found["any_order_gamma"] = bracket["reached"]
+    found["above_any_order_percent"] = bracket["above_percent"]
+    whole = joint_numbers(certify.get("whole", {}))
+    if "draws" in whole:
+        found["whole_held_percent"] = 100.0 * whole["coverage_given"]
+        found["whole_stable_percent"] = 100.0 * whole["stable_share"]
+    prefilter = prefilter_of(documents["prefilter"])
+    if prefilter is not None:
+        found["matching_error"] = prefilter.error_after
+        found["matching_error_unfiltered"] = prefilter.error_before
     certificate = certify["certificate"]
     if certificate is not None:
         verdict = certificate["plants"][0]
@@ -88,6 +112,10 @@ def numbers_of(
             values = [row[name] for row in loop["achieved"]]
             # A run that never gets there has no time: neither has the point.
             found[name] = None if None in values else max(values)
+        sensitivity = loop.get("sensitivity")
+        if sensitivity:
+            found["predicted_peak_sensitivity"] = sensitivity["nominal_peak"]
+            found["measured_peak_sensitivity"] = sensitivity["measured"][0]["peak"]
     return found
 
 

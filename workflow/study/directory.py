@@ -14,6 +14,7 @@ match what they would be made from now, so a killed study goes on where it stood
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,6 +34,18 @@ from workflow.summary import summarise
 
 LAYOUT_VERSION = 1
 
+# study.json goes last when a study is deleted: after a kill in between it is still a study, with less in it.
+_OWN_ENTRIES = (
+    "study.html",
+    "table.csv",
+    "table.json",
+    "pareto.svg",
+    "points",
+    "plants",
+    "study.toml",
+    "study.json",
+)
+
 
 @dataclass(frozen=True)
 class StudyDirectory:
@@ -41,11 +54,15 @@ class StudyDirectory:
     path: Path
 
     @classmethod
-    def begin(cls, path: Path, *, text: str, base: Base, resume: bool) -> StudyDirectory:
-        """A new or empty directory, or with `resume` the study that is there.
+    def begin(
+        cls, path: Path, *, text: str, base: Base, resume: bool, replace: bool = False
+    ) -> StudyDirectory:
+        """A new or empty directory, with `resume` the study that is there, with `replace` afresh in its
+        place.
 
         Raises InputError: not writable, not empty, holding something else, or begun with another base (axes
-        and search may change: points are found again by their content).
+        and search may change: points are found again by their content). With `replace` also where the base
+        is a run of the study that would be deleted, or another process is writing it.
         """
         study = cls(Path(path))
         document = {
@@ -56,18 +73,24 @@ class StudyDirectory:
         }
         held = study._held()
         if held and "study.json" not in held:
-            what = "no study is there" if resume else "not empty"
+            what = "no study is there" if resume or replace else "not empty"
             raise InputError(f"{path}: {what} (it holds {min(held)!r}); choose another --out")
-        if held and not resume:
+        if held and not (resume or replace):
             raise InputError(
-                f"{path}: an earlier study is there; choose another --out or continue it with --resume"
+                f"{path}: an earlier study is there; choose another --out, continue it with --resume or "
+                "start it afresh with --replace"
             )
-        if held:
+        if held and replace:
+            study._refuse_own_base(base)
+            with study.locked():  # never under the hands of a living study
+                study._discard()
+        elif held:
             earlier = storage.read_json(study.path / "study.json")
             changed = first_difference(earlier, storage.encode(document))
             if changed:
                 raise InputError(
-                    f"{path}: cannot resume, the base changed at {changed}; choose another --out"
+                    f"{path}: cannot resume, the base changed at {changed}; choose another --out or start "
+                    "afresh with --replace"
                 )
         try:
             for folder in (study.path, study.plants_path, study.points_path):
@@ -77,6 +100,21 @@ class StudyDirectory:
         storage.write_text(study.path / "study.toml", text)
         storage.write_json(study.path / "study.json", document)
         return study
+
+    def _refuse_own_base(self, base: Base) -> None:
+        if base.run is not None and self.path.resolve() in base.run.path.resolve().parents:
+            raise InputError(
+                f"{self.path}: --replace would delete the base, {base.run.path}; choose another --out"
+            )
+
+    def _discard(self) -> None:
+        """Delete what a study wrote here; files of others stay."""
+        for name in _OWN_ENTRIES:
+            entry = self.path / name
+            if entry.is_dir():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink(missing_ok=True)
 
     def discard_if_empty(self) -> None:
         """Take back what `begin` wrote if neither a plant nor a point is there: a corrected base may come."""

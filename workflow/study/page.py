@@ -16,12 +16,17 @@ from workflow.study.settings import Axis, ParetoPlot, StudyConfig
 
 _SHOWN = (
     "worst_gamma",
+    "any_order_gamma",
+    "whole_held_percent",
     "modulus_margin",
     "gain_margin_dB",
     "phase_margin_deg",
     "delay_margin_ms",
     "bandwidth_rad_s",
     "mode_damping",
+    "predicted_peak_sensitivity",
+    "measured_peak_sensitivity",
+    "matching_error",
     "rise_time_s",
     "overshoot_percent",
     "peak_command",
@@ -134,11 +139,13 @@ def _pareto_blocks(
 
 
 def _table(axes: Sequence[Axis], rows: Sequence[PointRow], units: Mapping[str, str]) -> Table:
-    heads = [_heading(COLUMNS[name], units) for name in _SHOWN]
+    # A column that no point has a number in was not asked for.
+    shown = [name for name in _SHOWN if any(row.numbers[name] is not None for row in rows)]
+    heads = [_heading(COLUMNS[name], units) for name in shown]
     cells = []
     for row in rows:
         asked = [short(row.values[axis.key]) for axis in axes]
-        numbers = [_cell(row.numbers[name]) for name in _SHOWN]
+        numbers = [_cell(row.numbers[name]) for name in shown]
         settled = row.numbers["settled_draws"]
         runs = "" if settled is None else f"{settled} of {row.numbers['draws']}"
         cells.append((str(row.number), *asked, *numbers, runs, row.state))
@@ -146,7 +153,12 @@ def _table(axes: Sequence[Axis], rows: Sequence[PointRow], units: Mapping[str, s
         ("point", *(axis.name for axis in axes), *heads, "settle", "state"),
         tuple(cells),
         caption="Left of the worst-case gamma what was asked, right of it what came of it: margins and "
-        "bandwidth are the worst over the ellipses, closed-loop numbers the worst over the runs.",
+        "bandwidth are the worst over the ellipses, closed-loop numbers the worst over the runs. Gamma at "
+        "most 1: the specification is met. Gamma of any order: what a controller of any order is known to "
+        "reach. "
+        "Whole responses within gamma: share of the responses drawn from the posterior whose own worst value "
+        "is no larger than that of the ellipses. Peak of S: predicted for the nominal loop, measured on the "
+        "arm as identified, with all its friction.",
         met=tuple(row.good for row in rows),
     )
 

@@ -23,7 +23,9 @@ from workflow.study.keys import last_name, with_values
 from workflow.study.settings import Axis, StudyConfig
 
 PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
-POINT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("design", "certify", "closed_loop"))
+POINT_STAGES: tuple[Stage, ...] = tuple(
+    s for s in STAGES if s.name in ("design", "yardstick", "certify", "prefilter", "closed_loop")
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from workflow.run_directory import RunDirectory
+from workflow.stages.results import load_document
 from workflow.study.columns import COLUMNS, Number, numbers_of
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot
-from workflow.summary import verdict_of
+from workflow.summary import gamma_of, verdict_of
+from workflow.yardstick import order_advice
 
 State = Literal["certified", "does not settle", "not certified", "impossible", "failed"]
 
@@ -48,7 +50,9 @@ class PointRow:
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
     assert point.config is not None
-    design, certify, loop = (run.load_stage(name).document for name in ("design", "certify", "closed_loop"))
+    stages = ("design", "yardstick", "certify", "prefilter", "closed_loop")
+    documents = {name: load_document(run, name) for name in stages}
+    design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
     state: State
     if design["synthesis"] is None:
         state = "impossible"
@@ -58,9 +62,13 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         state = "does not settle"
     else:
         state = "certified"
-    numbers = numbers_of(design, certify, loop, point.config.specification.mode_band_rad_s)
+    numbers = numbers_of(documents, point.config.specification.mode_band_rad_s)
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
     why = certify["reason"]
+    gamma = gamma_of(design)
+    if gamma is not None and gamma > 1:
+        advice = order_advice(documents["yardstick"], gamma, point.config.specification.controller_order)
+        why = f"{why}; {advice}" if advice else why
     if certify["certified"]:
         why = verdict_of({**design, "met": True}, certify, loop)
     return PointRow(point.number, point.name, point.values, state, why, numbers)

@@ -48,9 +48,12 @@ def run_study(
     jobs: int | None = None,
     scheduler: str | None = None,
     resume: bool = False,
+    replace: bool = False,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Compute every point of a study into `out`, then table and page; the table's numbers in the summary.
+
+    `resume` takes up the study that is there, `replace` deletes it first (when all that was given is right).
 
     jobs: processes of this machine (default: one per processor). scheduler: address of a Dask scheduler whose
     workers compute the points; what the points share is still computed here. A point that cannot be certified
@@ -60,6 +63,8 @@ def run_study(
     (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
     """
     progress = progress or Silence()
+    if resume and replace:
+        raise InputError("--resume and --replace contradict each other")
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     if jobs is not None and scheduler is not None:
@@ -79,7 +84,7 @@ def run_study(
         executor: Executor = here
         if scheduler is not None:
             executor = stack.enter_context(DaskCluster(scheduler))
-        directory = StudyDirectory.begin(out, text=text, base=base, resume=resume)
+        directory = StudyDirectory.begin(out, text=text, base=base, resume=resume, replace=replace)
         with directory.locked():
             work = _Work(directory, base, executor, here, progress)
             try:

@@ -1,0 +1,266 @@
+"""Any order's reach, whole responses and the prefilter: found, told, written beside the controller."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import shutil
+import subprocess
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from pydantic import ValidationError
+
+from control_design.joint_coverage import JointCoverage
+from control_design.plant_set import UncertainPlant
+from control_design.prefilter import Prefilter
+from control_design.specification import RationalWeight, Specification
+from tests.workflow.report_examples import (
+    DT_S,
+    bracket_document,
+    controller,
+    model,
+    plant,
+    posterior,
+    whole_document,
+)
+from workflow.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.errors import InputError
+from workflow.proportions import wilson_interval
+from workflow.reference_filter import (
+    find_prefilter,
+    model_answer,
+    prefilter_bytes,
+    prefilter_file,
+    prefilter_of,
+    prefilter_words,
+)
+from workflow.whole_responses import certify_whole, joint_numbers, joint_words, undrawable
+from workflow.yardstick import (
+    bracket_numbers,
+    bracket_of,
+    find_bracket,
+    order_advice,
+    yardstick_words,
+)
+
+_COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+
+def spec(**changes) -> Specification:
+    wish = {"bandwidth_rad_s": 0.1, "modulus_margin": 0.5, "controller_order": 1}
+    return Specification.model_validate(wish | changes)
+
+
+@pytest.mark.parametrize(
+    ("count", "total", "expected"),
+    [
+        # Solutions of |p - x/n| = z sqrt(p (1 - p)/n); the first row is z^2/(n + z^2) at the other end.
+        (0, 10, (0.0, 0.2775328)),
+        (5, 10, (0.2365931, 0.7634069)),
+        (10, 10, (0.7224672, 1.0)),
+        (2999, 3000, (0.9981144, 0.9999412)),
+    ],
+)
+def test_wilson_interval(count, total, expected):
+    found = wilson_interval(count, total)
+    assert found == pytest.approx(expected, abs=1e-6)
+    for end in found:
+        if 0 < end < 1:
+            off = (count / total - end) ** 2 - 1.959963985**2 * end * (1 - end) / total
+            assert abs(off) < 1e-9
+
+
+def test_wilson_interval_refuses_more_than_all():
+    with pytest.raises(ValueError, match="0 <= count <= total"):
+        wilson_interval(4, 3)
+
+
+def test_bracket_survives_its_document_without_a_hull():
+    document = json.loads(json.dumps(bracket_document(0.8)))
+    bracket = bracket_of(document)
+    assert bracket is not None
+    assert bracket.plants[0].hull is None
+    assert bracket.floor == pytest.approx(0.798)
+
+
+def test_words_of_the_yardstick():
+    document = bracket_document(0.8)
+    words = yardstick_words(document, 0.88, 4)
+    assert words is not None
+    assert "order 4: gamma 0.88, 10 % above" in words
+    assert "0.8;" in words
+    assert bracket_numbers(document, 0.88)["above_percent"] == pytest.approx(10.0)
+    assert "known to reach gamma 0.8" in str(yardstick_words(document, float("inf"), 4))
+    assert yardstick_words({}, 0.88, 4) is None, "a run made before says nothing"
+
+
+def test_advice_on_the_order():
+    assert "controller_order = 3 is too low" in str(order_advice(bracket_document(0.8), 1.2, 3))
+    assert "a higher order does not help" in str(order_advice(bracket_document(1.1), 1.2, 3))
+    assert order_advice({}, 1.2, 3) is None
+
+
+def test_yardstick_not_asked_for_or_impossible_says_why():
+    off = YardstickOptions.model_validate({"compute": False})
+    assert "compute = false" in find_bracket([plant()], spec(), off)["reason"]
+    on = YardstickOptions.model_validate({})
+    impossible = find_bracket([plant()], spec(bandwidth_rad_s=1e4), on)
+    assert impossible["bracket"] is None
+    assert "Nyquist" in impossible["reason"]
+
+
+def test_whole_responses_agree_with_drawing_them_here():
+    options = CertificateOptions.model_validate({"joint_draws": 400})
+    certificate, document = certify_whole(controller(), [plant()], spec(), options, np.random.default_rng(3))
+    numbers = joint_numbers(document)
+    # Here: the same posterior, drawn with other numbers; gamma on a grid of its own.
+    uncertain, law = posterior(model()), controller()
+    omega = np.geomspace(1e-3, np.pi / DT_S, 3000)
+    drawn = uncertain.sample(np.random.default_rng(11), 200)
+    loop = uncertain.response_of(drawn, omega) * law.response(omega)
+    weight = spec().sensitivity_magnitude(omega, DT_S, 1)
+    gamma = np.max(weight / np.abs(1 + loop), axis=1)
+    # Both are shares of about all draws: 1 % is two draws of 200.
+    assert abs(np.mean(gamma <= certificate.gamma) - numbers["held_share"]) < 0.02
+    assert numbers["stable_share"] == 1.0
+    low, high = numbers["stable_interval"]
+    assert low == pytest.approx(wilson_interval(400, 400)[0])
+    assert high == 1.0
+
+
+def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
+    asked = []
+
+    def calibrate(law, plants, specification, *, rng, coverage, draws, omega_min_rad_s):
+        asked.append(coverage)
+        return JointCoverage(coverage, draws, 0.9, 0.99, 0.95, 0.88, 0.9, 0.4, 0.998, 1.0)
+
+    monkeypatch.setattr("control_design.certificate.calibrate", calibrate)
+    found = {}
+    for wanted in (False, True):
+        options = CertificateOptions.model_validate({"calibrate": wanted, "joint_draws": 100})
+        found[wanted] = certify_whole(controller(), [plant()], spec(), options, np.random.default_rng(1))
+    assert asked == [0.95, 0.95]
+    kept, raised = found[False], found[True]
+    assert raised[0].gamma > kept[0].gamma, "ellipses of 99 % are larger"
+    assert (kept[0].joint, kept[1]["calibrated"], raised[1]["calibrated"]) == (None, False, True)
+    assert "calibrate = true" in str(joint_words(kept[1]))
+    assert "certified over ellipses of 99 %" in str(joint_words(raised[1]))
+
+
+def test_words_of_whole_responses():
+    words = str(joint_words(whole_document(0.9)))
+    assert "1000 whole responses" in words
+    assert "holds for 99 % (95 % interval 98.17 to 99.46 %)" in words
+    assert "100 % stable" in words
+    assert joint_words({}) is None
+    lost = whole_document(0.9)
+    lost["joint"] = {**lost["joint"], "gamma_given": "inf"}
+    assert "no worst case of the ellipses" in str(joint_words(lost))
+
+
+def test_what_cannot_be_drawn_says_why():
+    exact = UncertainPlant("exact", model().to_control())
+    assert "nothing to draw" in str(undrawable([exact]))
+    omega = np.array([1.0, 2.0, 5.0])
+    measured = posterior(model()).at(omega, 0.95)
+    own = UncertainPlant("measured", model().to_control(), measured)
+    assert "its own frequencies only" in str(undrawable([own]))
+    assert undrawable([plant()]) is None
+    certificate, document = certify_whole(
+        controller(), [exact], spec(), CertificateOptions.model_validate({}), np.random.default_rng(1)
+    )
+    assert certificate.joint is None
+    assert "not sampled: no uncertainty" in str(joint_words(document))
+
+
+def test_options_that_contradict_themselves():
+    with pytest.raises(ValidationError, match="joint_draws must be 0 or at least 100"):
+        CertificateOptions.model_validate({"joint_draws": 20})
+    with pytest.raises(ValidationError, match="calibrate needs joint_draws"):
+        CertificateOptions.model_validate({"joint_draws": 0, "calibrate": True})
+    with pytest.raises(ValidationError, match="either corner_rad_s or model"):
+        PrefilterSettings.model_validate({})
+    with pytest.raises(ValidationError, match="improper"):
+        PrefilterSettings.model_validate({"model": {"numerator": [1, 1], "denominator": [1]}})
+
+
+def test_model_of_a_corner_is_a_power_of_a_lag():
+    settings = PrefilterSettings.model_validate({"corner_rad_s": 3.0, "model_order": 3})
+    s = 1j * np.array([0.1, 3.0, 20.0])
+    assert settings.reference_model.at(s) == pytest.approx(1 / (s / 3 + 1) ** 3)
+
+
+def test_answer_of_the_model_settles_as_it_should():
+    lag = RationalWeight(numerator=(1.0,), denominator=(0.5, 1.0))
+    step = model_answer(lag, np.ones(400), DT_S)
+    time = np.arange(400) * DT_S
+    # Tustin's map of a lag of 50 samples: the step enters half a sample early.
+    assert step == pytest.approx(1 - np.exp(-(time + DT_S / 2) / 0.5), abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def filtered() -> dict[str, object]:
+    settings = PrefilterSettings.model_validate(
+        {"corner_rad_s": 1.0, "grid_points": 60, "mode_points": 20, "dense_points": 1000}
+    )
+    return find_prefilter(controller(), [plant()], settings)
+
+
+def test_prefilter_follows_the_model_better_than_none(filtered):
+    found = prefilter_of(filtered)
+    assert found is not None
+    assert found.error_after < 0.9 * found.error_before
+    # The nominal plant is one member: its error, computed here, cannot be above the certified one.
+    omega = np.geomspace(1e-3, np.pi / DT_S * 0.99, 2000)
+    loop = plant().channel.nominal_response(omega) * controller().response(omega)
+    s = 2j / DT_S * np.tan(omega * DT_S / 2)
+    error = np.abs(found.response(omega) * loop / (1 + loop) - 1 / (s + 1) ** 2)
+    assert error.max() <= found.error_after * 1.001
+    assert "times smaller" in str(prefilter_words(filtered))
+
+
+def test_prefilter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
+    settings = PrefilterSettings.model_validate({"corner_rad_s": 1.0})
+    document = find_prefilter(controller(500.0), [plant()], settings)
+    assert document["prefilter"] is None
+    assert str(prefilter_words(document)).startswith("no prefilter: plant 'hub'")
+    assert find_prefilter(controller(), [plant()], None) == {"prefilter": None, "reason": None}
+    with pytest.raises(InputError, match=r"prefilter\.corner_rad_s: 1000 lies beyond the Nyquist"):
+        find_prefilter(controller(), [plant()], PrefilterSettings.model_validate({"corner_rad_s": 1e3}))
+    late = PrefilterSettings.model_validate({"corner_rad_s": 1.0, "poles_rad_s": [900.0]})
+    with pytest.raises(InputError, match=r"prefilter\.poles_rad_s: 900 is not between"):
+        find_prefilter(controller(), [plant()], late)
+
+
+def test_prefilter_files(filtered, tmp_path):
+    found = prefilter_of(filtered)
+    assert found is not None
+    assert prefilter_file(Path("k.json")) == Path("k_prefilter.json")
+    again = Prefilter.from_json(prefilter_bytes(found, ".JSON").decode())
+    assert np.array_equal(again.A, found.A)
+    mat = scipy.io.loadmat(BytesIO(prefilter_bytes(found, ".mat")))
+    assert np.array_equal(mat["B"], found.B)
+    assert mat["dt_s"].item() == found.dt_s
+
+
+@pytest.mark.skipif(_COMPILER is None, reason="no C compiler (cc, gcc or clang) on this machine")
+def test_prefilter_in_c_agrees_to_1e_12(filtered, tmp_path):
+    found = prefilter_of(filtered)
+    assert found is not None
+    (tmp_path / "f.c").write_bytes(prefilter_bytes(found, ".c"))
+    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Werror", "-shared", "-fPIC"]
+    command = [str(_COMPILER), *flags, str(tmp_path / "f.c"), "-o", str(tmp_path / "f.so")]
+    subprocess.run(command, check=True, capture_output=True)
+    code = ctypes.CDLL(str(tmp_path / "f.so"))
+    code.prefilter_step.restype = ctypes.c_double
+    code.prefilter_step.argtypes = [ctypes.c_void_p, ctypes.c_double]
+    state = ctypes.create_string_buffer(8 * (found.order + 4))
+    code.prefilter_reset(state)
+    reference = np.repeat(np.random.default_rng(5).standard_normal(40), 25)
+    answer = np.array([code.prefilter_step(state, value) for value in reference])
+    assert np.max(np.abs(answer - found.filtered(reference))) < 1e-12

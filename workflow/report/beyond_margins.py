@@ -1,0 +1,134 @@
+"""Of a design beyond its margins: other orders, whole responses, the prefilter; words from the numbers."""
+
+from __future__ import annotations
+
+from control_design.prefilter import Prefilter
+from workflow.reference_filter import prefilter_of, prefilter_words
+from workflow.report.data import RunData
+from workflow.report.page import Block, Code, Remarks, Table, Text, heading, maybe
+from workflow.report.words import frequency, number, percent, sentence
+from workflow.whole_responses import joint_numbers, joint_of, joint_words
+from workflow.yardstick import bracket_of, order_advice, yardstick_words
+
+
+def beyond_words(data: RunData) -> list[str]:
+    """For the verdict: how far from any order, and how many whole responses the worst case holds for."""
+    if data.synthesis is None or not data.has_controller:
+        return []
+    gamma, order = data.synthesis.gamma, data.config.specification.controller_order
+    words = [joint_words(data.whole), prefilter_sentence(data)]
+    if bracket_of(data.yardstick) is not None:
+        words.insert(0, yardstick_words(data.yardstick, gamma, order))
+    if gamma > 1:
+        words.append(order_advice(data.yardstick, gamma, order))
+    return [text for text in words if text]
+
+
+def prefilter_sentence(data: RunData) -> str | None:
+    """The prefilter in one sentence; None where none was asked for."""
+    words = prefilter_words(data.prefilter)
+    if words is None:
+        return None
+    return words if prefilter_of(data.prefilter) is None else f"prefilter of {words}"
+
+
+def order_blocks(data: RunData) -> list[Block]:
+    """How far the order chosen is from what any controller could reach."""
+    bracket = bracket_of(data.yardstick)
+    gamma = data.synthesis.gamma if data.synthesis is not None and data.has_controller else None
+    order = data.config.specification.controller_order
+    words = yardstick_words(data.yardstick, gamma, order)
+    if words is None:
+        return []
+    if bracket is None:
+        return [Text(sentence(words))]
+    rows = []
+    if gamma is not None:
+        rows.append((f"this controller, order {order}", number(gamma, 4), "on the grid of the design"))
+    rows += [
+        ("a controller of any order", number(bracket.ellipse, 4), "reached: such a controller is known"),
+        ("no controller", number(bracket.floor, 4), "lower bound, within the basis searched"),
+    ]
+    table = Table(
+        ("who", "weighted worst case, gamma", "how it is known"),
+        tuple(rows),
+        "The yardstick: what is left to gain by a higher order, from a convex programme over all stabilising "
+        "controllers (Youla). It knows the weights, but neither structure nor damping of the controller's "
+        "own poles nor a delay margin, which may cost more.",
+    )
+    advice = None if gamma is None or gamma <= 1 else order_advice(data.yardstick, gamma, order)
+    return [
+        heading("Against a controller of any order"),
+        Text(sentence(words)),
+        table,
+        *maybe(() if advice is None else (sentence(advice),), "warning"),
+    ]
+
+
+def whole_blocks(data: RunData) -> list[Block]:
+    """For how many whole responses the worst case holds."""
+    words = joint_words(data.whole)
+    if words is None:
+        return []
+    joint = joint_of(data.whole)
+    if joint is None:
+        return [Text(sentence(words))]
+    numbers = joint_numbers(data.whole)
+    low, high = (percent(100 * value, 4) for value in numbers["held_interval"])
+    stable_low, stable_high = (percent(100 * value, 4) for value in numbers["stable_interval"])
+    rows = (
+        (
+            f"worst case of the {percent(100 * joint.given_level, 4)} ellipses",
+            number(joint.gamma_given, 4),
+            f"{percent(100 * joint.coverage_given, 4)} ({low} to {high})",
+        ),
+        (
+            f"worst case that holds for {percent(100 * joint.coverage, 4)}",
+            number(joint.gamma, 4),
+            f"{percent(100 * joint.coverage, 4)}: ellipses of {percent(100 * joint.level, 4)}",
+        ),
+        ("stable loop", "–", f"{percent(100 * joint.stable_share, 4)} ({stable_low} to {stable_high})"),
+        (
+            f"inside the {percent(100 * joint.given_level, 4)} ellipse at every frequency",
+            "–",
+            percent(100 * joint.simultaneous_given, 4),
+        ),
+    )
+    table = Table(
+        ("statement", "gamma", f"holds for, of {joint.draws} draws"),
+        rows,
+        "An ellipse holds at one frequency; these are whole responses drawn from the posterior, each through "
+        "the closed loop. In brackets the 95 % interval of the share. A response may leave its ellipse where "
+        "nothing is at stake.",
+    )
+    short = joint.level > joint.given_level and not data.whole["calibrated"]
+    return [
+        heading("Whole responses"),
+        *(maybe((sentence(words),), "warning") if short else (Text(sentence(words)),)),
+        table,
+    ]
+
+
+def prefilter_blocks(data: RunData) -> list[Block]:
+    """The prefilter: what it buys in the worst case, and its state space."""
+    words = prefilter_sentence(data)
+    if words is None:
+        return []
+    found: Prefilter | None = prefilter_of(data.prefilter)
+    if found is None:
+        return [heading("Prefilter"), Remarks((sentence(words),), "warning")]
+    table = Table(
+        ("reference", "largest model-matching error over the ellipses"),
+        (
+            ("as it is, F = 1", number(found.error_before, 4)),
+            (f"through F, order {found.order}", number(found.error_after, 4)),
+        ),
+        f"Largest |W (F T - T_ref)| of any member at any of the checked frequencies; with F it lies at "
+        f"{frequency(found.worst_rad_s)}. The feedback loop, and all that is certified of it, is the same.",
+    )
+    return [
+        heading("Prefilter"),
+        Text(sentence(words)),
+        table,
+        Code("Prefilter as JSON (state space, reference to filtered reference)", found.to_json()),
+    ]
