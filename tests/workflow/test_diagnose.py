@@ -1,0 +1,360 @@
+"""`flexlink diagnose`: the answer as JSON and page, several cases, failures, resuming."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import time
+import tomllib
+
+import numpy as np
+import pytest
+
+from diagnosis.residual import pooled_rms
+from plant import EFFECTS, Rig, parse_effects, simulate
+from tests.workflow.command import start_flexlink
+from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
+from workflow.config import SimulatedSource
+from workflow.diagnose import command, outputs, page
+from workflow.diagnose.case_files import load_case
+from workflow.diagnose.command import diagnose_cases
+from workflow.diagnose.outputs import Options, files_of
+from workflow.diagnose.processes import Step, perform
+from workflow.errors import InputError
+from workflow.figures.style import Picture
+
+QUESTIONS = (
+    "Is there a gap beyond noise?",
+    "Where does it lie?",
+    "Which effect, and how sure?",
+    "How far does the gap shrink?",
+    "What remains?",
+    "Which experiment to run next?",
+    "What does it mean for the controller?",
+    "What was not checked",
+)
+
+
+def made(folder, engine, *, rig=None, controller=False):
+    """Files of one case, computed here."""
+    options = Options(controller)
+    return files_of(load_case(folder, rig), options, "code", engine=engine, report=lambda f, m: None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_case(tmp_path_factory.mktemp("case") / "arm", FRICTION)
+
+
+@pytest.fixture(scope="module")
+def files(folder):
+    return made(folder, KnownAnswer((FRICTION,)), rig="rig_uncertain.toml", controller=True)
+
+
+@pytest.fixture(scope="module")
+def document(files):
+    return json.loads(files["arm.json"])
+
+
+@pytest.fixture
+def blank(monkeypatch):
+    """Pages with empty pictures."""
+    monkeypatch.setattr(page, "render", lambda figure: Picture("svg", b'<svg viewBox="0 0 1 1"></svg>'))
+
+
+# One case
+
+
+def test_json_keeps_its_contract(document, folder):
+    keys = "case verdict detail_verdict effects combination ambiguous_with gap_before gap_after noise_floor"
+    assert {*keys.split(), "where", "next_experiment"} <= document.keys()
+    assert document["case"] == "arm"
+    assert document["verdict"] == "effect"
+    assert document["combination"] == ["coulomb_friction"]
+    assert document["effects"][0]["name"] == "coulomb_friction"
+    assert document["effects"][0]["parameters"] == {"torque_Nm": 0.05}
+    low, high = document["effects"][0]["intervals"]["torque_Nm"]
+    assert low < 0.05 < high
+    assert document["probabilities"].keys() == {"none", *EFFECTS, "unknown"}
+    assert sum(document["probabilities"].values()) == pytest.approx(1.0, abs=1e-12)
+    assert sum(effect["probability"] for effect in document["effects"]) == pytest.approx(1.0, abs=1e-12)
+    assert {"subsystem", "bands", "regimes", "experiments", "sensors"} <= document["where"].keys()
+    # The gap, computed without any of the diagnosis: held-out record against the simulator.
+    case = load_case(folder).case
+    (held,) = case.held_out
+    residual = (held.output - simulate(case.rig, held.voltage_V).output) / case.noise
+    assert document["gap_before"] == pytest.approx(pooled_rms(residual), rel=1e-12)
+    assert document["gap_by_experiment"][held.name]["stated"] == pytest.approx(
+        pooled_rms(residual), rel=1e-12
+    )
+    assert document["gap_after"] < 1.2 < document["gap_before"]
+
+
+def test_equal_input_gives_equal_bytes(files, folder):
+    again = made(folder, KnownAnswer((FRICTION,)), rig="rig_uncertain.toml", controller=True)
+    assert again == files
+
+
+def test_repaired_rig_and_effects_are_read_by_their_readers(files, folder, tmp_path):
+    path = tmp_path / "arm.rig.toml"
+    path.write_bytes(files["arm.rig.toml"])
+    assert Rig.from_toml(path) == Rig.from_toml(folder / "rig_uncertain.toml")
+    tables = tomllib.loads(files["arm.effects.toml"].decode())["effects"]
+    assert parse_effects(tables) == parse_effects([FRICTION])
+    # A run configuration takes them as they are.
+    record = {"name": "a", "excitation": {"kind": "prbs", "amplitude_V": 1.0, "samples": 100}}
+    source = {"kind": "simulated", "rig": str(path), "effects": tables, "records": [record]}
+    assert SimulatedSource.model_validate(source).effects == (FRICTION,)
+
+
+def test_the_page_answers_in_order(files):
+    html = files["arm.html"].decode()
+    places = [html.index(f"<h2>{question}</h2>") for question in QUESTIONS]
+    assert places == sorted(places)
+    assert "The gap comes from dry (Coulomb) friction" in html
+    assert "torque 0.05 N m (95 %: 0.049 to 0.051)" in html
+    assert html.count("<figure>") >= 6
+    assert "nan" not in re.sub(r"<svg.*?</svg>", "", html, flags=re.DOTALL).lower().replace("nan m", "")
+
+
+@pytest.mark.parametrize(
+    ("engine", "words"),
+    [
+        (KnownAnswer((), "none", "none"), "No gap beyond sensor noise"),
+        (KnownAnswer((), "none", "parametric"), "further off than their tolerances allow"),
+        (KnownAnswer((), "unknown", "unknown"), "nothing on the list explains it"),
+        (KnownAnswer((FRICTION,), "effect", "not_converged"), "the fit did not converge"),
+        (
+            KnownAnswer((FRICTION,), "effect", "ambiguous", ambiguous=("viscous_friction",)),
+            "or from additional viscous friction",
+        ),
+        (
+            KnownAnswer((FRICTION, {"name": "tip_payload", "mass_kg": 0.01})),
+            "Dry (Coulomb) friction and an additional mass at the tip together",
+        ),
+    ],
+    ids=["none", "parametric", "unknown", "not_converged", "ambiguous", "two"],
+)
+def test_every_verdict_has_its_words(folder, engine, words, blank):
+    files = made(folder, engine)
+    assert words in files["arm.html"].decode()
+    answer = json.loads(files["arm.json"])
+    assert (answer["verdict"], answer["detail_verdict"]) == (engine.verdict, engine.detail)
+
+
+def test_what_was_suspected_is_spoken_of(tmp_path, blank):
+    folder = write_case(tmp_path / "arm", FRICTION)
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text('suspected = ["backlash", "coulomb_friction"]\n' + text)
+    files = made(folder, KnownAnswer((FRICTION,)))
+    html = files["arm.html"].decode()
+    assert "Asked about: play (backlash) in the gear has probability under 0.1 %." in html
+    assert "dry (Coulomb) friction has probability 96 % and is part of the answer" in html
+    assert json.loads(files["arm.json"])["suspected"] == {"backlash": 0.0, "coulomb_friction": 0.96}
+
+
+# Several cases
+
+
+@pytest.fixture
+def cases(tmp_path):
+    return [write_case(tmp_path / "cases" / name, FRICTION, seed=k) for k, name in enumerate(("one", "two"))]
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Cases in this process and without pictures: what is tested is what happens around them."""
+
+    def run_all(work, jobs, watch):
+        for index, one in enumerate(work):
+            yield index, perform(one, lambda f, m, index=index: watch(index, Step(f, m)))
+
+    monkeypatch.setattr(command, "run_all", run_all)
+    monkeypatch.setattr(outputs, "case_page", lambda content, report: "<html></html>\n")
+
+
+def everything(out):
+    """Bytes of all files but those that name seconds."""
+    return {
+        path.name: path.read_bytes() for path in out.iterdir() if path.name not in ("timings.json", "lock")
+    }
+
+
+def test_several_cases_make_an_overview(cases, tmp_path, here):
+    out = tmp_path / "out"
+    found = diagnose_cases(cases, out, controller=False, engine=KnownAnswer((FRICTION,)))
+    assert found.exit_code == 0
+    assert [document["case"] for document in found.documents] == ["one", "two"]
+    overview = (out / "index.html").read_text()
+    assert '<a href="one.html">one</a>' in overview
+    assert "2 cases: 2 with a named effect" in overview
+    assert found.summary.report_path == str(out / "index.html")
+
+
+def test_a_failing_case_does_not_lose_the_others(cases, tmp_path, here):
+    out = tmp_path / "out"
+    engine = KnownAnswer((FRICTION,), fails=("one",))
+    found = diagnose_cases([*cases, tmp_path / "three"], out, controller=False, engine=engine)
+    assert [document["case"] for document in found.documents] == ["two"]
+    assert found.exit_code == 1
+    assert [line.partition(":")[0] for line in found.complaints()] == ["three", "one"]
+    assert all("\n" not in line for line in found.complaints())
+    assert not (out / "one.json").exists()
+    assert "no such luck" in (out / "index.html").read_text()
+    # The missing folder is not there to be continued with; the failed case is tried again.
+    again = diagnose_cases(cases, out, controller=False, resume=True, engine=KnownAnswer((FRICTION,)))
+    assert again.exit_code == 0
+    assert (out / "one.json").exists()
+
+
+def test_bad_input_beside_good_cases_is_exit_code_2(cases, tmp_path, here):
+    found = diagnose_cases(
+        [*cases, tmp_path / "three"], tmp_path / "out", controller=False, engine=KnownAnswer((FRICTION,))
+    )
+    assert found.exit_code == 2
+    assert len(found.documents) == 2
+
+
+def test_a_fit_that_did_not_converge_is_exit_code_3(cases, tmp_path, here):
+    engine = KnownAnswer((FRICTION,), detail="not_converged")
+    found = diagnose_cases(cases[:1], tmp_path / "out", controller=False, engine=engine)
+    assert found.exit_code == 3
+    assert "did not converge" in found.complaints()[0]
+
+
+def test_resuming_does_only_what_is_missing(cases, tmp_path, here):
+    out, seen = tmp_path / "out", tmp_path / "seen"
+    engine = KnownAnswer((FRICTION,), seen=seen)
+    diagnose_cases(cases, out, controller=False, engine=engine)
+    first = everything(out)
+    assert seen.read_text() == "one\ntwo\n"
+    diagnose_cases(cases, out, controller=False, resume=True, engine=engine)
+    assert seen.read_text() == "one\ntwo\n"
+    # Killed while the second case was written: its JSON file, the last one, is not there.
+    (out / "two.json").unlink()
+    (out / "index.html").unlink()
+    (out / ".two.html.17.part").write_bytes(b"half a pa")
+    diagnose_cases(cases, out, controller=False, resume=True, engine=engine)
+    assert seen.read_text() == "one\ntwo\ntwo\n"
+    assert everything(out) == first
+    # A page that somebody edited no longer is what the answer names.
+    (out / "one.html").write_text("<html>mine</html>")
+    diagnose_cases(cases, out, controller=False, resume=True, engine=engine)
+    assert seen.read_text() == "one\ntwo\ntwo\none\n"
+    assert everything(out) == first
+
+
+def test_another_code_version_is_done_again(cases, tmp_path, here, monkeypatch):
+    out, seen = tmp_path / "out", tmp_path / "seen"
+    engine = KnownAnswer((FRICTION,), seen=seen)
+    diagnose_cases(cases[:1], out, controller=False, engine=engine)
+    monkeypatch.setattr(command, "diagnosis_digest", lambda: "another")
+    found = diagnose_cases(cases[:1], out, controller=False, resume=True, engine=engine)
+    assert seen.read_text() == "one\none\n"
+    assert found.documents[0]["made_from"]["code_sha256"] == "another"
+
+
+def test_other_inputs_are_refused_unless_replaced(cases, tmp_path, here):
+    out, engine = tmp_path / "out", KnownAnswer((FRICTION,))
+    diagnose_cases(cases, out, controller=False, engine=engine)
+    with pytest.raises(InputError, match="--resume or start it afresh with --replace"):
+        diagnose_cases(cases, out, controller=False, engine=engine)
+    with pytest.raises(InputError, match=r"other inputs: inputs\.two"):
+        diagnose_cases(cases[:1], out, controller=False, resume=True, engine=engine)
+    with pytest.raises(InputError, match=r"other inputs: inputs\.one"):
+        diagnose_cases(cases, out, rig="rig_uncertain.toml", controller=False, resume=True, engine=engine)
+    with pytest.raises(InputError, match=r"other inputs: options\.controller"):
+        diagnose_cases(cases, out, resume=True, engine=engine)
+    (out / "notes.txt").write_text("mine")
+    diagnose_cases(cases[:1], out, controller=False, replace=True, engine=engine)
+    assert not (out / "two.json").exists()
+    assert not (out / "index.html").exists()
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_a_directory_of_something_else_is_left_alone(cases, tmp_path, here):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("years of work")
+    for choice in ({}, {"resume": True}, {"replace": True}):
+        with pytest.raises(InputError, match=r"it holds 'thesis\.tex'"):
+            diagnose_cases(cases, out, engine=KnownAnswer(), **choice)
+    assert [path.name for path in out.iterdir()] == ["thesis.tex"]
+
+
+def test_json_is_all_there_is_on_standard_output(cases, tmp_path, here, flexlink, monkeypatch):
+    monkeypatch.setattr(command, "Engine", lambda: KnownAnswer((FRICTION,)))
+    answer = flexlink("diagnose", *cases, "--out", tmp_path / "out", "--no-controller", "--json")
+    assert answer.code == 0, answer.err
+    printed = json.loads(answer.out)
+    assert [case["verdict"] for case in printed["cases"]] == ["effect", "effect"]
+    assert printed["failed"] == []
+
+
+# Processes
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
+    out = tmp_path / "out"
+    engine = KnownAnswer((FRICTION,), dies=("one",))
+    found = diagnose_cases(cases, out, jobs=2, controller=False, engine=engine)
+    assert found.exit_code == 1
+    assert [document["case"] for document in found.documents] == ["two"]
+    assert "died" in found.failures[0].reason
+
+
+def _wait_for(path, process, seconds=300.0):
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path.name} did not appear"
+        assert process.poll() is None, process.communicate()[1].decode()
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_ends_with_the_same_bytes(cases, tmp_path):
+    quiet, killed = tmp_path / "quiet", tmp_path / "killed"
+    call = ("diagnose", *cases, "--jobs", 1, "--out")
+    process = start_flexlink(*call, quiet)
+    _, error = process.communicate()
+    assert process.returncode == 0, error.decode()
+    process = start_flexlink(*call, killed)
+    _wait_for(killed / "one.json", process)
+    time.sleep(2.0)  # the second case is being computed
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (killed / "two.json").exists()
+    before = (killed / "one.json").stat().st_mtime_ns
+    process = start_flexlink(*call, killed, "--resume")
+    _, error = process.communicate()
+    assert process.returncode == 0, error.decode()
+    assert (killed / "one.json").stat().st_mtime_ns == before
+    assert everything(killed) == everything(quiet)
+
+
+@pytest.mark.slow
+def test_a_recorded_case_from_files_to_files(gap_cases, tmp_path, flexlink):
+    """The labelled case with a payload: named, sized, closed, and its files for whoever comes next."""
+    truth = tomllib.loads((gap_cases / "labelled/tip_payload/answer.toml").read_text())
+    out = tmp_path / "out"
+    answer = flexlink("diagnose", gap_cases / "labelled/tip_payload", "--out", out, "--jobs", 1, "--json")
+    assert answer.code == 0, answer.err
+    (found,) = json.loads(answer.out)["cases"]
+    assert found["verdict"] == "effect"
+    assert found["combination"] == ["tip_payload"]
+    (expected,) = truth["effects"]
+    assert found["effects"][0]["parameters"]["mass_kg"] == pytest.approx(
+        expected["parameters"]["mass_kg"], rel=0.03
+    )
+    assert found["gap_before"] == pytest.approx(truth["pooled_gap"]["held_out_gap_before"], rel=0.05)
+    # Three standard errors of the RMS of 2600 samples of two outputs.
+    oracle = truth["pooled_gap"]["held_out_gap_after_oracle"]
+    assert found["gap_after"] <= oracle + 3 / np.sqrt(2 * 5200)
+    assert "an additional mass at the tip" in (out / "tip_payload.html").read_text()
+    Rig.from_toml(out / "tip_payload.rig.toml")
+    first, second, third, fourth = found["controller"]["runs"]
+    # A redesign on the repaired rig meets the machine it was made for; payloads are linear.
+    assert fourth["cost_s"] == pytest.approx(third["cost_s"], rel=0.01)
+    assert all(run["settles"] for run in (first, second, third, fourth))

@@ -1,0 +1,163 @@
+"""Case files: column maps, and one line for everything that can be wrong with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.workflow.diagnosis_examples import FRICTION, write_case
+from workflow.diagnose.case_files import load_case
+from workflow.errors import InputError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_case(tmp_path / "arm", FRICTION)
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_a_case_folder_is_read_as_it_stands(folder):
+    loaded = load_case(folder)
+    case = loaded.case
+    assert case.name == "arm"
+    assert [e.role for e in case.experiments] == ["estimation"] * 3 + ["held_out"]
+    table = np.loadtxt(folder / "experiments/02_prbs.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(case.experiments[1].voltage_V, table[:, 1])
+    np.testing.assert_array_equal(case.experiments[1].output, table[:, 2:])
+    assert loaded.rig_file == "rig.toml"
+    assert set(load_case(folder, "rig_uncertain.toml").case.rig.tolerances) == {
+        "hub.inertia_kg_m2",
+        "motor.resistance_ohm",
+    }
+
+
+def test_own_logs_with_a_column_map_give_the_same_case(folder, tmp_path):
+    case = load_case(folder).case
+    shop = tmp_path / "shop"
+    shop.mkdir()
+    (shop / "arm.toml").write_text((folder / "rig.toml").read_text())
+    entries = []
+    for number, experiment in enumerate(case.experiments):
+        table = np.column_stack(
+            [experiment.voltage_V, np.degrees(experiment.output[:, 0]), 1e3 * experiment.output[:, 1] + 7]
+        )
+        np.savetxt(
+            shop / f"{number}.csv", table, delimiter=",", header="u,encoder deg,tip", comments="", fmt="%.17g"
+        )
+        entries.append(f'[[experiments]]\nfile = "{number}.csv"\nrole = "{experiment.role}"\n')
+    (shop / "night_shift.toml").write_text(
+        f'rig = "arm.toml"\ndt_s = {case.rig.sampling.dt_s}\nsuspected = ["backlash"]\n[columns]\n'
+        f'voltage_V = "u"\nhub_angle_rad = {{ column = "encoder deg", scale = {np.pi / 180!r} }}\n'
+        'tip_m = { column = "tip", scale = 1e-3, offset = -7e-3 }\n' + "\n".join(entries)
+    )
+    loaded = load_case(shop / "night_shift.toml")
+    assert loaded.case.name == "night_shift"
+    assert loaded.suspected == ("backlash",)
+    for one, other in zip(loaded.case.experiments, case.experiments, strict=True):
+        assert one.role == other.role
+        np.testing.assert_array_equal(one.voltage_V, other.voltage_V)
+        # Degrees and millimetres there and back: a few units in the last place of the largest value.
+        np.testing.assert_allclose(one.output, other.output, rtol=0, atol=1e-14)
+
+
+def test_the_input_hash_follows_every_file(folder):
+    hashes = {load_case(folder).input_sha256, load_case(folder, "rig_uncertain.toml").input_sha256}
+    edit(folder / "case.toml", 'kind = "prbs"', 'kind = "noise"')
+    hashes.add(load_case(folder).input_sha256)
+    log = folder / "experiments/01_prbs.csv"
+    edit(log, "\n0,", "\n-0,")
+    hashes.add(load_case(folder).input_sha256)
+    assert len(hashes) == 4
+
+
+def _nan(folder):
+    log = folder / "experiments/03_prbs.csv"
+    lines = log.read_text().splitlines()
+    first, _, *rest = lines[41].split(",")
+    lines[41] = ",".join([first, "nan", *rest])
+    log.write_text("\n".join(lines) + "\n")
+
+
+def _dead(folder):
+    log = folder / "experiments/02_prbs.csv"
+    head, *lines = log.read_text().splitlines()
+    log.write_text("\n".join([head, *(line.rpartition(",")[0] + ",0.25" for line in lines)]) + "\n")
+
+
+def _case(old, new):
+    return lambda folder: edit(folder / "case.toml", old, new)
+
+
+def _rig(old, new):
+    return lambda folder: edit(folder / "rig.toml", old, new)
+
+
+SPOILT = {
+    "unreadable TOML": (
+        _case("[[experiments]]", "[[experiments]"),
+        ["case.toml", "not valid TOML", "line 3"],
+    ),
+    "unknown key": (_case("kind =", "knid ="), ["case.toml", "experiments[0].knid", "did you mean kind?"]),
+    "unknown role": (_case('"held_out"', '"validation"'), ["case.toml", "experiments[3].role", "'held_out'"]),
+    "no held-out role": (_case('"held_out"', '"estimation"'), ["case.toml", "no experiment", "held_out"]),
+    "no such effect": (
+        _case('case = "arm"', 'case = "arm"\nsuspected = ["colomb_friction"]'),
+        ["case.toml", "suspected[0]", "colomb_friction", "did you mean coulomb_friction?"],
+    ),
+    "no such log": (_case("01_prbs.csv", "01_prbs.txt"), ["case.toml", "experiments[0].file", "01_prbs.txt"]),
+    "wrong number of rows": (
+        _case("samples = 240", "samples = 250"),
+        ["experiments[0].samples", "250", "240"],
+    ),
+    "forbidden name": (_case('case = "arm"', 'case = "../arm"'), ["case.toml", "case", "../arm"]),
+    "taken name": (_case('case = "arm"', 'case = "index"'), ["case.toml", "'index'"]),
+    "no such column": (
+        _case('role = "estimation"', 'role = "estimation"\ncolumns = { tip_m = "tip_mm" }'),
+        ["01_prbs.csv", "no column 'tip_mm'", "time_s"],
+    ),
+    "scale of nothing": (
+        _case("[[experiments]]", '[columns]\ntip_m = { column = "tip_m", scale = 0 }\n\n[[experiments]]'),
+        ["case.toml", "columns.tip_m", "scale must not be 0"],
+    ),
+    "not a number": (_nan, ["03_prbs.csv", "line 42", "'voltage_V'"]),
+    "dead sensor": (_dead, ["02_prbs.csv", "tip_m is 0.25 throughout", "dead"]),
+    "another sampling": (
+        _rig("dt_s = 0.005", "dt_s = 0.004"),
+        ["01_prbs.csv", "0.005", "sampling.dt_s = 0.004"],
+    ),
+    "no noise level": (_rig("tip_noise_m = 0.001", "tip_noise_m = 0.0"), ["case.toml", "noise level"]),
+    "misspelt rig key": (_rig("inertia_kg_m2", "inerta_kg_m2"), ["rig.toml", "hub.inerta_kg_m2"]),
+    "unreadable rig": (_rig("[hub]", "[hub"), ["rig.toml", "not valid TOML"]),
+}
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_bad_input_is_one_line_and_leaves_nothing(what, folder, refused, tmp_path):
+    spoil, words = SPOILT[what]
+    spoil(folder)
+    line = refused("diagnose", folder, "--out", tmp_path / "out")
+    for word in words:
+        assert word in line, line
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_calls_are_one_line(folder, refused, tmp_path):
+    out = tmp_path / "out"
+    assert "no case is there" in refused("diagnose", tmp_path / "nowhere", "--out", out)
+    line = refused("diagnose", folder, "--out", out, "--rig", "rig_exact.toml")
+    assert "rig_exact.toml: no such rig file" in line
+    assert "rig_uncertain.toml" in line
+    assert "two cases are called 'arm'" in refused("diagnose", folder, folder, "--out", out)
+    assert "--jobs" in refused("diagnose", folder, "--out", out, "--jobs", 0)
+    assert "contradict" in refused("diagnose", folder, "--out", out, "--resume", "--replace")
+    assert not out.exists()
+
+
+def test_a_damaged_case_names_itself(tmp_path):
+    with pytest.raises(InputError, match=r"case\.toml"):
+        load_case(tmp_path)

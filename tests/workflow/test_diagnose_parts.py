@@ -1,0 +1,99 @@
+"""Parts of a diagnosis that can be checked against the simulator: linear machine, controller check, words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diagnosis.case import Case, Experiment
+from plant import EFFECTS, parse_effects, simulate
+from tests.workflow.diagnosis_examples import small_rig
+from workflow.diagnose.controller_check import check_controller
+from workflow.diagnose.linear_machine import sampled_linear_machine
+from workflow.diagnose.words import effect_words, parameter_words, probability_words, unit_of
+
+LINEAR = {
+    "nothing": [],
+    "whole delay": [{"name": "input_delay", "delay_s": 0.01}],
+    "broken delay": [{"name": "input_delay", "delay_s": 0.0137}],
+    "lag, gain, delay": [
+        {"name": "actuator_lag", "time_constant_s": 0.01},
+        {"name": "actuator_gain", "ratio": 1.2},
+        {"name": "input_delay", "delay_s": 0.003},
+    ],
+    "compliant joint, payload": [
+        {"name": "joint_compliance", "stiffness_Nm_rad": 50.0, "damping_Nms": 0.05},
+        {"name": "tip_payload", "mass_kg": 0.02},
+    ],
+    "compliant base": [
+        {"name": "base_compliance", "stiffness_Nm_rad": 80.0, "damping_Nms": 0.05, "inertia_kg_m2": 0.05}
+    ],
+}
+
+
+@pytest.mark.parametrize("what", LINEAR)
+def test_the_linear_machine_is_the_simulated_one(what):
+    rig, effects = small_rig(), parse_effects(LINEAR[what])
+    voltage = np.sign(np.random.default_rng(3).standard_normal(300))
+    expected = simulate(rig, voltage, effects).output
+    machine = sampled_linear_machine(rig, effects)
+    state, found = np.zeros(machine.nstates), []
+    for value in voltage:
+        found.append(machine.C @ state)
+        state = machine.A @ state + machine.B[:, 0] * value
+    # Both are exact; rounding grows with the steps: 300 steps of 1e-16 of signals of size one.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+
+
+def _case(*effects):
+    rig, experiments = small_rig(), []
+    for k, role in enumerate(("estimation", "held_out")):
+        rng = np.random.default_rng(k)
+        voltage = 3.0 * np.sign(rng.standard_normal(40).repeat(8))
+        output = simulate(rig, voltage, parse_effects(effects), rng=rng).output
+        experiments.append(Experiment(f"{k}", role, voltage, output))
+    return Case("arm", rig, tuple(experiments))
+
+
+def test_a_machine_that_is_its_model_meets_the_prediction():
+    case = _case()
+    check = check_controller(case, case.rig, ())
+    first, second, third, fourth = check.runs
+    assert all(run.settles for run in check.runs)
+    for predicted, achieved in ((first, second), (third, fourth)):
+        # The same linear machine by two routes; S is measured at lines a twentieth of its peak's
+        # frequency apart.
+        np.testing.assert_allclose(achieved.tip_m, predicted.tip_m, atol=1e-8)
+        assert achieved.cost_s == pytest.approx(predicted.cost_s, rel=1e-6)
+        assert achieved.margin == pytest.approx(predicted.margin, rel=0.02)
+    # Same rig, same specification, same seed.
+    assert third.cost_s == first.cost_s
+
+
+def test_a_delay_costs_margin_that_only_the_repaired_design_predicts():
+    case = _case()
+    late = parse_effects([{"name": "input_delay", "delay_s": 0.03}])
+    check = check_controller(case, case.rig, late)
+    promised, kept, _, _ = check.runs
+    assert kept.margin < promised.margin - 0.02
+    third, fourth = check.runs[2:]
+    assert fourth.margin == pytest.approx(third.margin, rel=0.02)
+    assert fourth.cost_s == pytest.approx(third.cost_s, rel=1e-6)
+
+
+def test_every_effect_has_words_and_every_parameter_its_unit():
+    for name, effect in EFFECTS.items():
+        assert effect_words(name) != name.replace("_", " "), name
+        for parameter in effect.model_fields:
+            assert unit_of(parameter) or parameter in ("ratio", "cycles_per_rev"), parameter
+    assert unit_of("stiffness_Nm_rad") == "N m/rad"
+    assert unit_of("hub.inertia_kg_m2") == "kg m²"
+    assert parameter_words("delay_s", 0.012, (0.011, 0.013)) == "delay 0.012 s (95 %: 0.011 to 0.013)"
+    assert parameter_words("ratio", 1.25, None) == "ratio 1.25"
+
+
+def test_no_probability_is_called_certain():
+    assert probability_words(1.0) == "over 99.9 %"
+    assert probability_words(0.0) == "under 0.1 %"
+    assert probability_words(0.954) == "95.4 %"
+    assert probability_words(0.996) == "99.6 %"
