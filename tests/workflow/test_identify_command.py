@@ -164,6 +164,8 @@ def test_what_to_do_stands_in_the_table_and_on_the_page(flexlink, undrawn, tmp_p
     rng = np.random.default_rng(0)
     u = np.repeat(rng.normal(size=400), 4)
     y = scipy.signal.lfilter([0, 0.1], np.polymul([1, -0.9], [1, -1.9, 0.95]), u)
+    # An echo 20 samples later, for which a few poles have no place: no noise model makes that white.
+    y[20:] += y[:-20].copy()
     limit = np.quantile(np.abs(y), 0.9)
     log = write_log(tmp_path / "log.csv", u, np.clip(y, -limit, limit))
     answer = flexlink(
