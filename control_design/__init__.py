@@ -13,7 +13,9 @@ from control_design.closed_loop import (
 )
 from control_design.controller import Controller, ControllerStepper
 from control_design.ellipses import Ellipses
+from control_design.guards import Guard
 from control_design.joint_coverage import JointCoverage
+from control_design.joint_synthesis import JointDesign, synthesise_jointly
 from control_design.margins import Margins
 from control_design.plant_set import Channel, Mode, UncertainPlant
 from control_design.prefilter import Prefilter, PrefilterOptions, design_prefilter
@@ -38,7 +40,9 @@ __all__ = [
     "Controller",
     "ControllerStepper",
     "Ellipses",
+    "Guard",
     "JointCoverage",
+    "JointDesign",
     "LinearMachine",
     "Margins",
     "Mode",
@@ -66,5 +70,6 @@ __all__ = [
     "simulate",
     "step_metrics",
     "synthesise",
+    "synthesise_jointly",
     "youla_bracket",
 ]

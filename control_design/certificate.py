@@ -170,6 +170,7 @@ def certify(
     joint_coverage: float | None = None,
     rng: np.random.Generator | None = None,
     joint_draws: int = 4000,
+    joint_stable_share: float = 0.999,
 ) -> Certificate:
     """Check a controller from any source against plants and specification.
 
@@ -183,6 +184,10 @@ def certify(
 
     joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
     and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
+
+    joint_stable_share: with a joint coverage, share of those responses that must be stable. It is a
+    requirement of its own: ellipses propagate parameters to first order, and no level of theirs speaks for
+    draws far outside (`joint_synthesis` designs for it).
 
     Raises
     ------
@@ -222,6 +227,8 @@ def certify(
         items.append(_controller_damping_item(controller, specification.controller_damping))
     if specification.integrator:
         items.append(_integrator_item(controller, plants[0]))
+    if joint is not None:
+        items.append(_stable_share_item(joint, plants, joint_stable_share))
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
     proofs = [v.all_frequencies for v in verdicts]
     robust = robust and all(proof.proved or not proof.possible for proof in proofs)
@@ -418,6 +425,20 @@ def _controller_damping_item(controller: Controller, required: float) -> Specifi
         "",
         achieved >= required * (1 - SOLVER_SLACK),
         None if least is None else float(np.abs(pairs[least])),
+    )
+
+
+def _stable_share_item(
+    joint: JointCoverage, plants: Sequence[UncertainPlant], required: float
+) -> SpecificationItem:
+    name = plants[0].name if len(plants) == 1 else "all plants together"
+    return SpecificationItem(
+        f"share of {joint.draws} sampled responses that are stable",
+        name,
+        required,
+        joint.stable_share,
+        "",
+        bool(joint.stable_share >= required),
     )
 
 

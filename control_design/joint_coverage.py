@@ -20,6 +20,7 @@ from control_design.controller import Controller
 from control_design.ellipses import Complex, Ellipses, Real
 from control_design.first_order import Intervals
 from control_design.frequency_grid import frequency_grid
+from control_design.guards import Guard, different_responses, guard_grid, winds
 from control_design.plant_set import Channel, Mode, UncertainPlant, modes_of
 from control_design.set_expansion import FirstOrderUncertainty
 from control_design.specification import Specification
@@ -249,24 +250,17 @@ class _Sampled:
     def stable_of(self, responses: Responses, members: Complex) -> npt.NDArray[np.bool_]:
         """Whether 1 + K G winds as it must, (D,); on a ten times finer grid where a step is wide."""
         omega = self.unit.omega_rad_s
-        stable, wide = self._winding(members * (self.loop * self.data.delay))
+        stable, wide = self._winds(members * (self.loop * self.data.delay))
         if np.any(wide):
             share = np.linspace(0, 1, 11)[:-1]
             fine = np.append((omega[:-1, None] + np.diff(omega)[:, None] * share).ravel(), omega[-1])
             loop = self.controller.response(fine)
-            again, _ = self._winding(responses(fine)[wide] * loop)
+            again, _ = self._winds(responses(fine)[wide] * loop)
             stable[wide] = again
         return stable
 
-    def _winding(self, loop: Complex) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        value = 1.0 + loop
-        steps = np.angle(value[:, 1:] * np.conj(value[:, :-1]))
-        first = np.angle(value[:, 0] * 1j**self.integrators)
-        last = np.angle(value[:, -1])
-        total = np.sum(steps, axis=1) + (first - np.pi * np.round(first / np.pi))
-        total -= last - np.pi * np.round(last / np.pi)
-        required = self.unstable + self.integrators / 2.0
-        return np.abs(total / np.pi - required) < 0.25, np.max(np.abs(steps), axis=1) > np.pi / 3
+    def _winds(self, loop: Complex) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        return winds(loop, integrators=self.integrators, unstable_poles=self.unstable)
 
 
 def sampled_gamma(loop: _Sampled, rng: np.random.Generator, draws: int) -> SampledGamma:
@@ -285,6 +279,43 @@ def sampled_gamma(loop: _Sampled, rng: np.random.Generator, draws: int) -> Sampl
         gamma[here] = np.where(stable[here], loop.gamma_of(members, performance), np.inf)
         distance[here] = loop.distance_of(members)
     return SampledGamma(gamma, stable, distance)
+
+
+def unstable_draws(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    *,
+    rng: np.random.Generator,
+    draws: int,
+    most: int,
+    omega_min_rad_s: float = 1e-4,
+) -> tuple[int, list[Guard]]:
+    """How many of `draws` sampled responses (of every plant) are unstable, and up to `most` different ones
+    of each plant, as guards for another synthesis.
+
+    Raises
+    ------
+    ValueError
+        If an uncertainty cannot be drawn from.
+    """
+    unstable = np.zeros(draws, dtype=bool)
+    guards: list[Guard] = []
+    for number, plant in enumerate(plants):
+        _refuse_undrawable(plant.channel)
+        loop = _Sampled.build(controller, plant, specification, omega_min_rad_s)
+        grid, found = guard_grid(plant, omega_min_rad_s), list[Complex]()
+        for start in range(0, draws, _CHUNK):
+            here = slice(start, min(start + _CHUNK, draws))
+            responses = _responses(plant.channel, rng, here.stop - here.start)
+            bad = ~loop.stable_of(responses, responses(loop.unit.omega_rad_s))
+            unstable[here] |= bad
+            if np.any(bad):
+                found.append(responses(grid)[bad])
+        if found:
+            together = np.concatenate(found)
+            guards += [Guard(number, grid, together[at]) for at in different_responses(together, most)]
+    return int(np.count_nonzero(unstable)), guards
 
 
 def gamma_of_draws(

@@ -11,6 +11,7 @@ from control_design.biquads import SOLVER_SLACK, Cascade
 from control_design.controller import Controller
 from control_design.ellipses import Complex, Real, scale_to_minus_one
 from control_design.frequency_grid import frequency_grid, local_maxima, mode_points, plant_grid
+from control_design.guards import GUARD_MODULUS, Guard, sorted_by_plant, winds
 from control_design.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification, performance_modes
 from control_design.stability import closed_loop_poles
@@ -25,9 +26,14 @@ class Problem:
     """What does not depend on the controller's order; the lean grids grow by exchange, the rest is fixed."""
 
     def __init__(
-        self, plants: tuple[UncertainPlant, ...], specification: Specification, options: SynthesisOptions
+        self,
+        plants: tuple[UncertainPlant, ...],
+        specification: Specification,
+        options: SynthesisOptions,
+        guards: tuple[Guard, ...] = (),
     ) -> None:
-        self.plants, self.spec, self.options = plants, specification, options
+        self.plants, self.spec, self.options, self.guards = plants, specification, options, guards
+        self._guarded = sorted_by_plant(guards)
         self.dt_s = plants[0].dt_s
         self.scale = options.scale_rad_s or _frequency_scale(plants, specification)
         self._loops = [_Loop(plant, specification.computational_delay_samples) for plant in plants]
@@ -83,7 +89,8 @@ class Problem:
             if self.spec.delay_margin_s is not None:
                 late = data.delay * np.exp(-1j * data.ellipses.omega_rad_s * self.spec.delay_margin_s)
                 rows.append(self._delay_copy(data, late))
-        return rows
+        grids = self.grids if grids is None else grids
+        return rows + [self._guard_rows(guard, grids[guard.plant]) for guard in self.guards]
 
     def gamma(self, cascade: Cascade, parameters: Real, *, kinds: Sequence[str] = KINDS) -> float:
         """Weighted worst case on the dense grids; inf if some nominal loop is unstable, an ellipse
@@ -122,9 +129,27 @@ class Problem:
         return found
 
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
-        """Whether every nominal loop is (poles of the full state space, strictly inside the circle)."""
+        """Whether every nominal loop is (poles of the full state space, strictly inside the circle), and
+        every guard's."""
         a, b, c, d = cascade.state_space(parameters)
-        return all(bool(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0)) for loop in self._loops)
+        return all(
+            bool(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0)) for loop in self._loops
+        ) and self.guarded(cascade, parameters)
+
+    def guarded(self, cascade: Cascade, parameters: Real, guards: Sequence[Guard] | None = None) -> bool:
+        """Whether 1 + K G winds as it has to for every guard, or for those given."""
+        samples = self.spec.computational_delay_samples
+        for number, omega, responses in self._guarded if guards is None else sorted_by_plant(guards):
+            plant = self.plants[number]
+            k = cascade.response(parameters, omega) * np.exp(-1j * omega * self.dt_s * samples)
+            stable, wide = winds(
+                responses * k,
+                integrators=plant.n_integrators + int(self.spec.integrator),
+                unstable_poles=plant.unstable_poles,
+            )
+            if not np.all(stable & ~wide):  # a wide step is a pole next to the circle, on either side
+                return False
+        return True
 
     def closed_loop_poles(self, cascade: Cascade, parameters: Real) -> list[Complex]:
         """Poles (n,) of every nominal loop; one infinite pole for an algebraic loop."""
@@ -132,8 +157,8 @@ class Problem:
         return [loop.poles(a, b, c, d) for loop in self._loops]
 
     def usable(self, cascade: Cascade, parameters: Real) -> bool:
-        """Whether it can be built and every nominal loop is stable; false also where no anti-windup gain
-        exists, which a numerically degenerate controller shows."""
+        """Whether it can be built and every nominal loop and guard is stable; false also where no anti-windup
+        gain exists, which a numerically degenerate controller shows."""
         try:
             controller = self.controller(cascade, parameters)
         except ValueError:
@@ -141,7 +166,7 @@ class Problem:
         return all(
             bool(np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1.0)
             for plant in self.plants
-        )
+        ) and self.guarded(cascade, parameters)
 
     def controller(self, cascade: Cascade, parameters: Real) -> Controller:
         """The controller of a parameter vector."""
@@ -180,11 +205,21 @@ class Problem:
             if np.any(covered):  # those deepest over -1 first
                 depth = 2.0 - np.minimum(scale_to_minus_one(k * data.delay, data.ellipses)[covered], 1.0)
                 worst[covered] = depth * 2.0 * np.max(worst[~covered], initial=limit)
-            index = [i for i in local_maxima(worst) if worst[i] > limit][:most]
-            new = np.setdiff1d(omega[index], self.grids[position])
-            self.grids[position] = np.union1d(self.grids[position], new)
-            added += new.size
+            added += self._add(position, omega, worst, limit, most)
+        samples = self.spec.computational_delay_samples
+        for guard in self.guards:
+            omega = guard.omega_rad_s
+            k = cascade.response(parameters, omega) * np.exp(-1j * omega * self.dt_s * samples)
+            near = GUARD_MODULUS / np.maximum(np.abs(1.0 + guard.response * k), 1e-300)
+            added += self._add(guard.plant, omega, near, limit, most)
         return added
+
+    def _add(self, position: int, omega: Real, value: Real, limit: float, most: int) -> int:
+        """Put the largest local maxima above the limit on the grid of one plant; how many were new."""
+        index = [i for i in local_maxima(value) if value[i] > limit][:most]
+        new = np.setdiff1d(omega[index], self.grids[position])
+        self.grids[position] = np.union1d(self.grids[position], new)
+        return int(new.size)
 
     def _rows(self, data: PlantData, delay: Complex) -> Rows:
         return Rows(
@@ -212,6 +247,32 @@ class Problem:
             start_window=self._start_window(data.plant),
             # A fractional delay makes the loop complex at Nyquist: its phase there is not tied to zero.
             reaches_nyquist=False,
+        )
+
+    def _guard_rows(self, guard: Guard, wanted: Real) -> Rows:
+        plant, points = self.plants[guard.plant], guard.ellipses(wanted)
+        omega = points.omega_rad_s
+        zero = np.zeros(omega.size)
+        data = PlantData(
+            plant=plant,
+            ellipses=points,
+            delay=np.exp(-1j * omega * self.dt_s * self.spec.computational_delay_samples),
+            w1=self.spec.sensitivity_magnitude(omega, self.dt_s, plant.n_integrators),
+            modulus=zero,
+            w3=zero,
+            w4=zero,
+            gp_max=None,
+        )
+        return Rows(
+            ellipses=points,
+            delay=data.delay,
+            w1=zero + GUARD_MODULUS,
+            w3=zero,
+            w4=zero,
+            gp_max=None,
+            row_scale=self._row_scale(data),
+            start_window=self._start_window(plant),
+            reaches_nyquist=True,
         )
 
     def _row_scale(self, data: PlantData) -> Real:

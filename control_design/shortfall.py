@@ -13,6 +13,7 @@ from control_design.synthesis_result import BlockingPoint
 NOMINAL = "stability of the nominal loop"
 ROBUST = "stability over the ellipse"
 DELAYED = "stability with the extra delay"
+GUARDED = "stability of a sampled response"
 DAMPING = "damping of the controller's own poles"
 
 _PLACES = 5  # named of each plant
@@ -23,7 +24,8 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
 
     An unstable nominal loop is named by its poles (frequency of ln(z)/dt, the fastest growing first), one
     that is stable by the frequencies at which an ellipse, or the ellipse behind the delay of the delay
-    margin, lies deepest over -1; a controller that rings too much by its own least damped pair.
+    margin, lies deepest over -1; a guard by the frequency where it comes nearest to -1; a controller that
+    rings too much by its own least damped pair.
     """
     unstable: list[tuple[float, BlockingPoint]] = []
     covered: list[tuple[float, BlockingPoint]] = []
@@ -46,7 +48,19 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
                     covered.append((float(scale[at]), point))
     found = [point for _, point in sorted(unstable, key=lambda entry: entry[0])]
     found += [point for _, point in sorted(covered, key=lambda entry: entry[0])]
-    return tuple(found or _ringing(problem, cascade, parameters))
+    return tuple(found or _guards(problem, cascade, parameters) or _ringing(problem, cascade, parameters))
+
+
+def _guards(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:
+    points = []
+    for guard in problem.guards:
+        if not problem.guarded(cascade, parameters, [guard]):
+            omega = guard.omega_rad_s
+            delay = np.exp(-1j * omega * problem.dt_s * problem.spec.computational_delay_samples)
+            distance = np.abs(1.0 + guard.response * cascade.response(parameters, omega) * delay)
+            at = int(np.argmin(distance))
+            points.append(BlockingPoint(problem.plants[guard.plant].name, GUARDED, float(omega[at]), np.inf))
+    return points
 
 
 def _ringing(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:

@@ -11,6 +11,7 @@ from control_design.biquads import Cascade, SectionKind
 from control_design.controller import Controller
 from control_design.ellipses import Real
 from control_design.frequency_grid import local_maxima
+from control_design.guards import Guard
 from control_design.order_search import Candidate, OrderResult, OrderSearch
 from control_design.plant_set import UncertainPlant
 from control_design.problem import Problem
@@ -39,6 +40,7 @@ def synthesise(
     *,
     rng: np.random.Generator,
     progress: Progress | None = None,
+    guards: Sequence[Guard] = (),
 ) -> SynthesisResult:
     """Design one controller for all plants: smallest gamma over every ellipse.
 
@@ -47,6 +49,7 @@ def synthesise(
     plants : at least one; several loads, operating points or identified models at once.
     rng : the starts are drawn from it; same generator state, same result.
     progress : called with (fraction, message).
+    guards : single responses that must be stable as well, whatever the weights say of them.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def synthesise(
     options = options or SynthesisOptions()
     specification.check_against(plants)
     tell = progress or (lambda fraction, message: None)
-    problem = Problem(tuple(plants), specification, options)
+    problem = Problem(tuple(plants), specification, options, tuple(guards))
     own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
     root = int(rng.integers(2**63))
     ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)

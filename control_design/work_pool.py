@@ -19,6 +19,7 @@ from typing import Any
 import control
 import numpy as np
 
+from control_design.guards import Guard
 from control_design.plant_set import UncertainPlant
 from control_design.problem import Problem
 from control_design.search_tasks import StartEnd, StartTask, Workshop
@@ -52,7 +53,7 @@ class WorkPool:
         if jobs == 1:
             return
         problem = workshop.problem
-        parts = problem.plants, problem.spec, problem.options
+        parts = problem.plants, problem.spec, problem.options, problem.guards
         try:
             ForkingPickler.dumps(parts)
         except Exception as error:  # what a plant made of local functions raises differs between versions
@@ -102,7 +103,10 @@ _own: Workshop | None = None  # of a worker process
 
 
 def _begin(
-    plants: tuple[UncertainPlant, ...], specification: Specification, options: SynthesisOptions
+    plants: tuple[UncertainPlant, ...],
+    specification: Specification,
+    options: SynthesisOptions,
+    guards: tuple[Guard, ...],
 ) -> None:
     """First thing in a worker process."""
     global _own
@@ -115,7 +119,7 @@ def _begin(
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    _own = Workshop(Problem(plants, specification, options))
+    _own = Workshop(Problem(plants, specification, options, guards))
 
 
 def _ready() -> None:
