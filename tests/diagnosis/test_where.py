@@ -260,7 +260,7 @@ def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):
     assert curve.found
     # The node below which half the samples of a side lie: a torque against the motion on both sides.
     backwards = [v for x, v in zip(curve.centres, curve.values, strict=True) if x < 0][-1]
-    forwards = [v for x, v in zip(curve.centres, curve.values, strict=True) if x > 0][0]
+    forwards = next(v for x, v in zip(curve.centres, curve.values, strict=True) if x > 0)
     assert backwards > 0 > forwards
     assert found.amplitude.growth == "offset"
 

@@ -1,0 +1,484 @@
+"""Which experiment to run next: the feasible one that tells the surviving rivals apart best.
+
+Two rivals i and j predict outputs y_i, y_j for an input. Their difference in noise deviations, D, is what an
+experiment has to show, less what free parameters absorb: with derivatives J by them and the precision L of
+what is known about them,
+
+    d^2 = D' (I + J L^-1 J')^-1 D = D'D - D'J (J'J + L)^-1 J'D,
+
+the expected log Bayes factor is about d^2 / 2, and d reads as standard deviations between the two. Where fits
+to the records give the precision, J holds both rivals' parameters. Where they do not, one rival is taken as
+true at its parameters and the other one refits its own (effect parameters known to a factor e, nominal ones
+to their tolerances), and d^2 is the mean of both ways round: with both free, any two effects could vanish
+together. To first order in the free parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from diagnosis.case import Real
+from diagnosis.experiment_choices import (
+    ALSO_WEAK,
+    Excitation,
+    Limits,
+    excitations,
+    tailored_excitations,
+    within,
+)
+from plant.effects import EFFECTS, Effect
+from plant.rig import Rig
+from plant.simulate import simulate
+
+# A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
+_SETTLED = 20.0
+# Below this nothing is said to separate two rivals.
+_SEPARATES = 3.0
+# Relative steps of difference quotients; contacts that switch need one that averages over many of them.
+_STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
+# In tolerances: small against one, large against the wobble of friction.
+_TOLERANCE_STEP = 0.02
+_LOG_PRECISION = 1.0
+# Enough amplitudes and phases that a handful of free parameters cannot absorb them.
+_TAILORED_LINES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """One explanation that is left.
+
+    Attributes
+    ----------
+    probability : float
+    rig : Rig
+        With its fitted nominal parameters.
+    effects : tuple of Effect
+    directions : callable, optional
+        Voltage (T,) -> derivatives (2 T, P) of the outputs in noise deviations, hub before tip sample by
+        sample, by the rival's free parameters. Without it: difference quotients by the logarithms of the
+        effects' parameters and by the tolerances of the rig (there without jagged effects, whose contacts say
+        little about a small change of a parameter and cost most of the time).
+    precision : (P, P), optional
+        What is known about the free parameters: the Gauss-Newton Hessian of the fit to the records, prior
+        included. Needed with `directions`.
+    name : str
+        In sentences; by default the names of the effects.
+    """
+
+    probability: float
+    rig: Rig
+    effects: tuple[Effect, ...] = ()
+    directions: Callable[[Real], Real] | None = None
+    precision: Real | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.probability <= 1:
+            raise ValueError(f"a rival's probability lies between 0 and 1; got {self.probability}")
+        object.__setattr__(self, "effects", tuple(self.effects))
+        if (self.directions is None) != (self.precision is None):
+            raise ValueError("a rival with directions needs their precision, and the other way round")
+        if not self.name:
+            names = " with ".join(type(effect).id for effect in self.effects)
+            object.__setattr__(self, "name", names or "no effect")
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far an experiment parts two rivals."""
+
+    rivals: tuple[str, str]
+    standard_deviations: float
+    log_bayes_factor: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Considered:
+    """An excitation that was looked at.
+
+    `feasible`: stays in the limits at a useful size. `at_most`: its score if no free parameter absorbed
+    anything; `score`: the score, None where at_most was already too low to win.
+    """
+
+    kind: str
+    description: str
+    amplitude_V: float
+    feasible: bool
+    at_most: float
+    score: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class NextExperiment:
+    """The experiment to run next.
+
+    Attributes
+    ----------
+    kind, parameters, amplitude_V, duration_s, dt_s, voltage_V (T,)
+        The excitation.
+    separations : tuple of Separation
+        Every pair of rivals.
+    expected_log_bayes_factor : float
+        Over the pairs, weighted with the product of their probabilities.
+    hub_angle_range_rad, deflection_range_m
+        Least and largest value any of the rivals predicts.
+    separates : bool
+        Whether any pair comes apart by three standard deviations.
+    sentence : str
+    considered : tuple of Considered
+        Best first.
+    """
+
+    kind: str
+    parameters: dict[str, float | int | str]
+    amplitude_V: float
+    duration_s: float
+    dt_s: float
+    voltage_V: Real
+    separations: tuple[Separation, ...]
+    expected_log_bayes_factor: float
+    hub_angle_range_rad: tuple[float, float]
+    deflection_range_m: tuple[float, float]
+    separates: bool
+    sentence: str
+    considered: tuple[Considered, ...] = field(default=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; `json.dumps` takes it."""
+        return {
+            "kind": self.kind,
+            "parameters": dict(self.parameters),
+            "amplitude_V": self.amplitude_V,
+            "duration_s": self.duration_s,
+            "dt_s": self.dt_s,
+            "voltage_V": self.voltage_V.tolist(),
+            "separations": [
+                {
+                    "rivals": list(s.rivals),
+                    "standard_deviations": s.standard_deviations,
+                    "log_bayes_factor": s.log_bayes_factor,
+                    "sentence": s.sentence,
+                }
+                for s in self.separations
+            ],
+            "expected_log_bayes_factor": self.expected_log_bayes_factor,
+            "hub_angle_range_rad": list(self.hub_angle_range_rad),
+            "deflection_range_m": list(self.deflection_range_m),
+            "separates": self.separates,
+            "sentence": self.sentence,
+            "sentences": [self.sentence],
+            "considered": [vars(c) for c in self.considered],
+        }
+
+
+def next_experiment(
+    rivals: Sequence[Rival],
+    limits: Limits,
+    *,
+    n_samples: int = 1400,
+    choices: Sequence[Excitation] | None = None,
+    rng: np.random.Generator | None = None,
+) -> NextExperiment:
+    """Choose among excitations within the limits.
+
+    Parameters
+    ----------
+    rivals
+        Two at least, all with the same sampling period and noise.
+    choices
+        Excitations to choose from, by default `excitations` of the voltage limit and n_samples.
+    rng
+        Of the random excitations; without it a fixed sequence.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two rivals, rivals that sample differently or are noise-free, no excitation that stays in
+        the limits.
+    """
+    rivals = tuple(rivals)
+    _check(rivals)
+    weights = _pair_weights(rivals)
+    dt = rivals[0].rig.sampling.dt_s
+    if choices is None:
+        rng = np.random.default_rng(0) if rng is None else rng
+        choices = excitations(limits.voltage_V, n_samples, dt, rng)
+        own = [_Prospect.of(choice, limits, rivals) for choice in choices]
+        weak = [p.excitation.scaled(1 / 3) for p in own if p is not None and p.excitation.kind in ALSO_WEAK]
+        feasible = [p for p in own if p is not None]
+        tailored = _tailored(feasible, rivals, weights, limits, rng)
+        looked_at = own + [_Prospect.of(choice, limits, rivals) for choice in (*weak, *tailored)]
+        choices = (*choices, *weak, *tailored)
+    else:
+        looked_at = [_Prospect.of(choice, limits, rivals) for choice in choices]
+    prospects = sorted((p for p in looked_at if p is not None), key=lambda p: p.bound, reverse=True)
+    if not prospects:
+        raise ValueError(
+            f"no experiment stays within {limits.hub_angle_rad} rad and {limits.deflection_m} m at a "
+            f"hundredth of {limits.voltage_V} V or more: give wider limits"
+        )
+    best: tuple[tuple[float, float], _Prospect, Real] | None = None
+    for prospect in prospects:
+        # Absorbing parameters only lessen a difference: what cannot win without them need not be computed.
+        if best is not None and prospect.bound[0] <= best[0][0]:
+            break
+        distance, _ = prospect.distances(rivals)
+        score = _score(distance, weights)
+        prospect.score = score[0]
+        if best is None or score > best[0]:
+            best = score, prospect, distance
+    if best is None:
+        raise AssertionError("at least one prospect was computed")
+    _, chosen, distance = best
+    left_out = [c for c, p in zip(choices, looked_at, strict=True) if p is None]
+    considered = [p.considered() for p in sorted(prospects, key=lambda p: -(p.score or 0.0))]
+    considered += [Considered(c.kind, c.words, c.amplitude_V, False, 0.0, None) for c in left_out]
+    return _result(chosen, rivals, distance, weights, dt, tuple(considered))
+
+
+def _check(rivals: Sequence[Rival]) -> None:
+    if len(rivals) < 2:
+        raise ValueError(f"an experiment separates at least two rivals; got {len(rivals)}")
+    first = rivals[0].rig
+    for rival in rivals:
+        if rival.rig.sampling != first.sampling or rival.rig.sensors != first.sensors:
+            raise ValueError("all rivals need the same sampling period and sensor noise")
+    if not (first.sensors.hub_angle_noise_rad > 0 and first.sensors.tip_noise_m > 0):
+        raise ValueError("sensors need a noise level above zero to tell rivals apart by")
+
+
+def _pair_weights(rivals: Sequence[Rival]) -> Real:
+    p = np.array([a.probability * b.probability for a, b in combinations(rivals, 2)])
+    return p / p.sum() if p.sum() > 0 else np.full(p.size, 1 / p.size)
+
+
+def _score(distance: Real, weights: Real) -> tuple[float, float]:
+    """Expected log Bayes factor with settled pairs cut off, and without, to choose between equals."""
+    return float(weights @ np.minimum(distance, _SETTLED) ** 2 / 2), float(weights @ distance**2 / 2)
+
+
+class _Prospect:
+    """An excitation within the limits with every rival's prediction."""
+
+    def __init__(self, excitation: Excitation, outputs: Sequence[Real], rivals: Sequence[Rival]) -> None:
+        self.excitation = excitation
+        self._noise = _noise(rivals[0].rig)
+        self._whitened = [np.asarray(y / self._noise).ravel() for y in outputs]
+        self.hub = tuple(_range([y[:, 0] for y in outputs]))
+        self.deflection = tuple(_range([_deflection(r.rig, y) for r, y in zip(rivals, outputs, strict=True)]))
+        self.score: float | None = None
+        plain = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
+        self.bound = _score(plain, _pair_weights(rivals))
+
+    @classmethod
+    def of(cls, choice: Excitation, limits: Limits, rivals: Sequence[Rival]) -> _Prospect | None:
+        outputs: list[Real] = []
+
+        def respond(voltage: Real) -> tuple[float, float]:
+            outputs[:] = [simulate(r.rig, voltage, r.effects).output for r in rivals]
+            angle = max(float(np.max(np.abs(y[:, 0]))) for y in outputs)
+            bend = max(
+                float(np.max(np.abs(_deflection(r.rig, y)))) for r, y in zip(rivals, outputs, strict=True)
+            )
+            return angle, bend
+
+        excitation = within(choice, limits, respond)
+        return None if excitation is None else cls(excitation, outputs, rivals)
+
+    def distances(self, rivals: Sequence[Rival]) -> tuple[Real, list[Real]]:
+        """d of every pair in standard deviations, and what parameters leave of its difference (2 T,)."""
+        free = [
+            _directions(r, self.excitation.voltage_V, y, self._noise)
+            for r, y in zip(rivals, self._whitened, strict=True)
+        ]
+        found, remains = [], []
+        for i, j in combinations(range(len(rivals)), 2):
+            D = self._whitened[i] - self._whitened[j]
+            if rivals[i].precision is not None and rivals[j].precision is not None:
+                J = np.hstack([free[i][0], free[j][0]])
+                sides = [(J, block_diag(free[i][1], free[j][1]))]
+            else:
+                sides = [free[i], free[j]]
+            lefts = [_left(D, *side) for side in sides]
+            found.append(np.sqrt(np.mean([squared for squared, _ in lefts])))
+            remains.append(np.mean([rest for _, rest in lefts], axis=0))
+        return np.array(found), remains
+
+    def considered(self) -> Considered:
+        x = self.excitation
+        return Considered(x.kind, x.words, x.amplitude_V, True, self.bound[0], self.score)
+
+
+def _left(D: Real, J: Real, L: Real) -> tuple[float, Real]:
+    """D' (I + J L^-1 J')^-1 D and (I + J L^-1 J')^-1 D."""
+    if not J.shape[1]:
+        return float(D @ D), D
+    moment = J.T @ D
+    absorbed = np.linalg.lstsq(J.T @ J + L, moment, rcond=1e-13)[0]
+    return max(float(D @ D - moment @ absorbed), 0.0), np.asarray(D - J @ absorbed)
+
+
+def _tailored(
+    prospects: Sequence[_Prospect],
+    rivals: Sequence[Rival],
+    weights: Real,
+    limits: Limits,
+    rng: np.random.Generator,
+) -> list[Excitation]:
+    """Multisine and binary signal at the lines where the rivals differ most for the voltage spent there.
+
+    Read from the first multisine among the prospects, the wide one; exact for linear rivals with nothing to
+    absorb, a good guess otherwise, and judged by simulation like every other choice.
+    """
+    wide = [p for p in prospects if p.excitation.kind == "multisine"]
+    if not wide:
+        return []
+    voltage = wide[0].excitation.voltage_V
+    period = voltage.size // 2
+    _, remains = wide[0].distances(rivals)
+    last = [rest.reshape(-1, 2)[period : 2 * period] for rest in remains]
+    power = sum(
+        w * np.sum(np.abs(np.fft.rfft(rest, axis=0)) ** 2, axis=1)
+        for w, rest in zip(weights, last, strict=True)
+    )
+    drive = np.abs(np.fft.rfft(voltage[period : 2 * period])) ** 2
+    driven = np.flatnonzero(drive > 1e-6 * drive.max())
+    gain = np.asarray(power)[driven] / drive[driven]
+    lines = np.sort(driven[np.argsort(-gain, kind="stable")[:_TAILORED_LINES]])
+    return tailored_excitations(lines, voltage.size, rivals[0].rig.sampling.dt_s, limits.voltage_V, rng)
+
+
+def _noise(rig: Rig) -> Real:
+    return np.array([rig.sensors.hub_angle_noise_rad, rig.sensors.tip_noise_m])
+
+
+def _deflection(rig: Rig, output: Real) -> Real:
+    return np.asarray(output[:, 1] - (rig.hub.radius_m + rig.link.length_m) * output[:, 0])
+
+
+def _range(signals: Sequence[Real]) -> tuple[float, float]:
+    return float(min(s.min() for s in signals)), float(max(s.max() for s in signals))
+
+
+def _directions(rival: Rival, voltage: Real, whitened: Real, noise: Real) -> tuple[Real, Real]:
+    """Derivatives (2 T, P) by the free parameters and their precision (P, P)."""
+    if rival.directions is not None and rival.precision is not None:
+        J = np.asarray(rival.directions(voltage), dtype=np.float64)
+        L = np.asarray(rival.precision, dtype=np.float64)
+        if J.shape != (whitened.size, L.shape[0]) or L.shape != (J.shape[1], J.shape[1]):
+            raise ValueError(
+                f"rival {rival.name}: directions must be ({whitened.size}, P) and precision (P, P); "
+                f"got {J.shape} and {L.shape}"
+            )
+        return J, L
+    columns, precision = [], []
+    for rig, effects, step in _effect_steps(rival):
+        output = simulate(rig, voltage, effects).output / noise
+        columns.append((output.ravel() - whitened) / step)
+        precision.append(_LOG_PRECISION)
+    if rival.rig.tolerances:
+        effects = tuple(e for e in rival.effects if type(e).dependence != "jagged")
+        start = whitened
+        if len(effects) < len(rival.effects):
+            start = (simulate(rival.rig, voltage, effects).output / noise).ravel()
+        for key, tolerance in rival.rig.tolerances.items():
+            moved = rival.rig.scaled({key: 1.0 / (1.0 + tolerance * _TOLERANCE_STEP)})
+            output = simulate(moved, voltage, effects).output / noise
+            columns.append((output.ravel() - start) / _TOLERANCE_STEP)
+            precision.append(1.0)
+    if not columns:
+        return np.zeros((whitened.size, 0)), np.zeros((0, 0))
+    return np.column_stack(columns), np.diag(precision)
+
+
+def _effect_steps(rival: Rival) -> list[tuple[Rig, tuple[Effect, ...], float]]:
+    """The rival with one effect parameter moved: rig, effects, step; one entry per parameter."""
+    found = []
+    for k, effect in enumerate(rival.effects):
+        for name, value in effect.parameters().items():
+            step = _STEP[type(effect).dependence]
+            moved, step = _moved(effect, name, value, step)
+            if moved is not None:
+                effects = (*rival.effects[:k], moved, *rival.effects[k + 1 :])
+                found.append((rival.rig, effects, step))
+    return found
+
+
+def _moved(effect: Effect, name: str, value: float, step: float) -> tuple[Effect | None, float]:
+    """The effect with one parameter a small factor larger, or smaller at a bound; None at zero.
+
+    A phase moves by radians.
+    """
+    for signed in (step, -step):
+        target = value + signed if name == "phase_rad" else value * (1 + signed)
+        if target == value:
+            return None, step
+        try:
+            return EFFECTS[type(effect).id](**{**effect.parameters(), name: target}), signed
+        except ValueError:
+            continue
+    return None, step
+
+
+def _result(
+    chosen: _Prospect,
+    rivals: Sequence[Rival],
+    distance: Real,
+    weights: Real,
+    dt: float,
+    considered: tuple[Considered, ...],
+) -> NextExperiment:
+    x = chosen.excitation
+    pairs = []
+    for (a, b), d in zip(combinations([r.name for r in rivals], 2), distance, strict=True):
+        words = (
+            f"would separate {a} from {b} by {_number(d)} standard deviations"
+            if d >= _SEPARATES
+            else f"would not separate {a} from {b} ({_number(d)} standard deviations)"
+        )
+        pairs.append(Separation((a, b), float(d), float(d**2 / 2), words))
+    separates = bool(np.max(distance) >= _SEPARATES)
+    duration = x.voltage_V.size * dt
+    if separates:
+        told = "; it ".join(s.sentence for s in pairs)
+        sentence = (
+            f"Run next: {x.words}, {duration:.3g} s. It {told}. The hub stays within "
+            f"{chosen.hub[0]:.2g} to {chosen.hub[1]:.2g} rad, the deflection within "
+            f"{1e3 * chosen.deflection[0]:.2g} to {1e3 * chosen.deflection[1]:.2g} mm."
+        )
+    else:
+        names = _listed([r.name for r in rivals])
+        sentence = (
+            f"None of the {len(considered)} experiments looked at separates {names}: the best, {x.words}, "
+            f"parts them by {np.max(distance):.2g} standard deviations at most."
+        )
+    return NextExperiment(
+        x.kind,
+        dict(x.parameters),
+        x.amplitude_V,
+        float(duration),
+        dt,
+        x.voltage_V,
+        tuple(pairs),
+        _score(distance, weights)[1],
+        (chosen.hub[0], chosen.hub[1]),
+        (chosen.deflection[0], chosen.deflection[1]),
+        separates,
+        sentence,
+        considered,
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,0 +1,79 @@
+"""Surviving explanations of a diagnosis as rivals of the next experiment, with what their fits know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from diagnosis.case import Case, Real
+from diagnosis.fit import Fit
+from diagnosis.hypotheses import Hypothesis
+from diagnosis.next_experiment import Rival
+from diagnosis.nominal import NominalParameters
+from plant.effects import Effect
+from plant.simulate import simulate
+
+# In tolerances: small against one, large against the wobble of friction.
+_DEVIATION_STEP = 0.02
+# A set less probable than this is only kept when there would be no rival at all without it.
+_SURVIVES = 0.01
+
+
+def rivals_of(
+    case: Case, hypotheses: Sequence[Hypothesis], sets: Mapping[tuple[str, ...], float], at_most: int = 3
+) -> tuple[Rival, ...]:
+    """The most probable fitted sets of effects, two at least if that many were fitted.
+
+    Parameters
+    ----------
+    hypotheses
+        Of `search`; the best of every set counts.
+    sets
+        Sorted effect names -> probability, as `probabilities` gives them; names without a fit ("unknown") are
+        passed over.
+    """
+    if not at_most >= 2:
+        raise ValueError(f"rivals come in pairs at least; got at_most = {at_most}")
+    best: dict[tuple[str, ...], Hypothesis] = {}
+    for hypothesis in hypotheses:
+        key = tuple(sorted(hypothesis.names))
+        if key not in best or hypothesis.log_weight > best[key].log_weight:
+            best[key] = hypothesis
+    # Equally hopeless sets have probabilities of zero alike: their weight orders them.
+    ordered = sorted(best, key=lambda k: (sets.get(k, 0.0), best[k].log_weight), reverse=True)[:at_most]
+    kept = [k for i, k in enumerate(ordered) if i < 2 or sets.get(k, 0.0) >= _SURVIVES]
+    return tuple(rival_of_fit(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
+
+
+def rival_of_fit(case: Case, fit: Fit, probability: float) -> Rival:
+    """A fit as a rival: its rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
+    nominal = NominalParameters(case.rig)
+    noise = case.noise
+
+    def outputs(deviations: Real, effects: Sequence[Effect], voltage: Real) -> Real:
+        return np.asarray((simulate(nominal.at(deviations), voltage, effects).output / noise).ravel())
+
+    def directions(voltage: Real) -> Real:
+        # Contacts say little about a small change of a nominal parameter and cost most of the time.
+        calm = tuple(e for e in fit.effects if type(e).dependence != "jagged")
+        start = outputs(fit.deviations, calm, voltage)
+        columns = []
+        for k in range(nominal.count):
+            moved = fit.deviations.copy()
+            moved[k] += _DEVIATION_STEP
+            columns.append((outputs(moved, calm, voltage) - start) / _DEVIATION_STEP)
+        if len(calm) < len(fit.effects):
+            start = outputs(fit.deviations, fit.effects, voltage)
+        for i, (candidate, x) in enumerate(zip(fit.candidates, fit.coordinates, strict=True)):
+            high = candidate.box[1]
+            for a, axis in enumerate(candidate.axes):
+                step = axis.step if x[a] + axis.step <= high[a] else -axis.step
+                moved = x.copy()
+                moved[a] += step
+                effects = list(fit.effects)
+                effects[i] = candidate.effect_at(moved)
+                columns.append((outputs(fit.deviations, tuple(effects), voltage) - start) / step)
+        return np.column_stack(columns) if columns else np.zeros((start.size, 0))
+
+    return Rival(probability, nominal.at(fit.deviations), fit.effects, directions, fit.hessian)
