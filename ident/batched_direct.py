@@ -25,7 +25,7 @@ from ident.arrays import RealArray
 _THIRD = 1 / 3
 # Columns of a box: trisections of its longest side, cost, age, whether its side costs are known; then centre
 # (D), widths (D), side costs (2 D).
-_LEVEL, _COST, _AGE, _KNOWN, _CENTRE = range(5)
+_LEVEL, COST, _AGE, _KNOWN, _CENTRE = range(5)
 _ASKED = 2  # the side costs were asked for just now
 # After 32 trisections a box is as small as rounding; it is not divided again.
 _LEVELS = 32
@@ -39,25 +39,29 @@ def minimise_in_batches(
     E = evaluations; the cost may be asked for a few points more. The time for bookkeeping grows with E^2
     (about 0.2 s at 100 000).
     """
-    points, costs = np.empty((evaluations, dimension)), np.empty(evaluations)
-    boxes = np.zeros((evaluations + 2 * dimension + 1, _CENTRE + 4 * dimension))
-    boxes[0, _CENTRE : _CENTRE + dimension] = 0.5
-    boxes[0, _CENTRE + dimension : _CENTRE + 2 * dimension] = 1.0
-    points[0] = 0.5
-    hull = np.empty(_LEVELS, dtype=np.int64)
-    proposed = np.empty((_LEVELS * 2 * dimension, dimension))
-    # The first box is divided whatever its cost: its centre is asked for together with its sides.
-    n_hull, n_proposed = _choose(boxes, 1, hull, proposed)
-    values = cost(np.concatenate([points[:1], proposed[:n_proposed]]))
-    costs[0] = boxes[0, _COST] = values[0]
-    n_boxes, n_points, age = _divide(boxes, 1, 1, hull[:n_hull], values[1:], points, costs, 1)
+    points, costs, boxes, hull, proposed = room(dimension, evaluations)
+    boxes[0, COST] = costs[0] = cost(points[:1])[0]
+    n_boxes, n_points, age = 1, 1, 1
     while n_points < evaluations:
-        n_hull, n_proposed = _choose(boxes, n_boxes, hull, proposed)
+        n_hull, n_proposed = choose(boxes, n_boxes, hull, proposed)
         if n_hull == 0:  # every box is as small as rounding
             return points[:n_points], costs[:n_points]
         values = cost(proposed[:n_proposed]) if n_proposed else proposed[0, :0]
-        n_boxes, n_points, age = _divide(boxes, n_boxes, age, hull[:n_hull], values, points, costs, n_points)
+        n_boxes, n_points, age = divide(boxes, n_boxes, age, hull[:n_hull], values, points, costs, n_points)
     return points, costs
+
+
+@numba.njit(cache=True)
+def room(dimension: int, evaluations: int) -> Any:
+    """Points (E, D), the first in place, costs (E,), boxes with the first one but for its cost, and room for
+    the hull and for the points that an iteration proposes."""
+    points, costs = np.empty((evaluations, dimension)), np.empty(evaluations)
+    boxes = np.zeros((evaluations + 2 * dimension + 1, _CENTRE + 4 * dimension))
+    for i in range(dimension):
+        boxes[0, _CENTRE + i] = points[0, i] = 0.5
+        boxes[0, _CENTRE + dimension + i] = 1.0
+    hull, proposed = np.empty(_LEVELS, dtype=np.int64), np.empty((_LEVELS * 2 * dimension, dimension))
+    return points, costs, boxes, hull, proposed
 
 
 @numba.njit(cache=True)
@@ -85,20 +89,20 @@ def _lower_hull(boxes: Any, best: Any, hull: Any) -> int:
     """
     levels = np.flatnonzero(best >= 0)[::-1]
     first, last = best[levels[0]], best[levels[-1]]
-    d_first, f_first = _half_side(boxes, first), boxes[first, _COST]
+    d_first, f_first = _half_side(boxes, first), boxes[first, COST]
     hull[0] = first
     if levels.size == 1:
         return 1
-    chord = (boxes[last, _COST] - f_first) / (_half_side(boxes, last) - d_first)
+    chord = (boxes[last, COST] - f_first) / (_half_side(boxes, last) - d_first)
     n_hull = 1
     for level in levels[1:-1]:
         box = best[level]
-        d, f = _half_side(boxes, box), boxes[box, _COST]
+        d, f = _half_side(boxes, box), boxes[box, COST]
         if f > f_first + (d - d_first) * chord:
             continue
         while n_hull > 2:
-            d1, f1 = _half_side(boxes, hull[n_hull - 1]), boxes[hull[n_hull - 1], _COST]
-            d2, f2 = _half_side(boxes, hull[n_hull - 2]), boxes[hull[n_hull - 2], _COST]
+            d1, f1 = _half_side(boxes, hull[n_hull - 1]), boxes[hull[n_hull - 1], COST]
+            d2, f2 = _half_side(boxes, hull[n_hull - 2]), boxes[hull[n_hull - 2], COST]
             if (d1 - d2) * (f - f2) - (f1 - f2) * (d - d2) >= 0:
                 break
             n_hull -= 1
@@ -113,25 +117,25 @@ def _intercept(boxes: Any, hull: Any, i: int, d_before: float) -> float:
     """The hull's steeper edge at its point i, prolonged to d = 0; the largest boxes always count."""
     if i + 1 == hull.size:
         return -np.inf
-    d, f = _half_side(boxes, hull[i]), boxes[hull[i], _COST]
-    slope = (f - boxes[hull[i + 1], _COST]) / (d - _half_side(boxes, hull[i + 1]))
+    d, f = _half_side(boxes, hull[i]), boxes[hull[i], COST]
+    slope = (f - boxes[hull[i + 1], COST]) / (d - _half_side(boxes, hull[i + 1]))
     if i > 0:
-        slope = max(slope, (f - boxes[hull[i - 1], _COST]) / (d - d_before))
+        slope = max(slope, (f - boxes[hull[i - 1], COST]) / (d - d_before))
     return float(f - slope * d)
 
 
 @numba.njit(cache=True)
-def _choose(boxes: Any, n_boxes: int, hull: Any, proposed: Any) -> tuple[int, int]:
+def choose(boxes: Any, n_boxes: int, hull: Any, proposed: Any) -> tuple[int, int]:
     """Boxes on the hull, and the points needed to divide those that can turn out potentially optimal."""
     dimension = (boxes.shape[1] - _CENTRE) // 4
     best = np.full(_LEVELS, -1)
     lowest = np.inf
     for box in range(n_boxes):
-        level, value = int(boxes[box, _LEVEL]), boxes[box, _COST]
+        level, value = int(boxes[box, _LEVEL]), boxes[box, COST]
         lowest = min(lowest, value)
         if level < _LEVELS:
             old = best[level]
-            if old < 0 or (value, boxes[box, _AGE]) < (boxes[old, _COST], boxes[old, _AGE]):
+            if old < 0 or (value, boxes[box, _AGE]) < (boxes[old, COST], boxes[old, _AGE]):
                 best[level] = box
     if np.all(best < 0):
         return 0, 0
@@ -159,7 +163,7 @@ def _choose(boxes: Any, n_boxes: int, hull: Any, proposed: Any) -> tuple[int, in
 
 
 @numba.njit(cache=True)
-def _divide(
+def divide(
     boxes: Any, n_boxes: int, age: int, hull: Any, values: Any, points: Any, costs: Any, n_points: int
 ) -> tuple[int, int, int]:
     """Divide boxes of the hull one after the other, noting points and costs until there is no room for
@@ -222,7 +226,7 @@ def _divide(
                 for j in range(boxes.shape[1]):
                     boxes[new, j] = boxes[box, j]
                 boxes[new, _CENTRE + side] += (2 * k - 1) * boxes[box, widths + side]
-                boxes[new, _COST] = boxes[box, side_costs + 2 * side + k]
+                boxes[new, COST] = boxes[box, side_costs + 2 * side + k]
                 boxes[new, _AGE] = age
                 age += 1
                 n_boxes += 1

@@ -29,6 +29,8 @@ from ident.lane_signals import cascade_states, combine, pitch_of, products, row_
 _LEAST_PIVOT = 1e-8
 # Order of the numbers in an array of bounds (see `ident.polish.Bounds`).
 _DISTANCE_MIN, _DISTANCE_MAX, _OMEGA_MIN, _OMEGA_MAX, _ZETA_MIN, _ZETA_MAX, _S_MIN = range(7)
+# Steps that do not gain multiply the damping by this, by its square next, and so on.
+GROWTH = 4.0
 _CLOSE = 1e-7  # poles pass through exp and log on their way to a bound
 
 
@@ -186,8 +188,8 @@ def _fours(count: int) -> int:
 @numba.njit(cache=True)
 def room_for_rows(order: int, n_samples: int, feedthrough: bool, free: bool) -> int:
     """Length of the scratch array of `linearise_by_products`."""
-    n_columns = order * (2 if free else 1) + (1 if feedthrough else 0)
-    return int((_fours(n_columns) + _fours(order) + 2) * pitch_of(n_samples))
+    n_columns = _n_columns(order, feedthrough, free)
+    return int((_fours(n_columns) + _fours(order) + 3) * pitch_of(n_samples))
 
 
 @numba.njit(cache=True)
@@ -210,13 +212,55 @@ def linearise_by_products(
     record; free only with a single record; rows is zeros (`room_for_rows`), or what an earlier call with
     poles of the same number left there.
     """
-    n_total, n = y.size, normal.shape[0]
-    n_columns = n * (2 if free else 1) + (1 if feedthrough else 0)
+    n = normal.shape[0]
+    gram, on_local, on_residual = _room_for_products(n, local_q.shape[0], starts, feedthrough, free)
+    rss = _fit_by_products(
+        blocks, n_real, u, y, starts, local_q, feedthrough, free, rows, gram, on_local, on_residual
+    )
+    if rss >= 0:
+        _sensitivities_by_products(
+            blocks, n_real, y.size, starts, local_q, feedthrough, free, rows, gram, on_local, on_residual,
+            normal, gradient,
+        )  # fmt: skip
+    return float(rss)
+
+
+@numba.njit(cache=True)
+def _room_for_products(order: int, n_local: int, starts: Any, feedthrough: bool, free: bool) -> Any:
+    """Products of the rows with each other, with the nuisance columns of each record, with the residual."""
+    n_rows = _fours(_n_columns(order, feedthrough, free)) + _fours(order)
+    return np.empty((n_rows, n_rows)), np.zeros((n_rows, n_local * (starts.size - 1))), np.empty(n_rows)
+
+
+@numba.njit(cache=True)
+def _n_columns(order: int, feedthrough: bool, free: bool) -> int:
+    return order * (2 if free else 1) + (1 if feedthrough else 0)
+
+
+@numba.njit(cache=True)
+def _fit_by_products(
+    blocks: Any,
+    n_real: int,
+    u: Any,
+    y: Any,
+    starts: Any,
+    local_q: Any,
+    feedthrough: bool,
+    free: bool,
+    rows: Any,
+    gram: Any,
+    on_local: Any,
+    on_residual: Any,
+) -> float:
+    """J of `linearise_by_products`: all that a step which does not gain needs."""
+    n_total, n = y.size, 2 * blocks.shape[0] - n_real
+    n_columns = _n_columns(n, feedthrough, free)
     first = _fours(n_columns)  # the row of the first state
     n_rows = first + _fours(n)
     pitch = pitch_of(n_total)
     fitted = rows[n_rows * pitch : (n_rows + 1) * pitch]
     output = rows[(n_rows + 1) * pitch : (n_rows + 2) * pitch]
+    residual = rows[(n_rows + 2) * pitch : (n_rows + 3) * pitch]
     _put(output, y)
     for r in range(starts.size - 1):
         cascade_states(blocks, n_real, u, starts[r], starts[r + 1], rows, 0, pitch)
@@ -224,10 +268,7 @@ def linearise_by_products(
         run_cascade_free(blocks, n_real, rows.reshape((-1, pitch)), n, n_total)
     if feedthrough:
         _put(rows[(n_columns - 1) * pitch :], u)
-    gram = np.empty((n_rows, n_rows))
     products(rows, pitch, 0, first, gram)
-    n_local = local_q.shape[0]
-    on_local = np.zeros((n_rows, n_local * (starts.size - 1)))
     _project_products(rows, pitch, 0, n_columns, local_q, starts, on_local, gram)
     theta = np.zeros(n_rows)
     row_products(rows, pitch, first, output, theta)
@@ -236,21 +277,51 @@ def linearise_by_products(
     _forward(gram, n_columns, theta)
     _backward(gram, n_columns, theta)
     combine(rows, pitch, first, theta, fitted)
-    for r in range(starts.size - 1):
-        single_states(blocks, n_real, fitted, starts[r], starts[r + 1], rows, first, pitch)
+    # The residual before refinement.
     for k in range(n_total):
-        fitted[k] = output[k] - fitted[k]
-    # From here on "fitted" is the residual before refinement.
+        residual[k] = output[k] - fitted[k]
     for r in range(starts.size - 1):
         lo, hi = starts[r], starts[r + 1]
-        for i in range(n_local):
-            _subtract(fitted, _dot(local_q[i], fitted, lo, hi), local_q[i], lo, hi)
+        for i in range(local_q.shape[0]):
+            _subtract(residual, _dot(local_q[i], residual, lo, hi), local_q[i], lo, hi)
+    row_products(rows, pitch, first, residual, on_residual)
+    # Multiplied with L^-1 on the side of the columns: what of the residual lies in them.
+    _forward(gram, n_columns, on_residual)
+    rss = _dot(residual, residual, 0, n_total)
+    for q in range(n_columns):
+        rss -= on_residual[q] ** 2
+    return float(rss)
+
+
+@numba.njit(cache=True)
+def _sensitivities_by_products(
+    blocks: Any,
+    n_real: int,
+    n_total: int,
+    starts: Any,
+    local_q: Any,
+    feedthrough: bool,
+    free: bool,
+    rows: Any,
+    gram: Any,
+    on_local: Any,
+    on_residual: Any,
+    normal: Any,
+    gradient: Any,
+) -> None:
+    """The rest of `linearise_by_products`, from what `_fit_by_products` left in the same arrays."""
+    n = normal.shape[0]
+    n_columns = _n_columns(n, feedthrough, free)
+    first = _fours(n_columns)
+    n_rows = first + _fours(n)
+    pitch = pitch_of(n_total)
+    fitted = rows[n_rows * pitch : (n_rows + 1) * pitch]
+    residual = rows[(n_rows + 2) * pitch : (n_rows + 3) * pitch]
+    for r in range(starts.size - 1):
+        single_states(blocks, n_real, fitted, starts[r], starts[r + 1], rows, first, pitch)
     products(rows, pitch, first, n_rows, gram)
     _project_products(rows, pitch, first, first + n, local_q, starts, on_local, gram)
-    on_residual = np.empty(n_rows)
-    row_products(rows, pitch, n_rows, fitted, on_residual)
-    # Multiplied with L^-1 on the side of the columns: what of the states and the residual lies in them.
-    _forward(gram, n_columns, on_residual)
+    row_products(rows[first * pitch :], pitch, n_rows - first, residual, on_residual[first:])
     for i in range(first, first + n):
         _forward(gram, n_columns, gram[i])
     for i in range(n):
@@ -263,10 +334,6 @@ def linearise_by_products(
         gradient[i] = on_residual[first + i]
         for q in range(n_columns):
             gradient[i] -= gram[first + i, q] * on_residual[q]
-    rss = _dot(fitted, fitted, 0, n_total)
-    for q in range(n_columns):
-        rss -= on_residual[q] ** 2
-    return float(rss)
 
 
 @numba.njit(cache=True)
@@ -308,30 +375,58 @@ def descend(
     free: bool,
     tolerance: float,
     max_iterations: int,
+    damping: float,
 ) -> tuple[float, int, bool]:
     """Levenberg-Marquardt from the poles given in real and pairs, which receive the end; see
     `ident.polish.polish`.
 
-    y_clear is y without its part in local_q. Returns J, the number of iterations and whether the end is
+    y_clear is y without its part in local_q; damping is that of the first step.
+    Returns J, the number of iterations and whether the end is
     stationary.
     """
     n, n_free_real = real.size + 2 * pairs.size, real.size - n_fixed_real
     rows = np.zeros(room_for_rows(n, y.size, feedthrough, free))
+    gram, on_local, on_residual = _room_for_products(n, local_q.shape[0], starts, feedthrough, free)
     residual = np.empty(y.size)
+    # With free responses of several records the orthogonal factorisation alone.
+    by_products = not free or starts.size == 2
     x = clip_parameters(free_parameters(real, pairs, n_fixed_real, n_fixed_pairs), n_free_real, bounds)
     _set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
     normal, gradient = np.empty((n, n)), np.empty(n)
     trial_normal, trial_gradient = np.empty((n, n)), np.empty(n)
     trial_real, trial_pairs = real.copy(), pairs.copy()
-    here = _linearised(
-        _blocks(real, pairs), real.size, u, y, y_clear, starts, polynomials, local_q, feedthrough, free, rows,
-        residual, normal, gradient,
-    )  # fmt: skip
+    here, fast = -1.0, False
+    blocks = _blocks(real, pairs)
+    if by_products:
+        here = _fit_by_products(
+            blocks,
+            real.size,
+            u,
+            y_clear,
+            starts,
+            local_q,
+            feedthrough,
+            free,
+            rows,
+            gram,
+            on_local,
+            on_residual,
+        )
+        fast = here >= 0
+    if fast:
+        _sensitivities_by_products(
+            blocks, real.size, y.size, starts, local_q, feedthrough, free, rows, gram, on_local, on_residual,
+            normal, gradient,
+        )  # fmt: skip
+    else:
+        here = linearise(
+            blocks, real.size, u, y, starts, polynomials, feedthrough, free, residual, normal, gradient
+        )
     if x.size == 0:
         return here, 0, True
     # Residuals at rounding level relative to the output: nothing left to gain.
     floor = 1e-26 * _dot(y, y, 0, y.size)
-    damping, growth = 1e-3, 2.0
+    growth = GROWTH
     system, factor = np.empty((x.size, x.size)), np.empty((x.size, x.size))
     for iteration in range(max_iterations):
         if here <= floor:
@@ -367,10 +462,19 @@ def descend(
                     trial_x[free_ones[i]] += step[i] / scale[i]
                 trial_x = clip_parameters(trial_x, n_free_real, bounds)
                 _set_poles(trial_x, trial_real, trial_pairs, n_fixed_real, n_fixed_pairs)
-                there = _linearised(
-                    _blocks(trial_real, trial_pairs), real.size, u, y, y_clear, starts, polynomials, local_q,
-                    feedthrough, free, rows, residual, trial_normal, trial_gradient,
-                )  # fmt: skip
+                blocks = _blocks(trial_real, trial_pairs)
+                there = -1.0
+                if by_products:
+                    there = _fit_by_products(
+                        blocks, real.size, u, y_clear, starts, local_q, feedthrough, free, rows, gram,
+                        on_local, on_residual,
+                    )  # fmt: skip
+                fast = there >= 0
+                if not fast:
+                    there = linearise(
+                        blocks, real.size, u, y, starts, polynomials, feedthrough, free, residual,
+                        trial_normal, trial_gradient,
+                    )  # fmt: skip
                 promised = 0.0
                 for i in range(m):
                     along = 2 * slope[i]
@@ -382,42 +486,19 @@ def descend(
                 if ratio > 1e-4:
                     break
             damping *= growth
-            growth *= 2
+            growth *= GROWTH
             if damping > 1e12:
                 # No step of any length gains: the linearisation's promise is rounding, or a bound's corner.
                 return here, iteration, False
+        if fast:
+            _sensitivities_by_products(
+                blocks, real.size, y.size, starts, local_q, feedthrough, free, rows, gram, on_local,
+                on_residual, trial_normal, trial_gradient,
+            )  # fmt: skip
         x, here = trial_x, there
         _set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
         normal, trial_normal = trial_normal, normal
         gradient, trial_gradient = trial_gradient, gradient
         damping *= max(1 / 5, 1 - (2 * ratio - 1) ** 3)
-        growth = 2.0
+        growth = GROWTH
     return here, max_iterations, False
-
-
-@numba.njit(cache=True)
-def _linearised(
-    blocks: Any,
-    n_real: int,
-    u: Any,
-    y: Any,
-    y_clear: Any,
-    starts: Any,
-    polynomials: Any,
-    local_q: Any,
-    feedthrough: bool,
-    free: bool,
-    rows: Any,
-    residual: Any,
-    normal: Any,
-    gradient: Any,
-) -> float:
-    if not free or starts.size == 2:
-        rss = linearise_by_products(
-            blocks, n_real, u, y_clear, starts, local_q, feedthrough, free, rows, normal, gradient
-        )
-        if rss >= 0:
-            return float(rss)
-    return float(
-        linearise(blocks, n_real, u, y, starts, polynomials, feedthrough, free, residual, normal, gradient)
-    )

@@ -17,9 +17,10 @@ from ident.direct import best_apart, minimise
 from ident.frf_polish import polish_response
 from ident.frf_regression import FrfRegression, fit_response
 from ident.options import IdentOptions
-from ident.order_selection import OrderStep, effective_samples
+from ident.order_selection import OrderStep
 from ident.poles import Poles
 from ident.polish import Bounds, Polished
+from ident.residual_colour import effective_samples
 from ident.search_trace import PolishedMinimum, SearchStage
 
 _GAIN = 1e-6

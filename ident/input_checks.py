@@ -15,11 +15,11 @@ from scipy.special import chdtri
 from ident.arrays import RealArray
 from ident.least_squares import linearisation
 from ident.model import GobfModel
-from ident.order_selection import effective_samples
 from ident.poles import Poles
 from ident.polish import pole_system
 from ident.record import Record
 from ident.regression import Regression
+from ident.residual_colour import effective_samples
 
 # An input is there at a frequency if it has this share of the density that it would have if its power were
 # spread evenly up to Nyquist ...

@@ -74,8 +74,12 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
     first-order changes of the poles are taken out of it (design 4.3).
     """
     local = shared if local is None else local
+    free = local.order > 0 and data.structure.estimate_initial_state
+    if shared.order == 0 and not free and not data.structure.feedthrough:
+        nothing = np.zeros((0, data.n_samples))
+        return Projection(data.polynomials_q, nothing, np.zeros((0, 0)), data.y_clear.copy())
     columns = shared_columns(data, shared)
-    if local.order and data.structure.estimate_initial_state:
+    if free:
         residual = data.y.copy()
         local_q = np.zeros((data.polynomials.shape[0] + local.order, data.n_samples))
         for i in range(data.n_records):
@@ -164,5 +168,7 @@ def linearisation(data: Regression, poles: Poles) -> Linearisation:
 
 def driving_signal(data: Regression, poles: Poles) -> RealArray:
     """The input sent through the all-pass of the poles, (N,): what drives the next block of the cascade."""
+    if poles.order == 0:
+        return data.u
     parts = [all_pass_signal(poles, data.u[data.segment(i)]) for i in range(data.n_records)]
     return np.concatenate(parts)

@@ -13,14 +13,14 @@ from ident.arrays import RealArray
 from ident.basis import block_parameters, run_cascade_free
 from ident.candidate_cost import CandidateCost
 from ident.coordinates import SearchSpace
-from ident.descent import blocked, chain_rule, clip_parameters, free_parameters
+from ident.descent import GROWTH, blocked, chain_rule, clip_parameters, free_parameters
 from ident.kernels import _schur_drop
 from ident.miso_regression import MisoRegression, driven, linearisation, project
 from ident.options import IdentOptions
-from ident.order_selection import OrderSelection, Progress, effective_samples
-from ident.pole_search import PoleSearch
+from ident.order_selection import OrderSelection, Progress
+from ident.pole_search import ROUGH, PoleSearch
 from ident.poles import Poles
-from ident.polish import Bounds, Polished
+from ident.polish import FAR, NEAR, Bounds, Polished
 from ident.search_trace import PolishedMinimum
 
 # Below this fraction of |y|^2 the Gram matrix of the candidates knows nothing; descents see the true
@@ -35,6 +35,7 @@ class MisoCost(CandidateCost):
     def __init__(self, data: MisoRegression, space: SearchSpace, shared: Poles, local: Poles) -> None:
         self.space = space
         self.evaluations = 0
+        self._together = None
         self._floor = _FLOOR * float(data.y @ data.y)
         self._data = data
         frozen = project(data, shared, local)
@@ -77,6 +78,7 @@ class MisoSearch(PoleSearch):
     """`PoleSearch` on the joint cost of several inputs."""
 
     data: MisoRegression
+    patience = 1  # descents take far longer than for one input
 
     def __init__(self, data: MisoRegression, options: IdentOptions) -> None:
         super().__init__(data, options)
@@ -84,10 +86,14 @@ class MisoSearch(PoleSearch):
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
         return MisoCost(self.data, space, shared, local)
 
+    def residual(self, poles: Poles) -> RealArray:
+        return project(self.data, poles).residual
+
     def descend(self, poles: Poles, stage: str, tolerance: float = 1e-9) -> Polished:
         """Polish from the given poles (fixed ones first) and note the end in the trace."""
         n_fixed = self.fixed.real.size, self.fixed.pairs.size
-        end = polish(self.data, poles, self.bounds, n_fixed, tolerance=tolerance)
+        damping = FAR if tolerance >= ROUGH else NEAR
+        end = polish(self.data, poles, self.bounds, n_fixed, tolerance=tolerance, damping=damping)
         self.evaluations += end.iterations + 1
         self.minima.append(PolishedMinimum(stage, end.poles, end.rss))
         return end
@@ -101,10 +107,6 @@ class MisoSelection(OrderSelection):
     def __init__(self, search: MisoSearch, progress: Progress) -> None:
         super().__init__(search, progress)
 
-    def _worth(self, end: Polished) -> float:
-        data = self.search.data
-        return effective_samples(project(data, end.poles).residual, data.starts)
-
 
 def polish(
     data: MisoRegression,
@@ -114,6 +116,7 @@ def polish(
     *,
     max_iterations: int = 60,
     tolerance: float = 1e-9,
+    damping: float = NEAR,
 ) -> Polished:
     """Levenberg-Marquardt as in `ident.descent.descend`; the first n_fixed real poles and pairs stay.
 
@@ -127,7 +130,7 @@ def polish(
         return Polished(poles, here.rss, 0, True)
     # Residuals at rounding level relative to the output: nothing left to gain.
     floor = 1e-26 * float(data.y @ data.y)
-    damping, growth = 1e-3, 2.0
+    growth = GROWTH
     for iteration in range(max_iterations):
         chain = chain_rule(*poles.writable(), *n_fixed)
         system, slope = chain.T @ here.normal @ chain, chain.T @ here.gradient
@@ -149,12 +152,12 @@ def polish(
             ratio = (here.rss - trial.rss) / promised if promised > 0 else 0.0
             if ratio > 1e-4:
                 break
-            damping, growth = damping * growth, 2 * growth
+            damping, growth = damping * growth, GROWTH * growth
             if damping > 1e12:
                 # No step of any length gains: the linearisation's promise is rounding, or a bound's corner.
                 return Polished(poles, here.rss, iteration, False)
         x, poles, here = trial_x, trial_poles, trial
-        damping, growth = damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), 2.0
+        damping, growth = damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), GROWTH
     return Polished(poles, here.rss, max_iterations, False)
 
 

@@ -17,9 +17,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from ident.least_squares import linearisation
-from ident.order_selection import effective_samples
 from ident.polish import Bounds, Polished, free_optimality
 from ident.regression import Regression
+from ident.residual_colour import effective_samples
 
 # A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
 NUISANCE_LEVEL = 0.99

@@ -79,12 +79,17 @@ class IdentOptions(BaseModel):
         "best poles more often than not",
     )
     evaluations: int = Field(
-        350, ge=20, le=1_000_000, description="cost evaluations of the first global search"
+        250, ge=20, le=1_000_000, description="cost evaluations of the first global search"
     )
     search_samples: int = Field(
         20_000, ge=100, description="longer data are searched on a part of them, then polished on all"
     )
-    starts: int = Field(4, ge=1, le=20, description="points of a global search that are polished")
+    starts: int = Field(
+        4,
+        ge=1,
+        le=20,
+        description="points of a global search that are polished; five times as many if the first disagree",
+    )
 
     omega_min_rad_s: float | None = Field(None, gt=0, description="lowest natural frequency of a pair")
     omega_max_rad_s: float | None = Field(None, gt=0, description="highest natural frequency of a pair")

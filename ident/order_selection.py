@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
-from ident.arrays import RealArray
-from ident.least_squares import linearisation
 from ident.options import IdentOptions
 from ident.pole_search import PoleSearch
 from ident.poles import Poles
@@ -41,27 +37,6 @@ class OrderStep:
         return self.n_real + 2 * self.n_pairs
 
 
-def effective_samples(residual: RealArray, starts: npt.NDArray[np.int64]) -> float:
-    """Number of independent samples a residual is worth: N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth.
-
-    Bartlett: that factor is by how much colour widens the scatter of quadratic forms such as J. With N
-    itself a criterion goes on adding poles that describe noise, friction and the like, without end on long
-    records.
-    """
-    n = residual.size
-    lags = min(200, int(np.min(np.diff(starts))) // 10)
-    covariance = np.zeros(lags + 1)
-    for lo, hi in pairwise(starts):
-        part = residual[lo:hi]
-        size = 1 << int(2 * part.size - 1).bit_length()
-        covariance += np.fft.irfft(np.abs(np.fft.rfft(part, size)) ** 2, size)[: lags + 1]
-    if not covariance[0] > 0:
-        return float(n)
-    rho = covariance[1:] / covariance[0]
-    # What white noise shows by chance, 1/N per lag, is no colour.
-    return float(n / (1 + 2 * np.sum(np.maximum(rho**2 - 1 / n, 0.0))))
-
-
 class OrderSelection:
     """Grows and prunes the set of poles of one search."""
 
@@ -70,7 +45,6 @@ class OrderSelection:
         self.options: IdentOptions = search.options
         self.progress = progress
         self._tried: dict[tuple[int, int], float] = {}
-        self._last_worth: tuple[Polished, float] | None = None
         self._n = search.data.n_samples
         self._power = float(search.data.y @ search.data.y)
 
@@ -105,16 +79,14 @@ class OrderSelection:
         return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
 
     def worth(self, end: Polished) -> float:
-        """Independent samples that the residual of an end is worth; kept for the last end asked for."""
-        if self._last_worth is None or self._last_worth[0] is not end:
-            self._last_worth = end, self._worth(end)
-        return self._last_worth[1]
+        """Independent samples that the residual of an end is worth."""
+        return self.search.colour(end).effective_samples
 
     def _grow_pairs(self, best: Polished, most_pairs: int) -> Polished:
         while (count := self._counts(best)[1]) < most_pairs and self._visible(best):
             self.progress(0.1 + 0.8 * count / max(most_pairs, 1), f"search for pole pair {count + 1}")
             trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
-            if self.options.n_pairs is None and not self._better(trial, best, self._worth(trial)):
+            if self.options.n_pairs is None and not self._better(trial, best, self.worth(trial)):
                 break
             best = trial
         return best
@@ -122,7 +94,7 @@ class OrderSelection:
     def _grow_real(self, best: Polished) -> Polished:
         while self._counts(best)[0] < self.options.max_real and self._visible(best):
             trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
-            if not self._better(trial, best, self._worth(trial)):
+            if not self._better(trial, best, self.worth(trial)):
                 break
             best = trial
         return best
@@ -138,7 +110,7 @@ class OrderSelection:
             if self.options.n_pairs is None:
                 for i in range(fixed.pairs.size, best.poles.pairs.size):
                     trials.append(Poles(best.poles.real, np.delete(best.poles.pairs, i)))
-            worth = self._worth(best) if trials else 0.0
+            worth = self.worth(best) if trials else 0.0
             ends = [self._noted(self.search.descend(poles, "pruning", 1e-4)) for poles in trials]
             ends = [end for end in ends if self._better(end, best, worth)]
             if not ends:
@@ -155,10 +127,6 @@ class OrderSelection:
     def _criterion(self, rss: float, order: int, worth: float) -> float:
         floor = max(rss, _EXPLAINED * self._power, np.finfo(np.float64).tiny)
         return float(worth * np.log(floor / self._n) + self.search.data.n_parameters(order) * np.log(worth))
-
-    def _worth(self, end: Polished) -> float:
-        data = self.search.data
-        return effective_samples(linearisation(data, end.poles).residual, data.starts)
 
     def _visible(self, best: Polished) -> bool:
         enough = self._n > 2 * self.search.data.n_parameters(best.poles.order + 2)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import cmath
 from collections.abc import Callable
 from functools import cache, partial
-from itertools import combinations_with_replacement, cycle, islice
+from itertools import combinations_with_replacement, cycle, islice, pairwise
 
 import numpy as np
 
 from ident.arrays import RealArray
 from ident.candidate_cost import CandidateCost
 from ident.coordinates import SearchSpace, search_space
-from ident.direct import best_apart, minimise
+from ident.direct import best_apart
+from ident.least_squares import linearisation
 from ident.options import IdentOptions
 from ident.poles import Poles
-from ident.polish import Bounds, Polished, polish
+from ident.polish import FAR, NEAR, Bounds, Polished, polish
 from ident.regression import Regression
+from ident.residual_colour import ResidualColour, residual_colour
 from ident.search_trace import PolishedMinimum, SearchStage
 
 # A rescan has to gain this fraction of J to count.
@@ -24,7 +27,7 @@ _GAIN = 1e-6
 _ROUNDS = 6
 # Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
 # end.
-_ROUGH = 1e-3
+ROUGH = 1e-3
 # So many starts that end in one place make a rescan superfluous.
 _STARTS_TO_AGREE = 3
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
@@ -33,8 +36,11 @@ _REAL_GRID = 9
 _PAIR_GRID = (60, 3)
 # Ends of rough descents are one optimum if they differ in J by no more than what such descents leave, in a
 # pole by no more than this fraction; of rates below the box's slowest nothing is told anyway.
-_SAME_COST = 3 * _ROUGH
+_SAME_COST = 3 * ROUGH
 _SAME_POLE = 0.1
+# Share of the output's power up to which a residual counts as little: with more noise than that many minima
+# lie close together, and a whiteness test does not tell them apart.
+_LITTLE_NOISE = 0.02
 
 
 class PoleSearch:
@@ -42,6 +48,8 @@ class PoleSearch:
 
     The fixed poles come first among the poles of each type and are never moved.
     """
+
+    patience = 5
 
     def __init__(self, data: Regression, options: IdentOptions) -> None:
         self.data = data
@@ -51,7 +59,11 @@ class PoleSearch:
         self.stages: list[SearchStage] = []
         self.minima: list[PolishedMinimum] = []
         self.evaluations = 0
-        self._agreed: Polished | None = None
+        # Slower than the box of the search goes, of which a record says nothing.
+        self._slowest = 0.2 / max(data.longest, 30)
+        self._power = float(data.y_clear @ data.y_clear)
+        self._settled: Polished | None = None
+        self._coloured: tuple[Polished, ResidualColour] | None = None
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self.options)
@@ -61,36 +73,56 @@ class PoleSearch:
         return CandidateCost(self.data, space, shared, local)
 
     def joint(self, n_real: int, n_pairs: int) -> Polished:
-        """Best poles of a joint global search over n_real real poles and n_pairs pairs."""
+        """Best poles of a joint global search over n_real real poles and n_pairs pairs.
+
+        The search has settled if the first starts, points of the cube far from each other, all end in one
+        place that can be trusted (`_is_trusted`). Agreement by itself is not enough: a broad wrong minimum
+        can catch several starts, but leaves dynamics in the residual. Else `patience` times as many starts
+        are tried: more of them find more than more evaluations do.
+        """
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
         cost = self.candidate_cost(space, self.fixed, self.fixed)
-        points = self._global(title, cost, self.options.evaluations)
-        starts = [self.fixed.appended(space.poles(point)) for point in points]
+        few = self.options.starts
+        points = self._global(title, cost, self.options.evaluations, self.patience * few)
+
+        def starts(chosen: RealArray) -> list[Poles]:
+            return [self.fixed.appended(space.poles(point)) for point in chosen]
+
         known = len(self.minima)
-        best = self._best_descent(starts, title)
-        ends = self.minima[known : known + len(starts)]
-        if len(ends) >= _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends):
-            self._agreed = best
+        best = self._best_descent(starts(points[:few]), title)
+        ends = self.minima[known : known + len(points[:few])]
+        agreed = len(ends) >= _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
+        if agreed and self._is_trusted(best):
+            self._settled = best
+            return best
+        if len(points) > few:
+            other = self._best_rough(starts(points[few:]), title)
+            if other.rss < best.rss * (1 - _GAIN):
+                best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
         return best
+
+    def _is_trusted(self, best: Polished) -> bool:
+        """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real poles.
+
+        Two real poles that meet stay together in a descent, although apart they may fit better.
+        """
+        distances = sorted(1 - a for a in best.poles.real[self.fixed.real.size :].tolist())
+        meeting = any(
+            fast > self._slowest / 4 and fast - slow <= _SAME_POLE * fast
+            for slow, fast in pairwise(distances)
+        )
+        return not meeting and best.rss <= _LITTLE_NOISE * self._power and self.colour(best).white
 
     def _is_same(self, end: PolishedMinimum, best: Polished) -> bool:
         """Whether a rough descent was on its way to `best`."""
-        slack = 0.2 / max(self.data.longest, 30)
-
-        def apart(ours: RealArray, theirs: RealArray) -> bool:
-            return bool(
-                np.any(np.abs(np.sort(ours) - np.sort(theirs)) > _SAME_POLE * np.sort(theirs) + slack)
-            )
-
-        pairs, best_pairs = np.log(end.poles.pairs), np.log(best.poles.pairs)
-        return (
-            end.rss <= best.rss * (1 + _SAME_COST)
-            and not apart(1 - end.poles.real, 1 - best.poles.real)
-            and not apart(np.abs(pairs), np.abs(best_pairs))
-            and not apart(-pairs.real, -best_pairs.real)
+        if end.rss > best.rss * (1 + _SAME_COST):
+            return False
+        return all(
+            abs(ours - theirs) <= _SAME_POLE * theirs + self._slowest
+            for ours, theirs in zip(_rates(end.poles), _rates(best.poles), strict=True)
         )
 
     def add_pair(self, poles: Poles) -> Polished:
@@ -98,7 +130,9 @@ class PoleSearch:
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
         cost = self.candidate_cost(space, poles.doubled(), poles)
-        points = self._global(title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations))
+        points = self._global(
+            title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations), self.options.starts
+        )
         return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
 
     def add_real(self, poles: Poles) -> Polished:
@@ -116,10 +150,9 @@ class PoleSearch:
         """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round
         gains nothing.
 
-        Not if `best` is where every start of the joint search ended: points of the cube far from each other,
-        each the best of its surroundings. Over 250 searches where they agree no rescan gained anything.
+        Not if the joint search settled on `best`.
         """
-        if best is self._agreed:
+        if best is self._settled:
             return best
         n_fixed_real, n_fixed_pairs = self.fixed.real.size, self.fixed.pairs.size
         n_real, n_pairs = best.poles.real.size, best.poles.pairs.size
@@ -185,10 +218,20 @@ class PoleSearch:
             start, known = looks(point)
             if known:
                 continue
-            trial = self.descend(start, "rescan", _ROUGH)
+            trial = self.descend(start, "rescan", ROUGH)
             if trial.rss < found.rss * (1 - _GAIN):
                 found = self.descend(trial.poles, "rescan")
         return found
+
+    def residual(self, poles: Poles) -> RealArray:
+        """What the fit with these poles leaves of the output, (N,)."""
+        return linearisation(self.data, poles).residual
+
+    def colour(self, end: Polished) -> ResidualColour:
+        """Colour of the residual of an end; kept for the last end asked for."""
+        if self._coloured is None or self._coloured[0] is not end:
+            self._coloured = end, residual_colour(self.residual(end.poles), self.data.starts)
+        return self._coloured[1]
 
     def descend(self, poles: Poles, stage: str, tolerance: float = 1e-9) -> Polished:
         """Polish from the given poles (fixed ones first) and note the end in the trace."""
@@ -199,20 +242,33 @@ class PoleSearch:
             n_fixed_real=self.fixed.real.size,
             n_fixed_pairs=self.fixed.pairs.size,
             tolerance=tolerance,
+            damping=FAR if tolerance >= ROUGH else NEAR,
         )
         self.evaluations += end.iterations + 1
         self.minima.append(PolishedMinimum(stage, end.poles, end.rss))
         return end
 
     def _best_descent(self, starts: list[Poles], stage: str) -> Polished:
-        rough = min((self.descend(start, stage, _ROUGH) for start in starts), key=lambda end: end.rss)
-        return self.descend(rough.poles, stage)
+        return self.descend(self._best_rough(starts, stage).poles, stage)
 
-    def _global(self, title: str, cost: CandidateCost, evaluations: int) -> RealArray:
-        points, costs = minimise(cost.log, cost.space.dimension, self.options.algorithm, evaluations)
+    def _best_rough(self, starts: list[Poles], stage: str) -> Polished:
+        return min((self.descend(start, stage, ROUGH) for start in starts), key=lambda end: end.rss)
+
+    def _global(self, title: str, cost: CandidateCost, evaluations: int, count: int) -> RealArray:
+        points, costs = cost.minimise(self.options.algorithm, evaluations)
         self.evaluations += cost.evaluations
         self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
-        return best_apart(points, costs, self.options.starts)
+        return best_apart(points, costs, count)
+
+
+def _rates(poles: Poles) -> list[float]:
+    """Decays of the real poles, frequencies of the pairs and their decays per sample, each by size."""
+    pairs = [cmath.log(pole) for pole in poles.pairs.tolist()]
+    return [
+        *sorted(1 - a for a in poles.real.tolist()),
+        *sorted(abs(log) for log in pairs),
+        *sorted(-log.real for log in pairs),
+    ]
 
 
 @cache

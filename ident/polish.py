@@ -16,13 +16,18 @@ from functools import cached_property
 
 import numpy as np
 
-from ident.arrays import RealArray
+from ident.arrays import RealArray, kernel_array
 from ident.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.descent import blocked, chain_rule, clip_parameters, descend, free_parameters
+from ident.kernels import _schur_drop
 from ident.least_squares import Linearisation
 from ident.options import IdentOptions
 from ident.poles import Poles
 from ident.regression import Regression
+
+# Damping of the first step in units of the scaled normal matrix. From afar a full step mostly leads too far:
+# half the evaluations of a descent that starts boldly are steps taken back.
+NEAR, FAR = 1e-3, 1.0
 
 
 @dataclass(frozen=True)
@@ -104,10 +109,12 @@ def polish(
     n_fixed_pairs: int = 0,
     max_iterations: int = 60,
     tolerance: float = 1e-9,
+    damping: float = NEAR,
 ) -> Polished:
     """Descend from the given poles; the first n_fixed ones of each type stay where they are.
 
-    Stops when the decrease that the linearisation still promises is below `tolerance` of J.
+    Stops when the decrease that the linearisation still promises is below `tolerance` of J. damping is that
+    of the first step: `NEAR` an optimum, or `FAR` from one.
     """
     real, pairs = poles.writable()
     rss, iterations, converged = descend(
@@ -126,6 +133,7 @@ def polish(
         data.structure.estimate_initial_state,
         tolerance,
         max_iterations,
+        damping,
     )
     return Polished(Poles(real, pairs), rss, iterations, converged)
 
@@ -154,7 +162,6 @@ def free_optimality(
     free = np.flatnonzero(~blocked(x, gradient, poles.real.size - n_fixed_real, bounds.array))
     scale = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
     slope = gradient[free] / scale
-    share = (
-        slope @ np.linalg.lstsq(normal[np.ix_(free, free)] / np.outer(scale, scale), slope, rcond=1e-12)[0]
-    )
+    scaled = kernel_array(normal[np.ix_(free, free)] / (scale[:, None] * scale))
+    share = float(_schur_drop(scaled, slope))
     return float(np.sqrt(max(share, 0.0) / here.rss))

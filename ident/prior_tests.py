@@ -21,12 +21,13 @@ from scipy.stats import chi2
 
 from ident.arrays import RealArray
 from ident.least_squares import fit
-from ident.order_selection import OrderSelection, effective_samples
+from ident.order_selection import OrderSelection
 from ident.pole_search import PoleSearch
 from ident.poles import Poles
 from ident.polish import Polished
 from ident.record import Record
 from ident.regression import Regression, prepare
+from ident.residual_colour import effective_samples
 from ident.structure import Structure
 from ident.structured_fit import structured_fit, structured_polish
 

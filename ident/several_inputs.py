@@ -27,11 +27,12 @@ from ident.miso_regression import (
 )
 from ident.miso_search import MisoSearch, MisoSelection
 from ident.options import IdentOptions
-from ident.order_selection import Progress, effective_samples
+from ident.order_selection import Progress
 from ident.pole_warnings import pole_warnings
 from ident.polish import Bounds, Polished, free_optimality
 from ident.record import Record
 from ident.regression import thinned
+from ident.residual_colour import effective_samples
 from ident.search_trace import SearchTrace
 
 # As in `ident.identify`: level at which a nuisance left to the data stays, and how far initial states may

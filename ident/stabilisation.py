@@ -23,12 +23,13 @@ from ident.arrays import RealArray, readonly_real
 from ident.identification import Identification
 from ident.least_squares import fit
 from ident.options import IdentOptions
-from ident.order_selection import Progress, effective_samples
+from ident.order_selection import Progress
 from ident.pole_search import PoleSearch
 from ident.poles import Poles
 from ident.polish import Polished
 from ident.record import Record
 from ident.regression import Regression, prepare, thinned
+from ident.residual_colour import effective_samples
 
 FREQUENCY_TOLERANCE = 0.01
 DAMPING_TOLERANCE = 0.05

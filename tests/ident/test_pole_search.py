@@ -90,7 +90,7 @@ def test_joint_search_finds_the_mode_and_traces_it(algorithm):
     assert end.poles.omega_rad_s(0.005)[0] == pytest.approx(15.0, rel=0.02)
     stage = search.stages[0]
     assert stage.points.shape == (stage.log_cost.size, 4)
-    assert stage.log_cost.size >= 300
+    assert stage.log_cost.size >= 0.9 * options.evaluations  # scipy ends between iterations
     assert search.evaluations >= stage.log_cost.size
     assert min(minimum.rss for minimum in search.minima) == end.rss
 

@@ -83,10 +83,13 @@ def test_one_input_is_the_single_input_identification():
         IdentOptions(estimate_initial_state=True, max_pairs=3),
     ):
         one, several = identify([truth.record], options), identify_miso([truth.record], options)
-        np.testing.assert_allclose(several.model.poles.values, one.model.poles.values, rtol=0, atol=1e-6)
+        # Either descent stops when 1e-9 of J is left to gain: within sqrt(1e-9 N) = 1.4e-3 of the poles'
+        # standard deviations, the largest of which is a few thousandths.
+        assert several.rss == pytest.approx(one.rss, rel=4e-9)
+        np.testing.assert_allclose(several.model.poles.values, one.model.poles.values, rtol=0, atol=1e-5)
         scale = np.max(np.abs(one.model.coefficients))
         np.testing.assert_allclose(
-            several.model.coefficients[0], one.model.coefficients, rtol=0, atol=1e-6 * scale
+            several.model.coefficients[0], one.model.coefficients, rtol=0, atol=1e-5 * scale
         )
         assert several.verdicts == one.verdicts
         assert [(s.n_real, s.n_pairs) for s in several.order_table] == [
