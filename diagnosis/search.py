@@ -12,6 +12,7 @@ from diagnosis.case import Case, Real
 from diagnosis.fit import Fit, cost_at, fit
 from diagnosis.hypotheses import Hypothesis
 from diagnosis.jagged import refined
+from diagnosis.leftover import leftover
 from diagnosis.residual import ResidualModel
 from diagnosis.screening import Screening, Start, smallest_size
 from plant.effects import EFFECTS
@@ -61,7 +62,7 @@ def search(case: Case, progress: Progress | None = None) -> Search:
             if EFFECTS[candidate.effect].dependence == "jagged":
                 starts = screening.zoomed(candidate, starts)
             listed.append((candidate.from_size(least), starts))
-    found = [Hypothesis.of(base)]
+    found = [_weighed(model, base)]
     found += _fitted(model, base, listed, _part(report, 0.35, 0.35))
     found.sort(key=lambda h: -h.log_weight)
     while found[0].names and len(found[0].names) < _MOST_EFFECTS:
@@ -79,6 +80,11 @@ def search(case: Case, progress: Progress | None = None) -> Search:
             break
     report(1.0, "done")
     return Search(base, tuple(found), model.simulations)
+
+
+def _weighed(model: ResidualModel, end: Fit) -> Hypothesis:
+    segments = [experiment.voltage_V.size for experiment in model.case.estimation]
+    return Hypothesis.of(end, leftover(end.residuals, segments))
 
 
 def _part(report: Progress, begin: float, share: float) -> Progress:
@@ -114,7 +120,7 @@ def _fitted(
         if k < (1 if around.candidates else 3) or promising:
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
             item = refined(model, fine if fine.cost <= item.cost else item)
-        finished.append(Hypothesis.of(item))
+        finished.append(_weighed(model, item))
     return finished
 
 
@@ -141,7 +147,7 @@ def _without_one(model: ResidualModel, found: Sequence[Hypothesis]) -> list[Hypo
                 continue
             end = refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS))
             if before is None or end.cost < before.cost:
-                tried.append(Hypothesis.of(end))
+                tried.append(_weighed(model, end))
     return tried
 
 
