@@ -23,7 +23,10 @@ _SURVIVES = 0.01
 def rivals_of(
     case: Case, hypotheses: Sequence[Hypothesis], sets: Mapping[tuple[str, ...], float], at_most: int = 3
 ) -> tuple[Rival, ...]:
-    """The most probable fitted sets of effects, two at least if that many were fitted.
+    """The most probable fitted sets of effects that contradict each other; two at least if there are two.
+
+    A set that contains a more probable one, or lies within it, names the same cause and more or less beside
+    it: no rival.
 
     Parameters
     ----------
@@ -41,8 +44,13 @@ def rivals_of(
         if key not in best or hypothesis.log_weight > best[key].log_weight:
             best[key] = hypothesis
     # Equally hopeless sets have probabilities of zero alike: their weight orders them.
-    ordered = sorted(best, key=lambda k: (sets.get(k, 0.0), best[k].log_weight), reverse=True)[:at_most]
-    kept = [k for i, k in enumerate(ordered) if i < 2 or sets.get(k, 0.0) >= _SURVIVES]
+    kept: list[tuple[str, ...]] = []
+    for key in sorted(best, key=lambda k: (sets.get(k, 0.0), best[k].log_weight), reverse=True):
+        if len(kept) == at_most or (len(kept) >= 2 and sets.get(key, 0.0) < _SURVIVES):
+            break
+        # No effect at all is a rival of everything, though it is contained in every set.
+        if not any(key and other and (set(key) <= set(other) or set(other) <= set(key)) for other in kept):
+            kept.append(key)
     return tuple(rival_of_fit(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
 
 

@@ -13,6 +13,8 @@ from diagnosis.where_records import BandGap, EquivalentCurve, ExperimentGap, Par
 _MOST = 0.8
 # A missing function is put into the headline if it explains at least this share of the gap.
 _MUCH = 0.5
+# A sensor with less of the gap than this does not need a sentence about its frequencies.
+_LITTLE = 0.05
 ROUTES = {"hub_torque": "torque on the hub", "hub_angle": "hub angle error", "tip": "tip sensor error"}
 AXES = {
     "speed": "the hub speed",
@@ -145,8 +147,8 @@ def _sensors(found: Where) -> str:
     shown = [s for s in found.sensors if s.gap.found]
     if not shown:
         return ""
-    parts = [f"{times(s.gap)} the noise in the {sensor_word(s.sensor)}" for s in shown]
-    return f"The gap is {' and '.join(parts)} sensor{'s' if len(parts) > 1 else ''}."
+    parts = [f"{times(s.gap)} the noise in the {sensor_word(s.sensor)} sensor" for s in shown]
+    return f"The gap is {' and '.join(parts)}."
 
 
 def _experiments(gaps: Sequence[ExperimentGap]) -> str:
@@ -171,31 +173,44 @@ def _experiments(gaps: Sequence[ExperimentGap]) -> str:
 
 
 def _frequency(found: Where) -> str:
-    parts = []
+    parts: list[str] = []
+    runs: dict[tuple[float, float], list[tuple[str, float]]] = {}
     for s in found.sensors:
+        word = sensor_word(s.sensor)
         own = [b for b in found.bands if b.sensor == s.sensor]
         if not s.gap.found:
             # Concentrated gaps can hide in the sum over all frequencies; a band on its own still speaks.
-            alone = [b for b in own if b.gap.found]
             parts += [
-                f"The {sensor_word(s.sensor)} sensor has a gap {frequencies(b.low_Hz, b.high_Hz, found)} of "
+                f"The {word} sensor has a gap {frequencies(b.low_Hz, b.high_Hz, found)} of "
                 f"{b.gap.gap_rms:.2g} noise deviations."
-                for b in alone
+                for b in own
+                if b.gap.found
             ]
+        elif s.gap.share < _LITTLE:
             continue
-        statistic, freedom = evenness(own)
-        run = concentration(own_shares(own))
-        if statistic < chi2.ppf(0.95, freedom) and all(b.gap.found for b in own):
+        elif all(b.gap.found for b in own) and _even(own):
             parts.append(
-                f"The gap of the {sensor_word(s.sensor)} sensor is spread evenly over all frequencies, as "
-                f"more sensor noise or coarse resolution would be."
+                f"The gap of the {word} sensor is spread evenly over all frequencies, as more sensor noise "
+                f"or coarse resolution would be."
             )
-        elif run is not None:
-            parts.append(
-                f"{percent(run[2]).capitalize()} of the gap energy of the {sensor_word(s.sensor)} sensor "
-                f"lies {frequencies(run[0], run[1], found)}."
-            )
+        else:
+            run = concentration(own_shares(own))
+            if run is not None:
+                runs.setdefault(run[:2], []).append((word, run[2]))
+    for (low, high), members in runs.items():
+        shares = listed(list(dict.fromkeys(percent(share) for _, share in members)))
+        sensors = f"{listed([word for word, _ in members])} sensor{'s' if len(members) > 1 else ''}"
+        verb = "lie" if len(members) > 1 else "lies"
+        parts.append(
+            f"{shares[0].upper()}{shares[1:]} of the gap energy of the {sensors} {verb} "
+            f"{frequencies(low, high, found)}."
+        )
     return " ".join(parts)
+
+
+def _even(bands: Sequence[BandGap]) -> bool:
+    statistic, freedom = evenness(bands)
+    return bool(statistic < chi2.ppf(0.95, freedom))
 
 
 def own_shares(bands: Sequence[BandGap]) -> list[BandGap]:

@@ -164,12 +164,29 @@ def test_records_sharpen_the_separation():
         next_experiment(r, limits, choices=choice).separations[0].standard_deviations for r in (known, vague)
     )
     assert d > less * (1 - 1e-6)
-    ordered = rivals_of(case, [Hypothesis(f, w) for f, w in zip(fits, (0.0, -5.0), strict=True)], {})
+    ordered = rivals_of(case, [Hypothesis.of(f) for f in fits], {})
     assert [r.name for r in ordered] == ["input_delay", "actuator_lag"]
 
 
+def test_sets_that_name_the_same_cause_are_no_rivals():
+    residuals = white(np.random.default_rng(0))
+    case = made(residuals)
+    chosen = {c.effect: c for c in candidates(case) if c.effect in ("input_delay", "actuator_lag")}
+    start = {name: np.array([c.axes[0].coordinate(0.004)]) for name, c in chosen.items()}
+
+    def fitted(*names):
+        model = ResidualModel(case)
+        return fit(model, [chosen[n] for n in names], [start[n] for n in names], np.zeros(0), iterations=1)
+
+    sets = {("input_delay",): 0.6, ("actuator_lag", "input_delay"): 0.3, ("actuator_lag",): 0.05, (): 0.05}
+    fits = [fitted("input_delay"), fitted("actuator_lag", "input_delay"), fitted("actuator_lag"), fitted()]
+    rivals = rivals_of(case, [Hypothesis.of(f) for f in fits], sets)
+    assert rivals[0].name == "input_delay"
+    assert {r.name for r in rivals[1:]} == {"actuator_lag", "no effect"}
+
+
 def test_effort_is_bounded(monkeypatch):
-    """Time is counted in simulations: about 15 excitations, three rivals, what limits and parameters ask for."""
+    """Time is counted in simulations, for that is where it goes."""
     calls = []
 
     def counted(*args, **kwargs):

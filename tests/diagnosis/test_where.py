@@ -13,7 +13,14 @@ from diagnosis.regimes import motions
 from diagnosis.where import subsystem_mass, where
 from diagnosis.where_sentences import best_curve
 from plant import EFFECTS, multisine, multisine_lines, simulate
-from plant.effects import CoulombFriction, HardeningSpring, LinkStiffness, TipPayload
+from plant.effects import (
+    CoulombFriction,
+    HardeningSpring,
+    LinkStiffness,
+    Quantisation,
+    SensorGain,
+    TipPayload,
+)
 from tests.diagnosis.recorded import recorded_case
 from tests.diagnosis.synthetic_residuals import DT, MODEL, PERIOD, RIG, inputs, made, white
 
@@ -117,6 +124,41 @@ def test_a_torque_that_depends_on_the_angle_is_read_off():
     # The curve at its outermost node against -k3 theta^3, within a third: piecewise linear, first order.
     theta, torque = curve.centres[-1], curve.values[-1]
     assert torque == pytest.approx(-k3 * theta**3, rel=0.35)
+
+
+def test_a_coarse_tip_sensor_is_found_there_and_at_all_frequencies():
+    # Rounding to 8 noise deviations leaves an even error of 8/sqrt(12) = 2.3, like noise where the arm moves.
+    found = _of_effect(Quantisation(step_m=8 * RIG.sensors.tip_noise_m))
+    hub, tip = (s.gap for s in found.sensors)
+    assert not hub.found
+    assert tip.gap_rms == pytest.approx(8 / np.sqrt(12), rel=0.1)
+    assert "lies in the tip sensor" in found.headline
+    top = next(b.gap for b in found.bands if b.sensor == "tip" and b.high_Hz == 0.5 / DT)
+    assert top.found
+    # Most of the width of the spectrum lies there, and so does most of an even error.
+    assert top.share > 0.5
+
+
+def test_a_wrong_sensor_gain_is_an_error_over_the_tip_position():
+    ratio = 1.05
+    found = _of_effect(SensorGain(ratio=ratio))
+    curve = best_curve(found.curves)
+    assert (curve.route, curve.axis) == ("tip", "position")
+    assert curve.share > 0.98
+    # The straight line (ratio - 1) x, within four standard errors at every node.
+    line = (ratio - 1) * np.array(curve.centres)
+    assert np.all(np.abs(np.array(curve.values) - line) < 4 * np.array(curve.standard_errors) + 1e-9)
+    assert "lies in the tip sensor" in found.headline
+    assert found.linear.share > 0.9
+
+
+def test_a_known_ripple_period_is_a_regime_of_its_own():
+    residuals = white(np.random.default_rng(2))
+    case = made(residuals)
+    axes = {r.axis: r for r in where(case, residuals, ripple_cycles_per_rev=20.0).regimes}
+    assert len(axes["angle_in_period"].bins) == 8
+    assert sum(b.samples for b in axes["angle_in_period"].bins) == sum(e.shape[0] for e in residuals.values())
+    assert "angle_in_period" not in {r.axis for r in where(case, residuals).regimes}
 
 
 def test_linear_and_nonlinear_causes_are_told_apart():
