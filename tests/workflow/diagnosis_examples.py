@@ -105,6 +105,7 @@ class KnownAnswer(Engine):
         start, end = gap(before), gap(after)
         closed = (start**2 - end**2) / (start**2 - 1.0)
         fitted = {effect.id: effect.parameters() for effect in effects}
+        fitted.setdefault("viscous_friction", {"coefficient_Nms": 2e-3})
         named = [
             NamedEffect(
                 name=name,
@@ -112,7 +113,7 @@ class KnownAnswer(Engine):
                 presence=p if name not in names else sure,
                 parameters=fitted.get(name, {}),
                 intervals={k: (0.98 * v, 1.02 * v) for k, v in fitted.get(name, {}).items()},
-                gap_after=end if name in fitted else float("nan"),
+                gap_after=end if name in names else float("nan"),
             )
             for name, p in total.items()
         ]

@@ -108,6 +108,17 @@ def test_repaired_rig_and_effects_are_read_by_their_readers(files, folder, tmp_p
     assert SimulatedSource.model_validate(source).effects == (FRICTION,)
 
 
+def test_the_proposed_experiment_can_be_run(files, document, folder):
+    proposed = document["next_experiment"]
+    assert "Run next" in proposed["sentences"][-1] or "None of" in proposed["sentences"][-1]
+    lines = files["arm.next.csv"].decode().splitlines()
+    assert lines[0] == "time_s,voltage_V"
+    voltage = np.array([float(line.split(",")[1]) for line in lines[1:]])
+    np.testing.assert_allclose(voltage, proposed["voltage_V"], rtol=1e-8)
+    case = load_case(folder).case
+    assert np.max(np.abs(voltage)) <= max(np.max(np.abs(e.voltage_V)) for e in case.experiments) * (1 + 1e-9)
+
+
 def test_the_page_answers_in_order(files):
     html = files["arm.html"].decode()
     places = [html.index(f"<h2>{question}</h2>") for question in QUESTIONS]

@@ -16,7 +16,7 @@ from workflow.diagnose.document import json_text
 from workflow.diagnose.outputs import Engine, Options, made_from
 from workflow.diagnose.overview import closure_words, overview_page, short_answer
 from workflow.diagnose.processes import Finished, Step, Work, run_all
-from workflow.diagnose.words import parameter_words, probability_words
+from workflow.diagnose.words import parameter_words, probability_words, times_noise
 from workflow.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL,
@@ -26,7 +26,7 @@ from workflow.errors import (
     one_line,
 )
 from workflow.progress import Progress, Silence
-from workflow.report.words import listing, number
+from workflow.report.words import listing
 from workflow.summary import Row, RunSummary, Section
 
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
@@ -219,7 +219,7 @@ def _rows(document: Mapping[str, Any]) -> list[Row]:
             rows.append(Row(effect["name"], "; ".join(parts)))
     if document["ambiguous_with"]:
         rows.append(Row("could also be", listing(document["ambiguous_with"])))
-    gaps = [number(document[key], 4) for key in ("gap_before", "gap_refit", "gap_after", "noise_floor")]
+    gaps = [times_noise(document[key]) for key in ("gap_before", "gap_refit", "gap_after", "noise_floor")]
     rows.append(
         Row(
             "residual / noise",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from diagnosis.case import Real
 from diagnosis.diagnosis import Diagnosis
 from workflow import storage
 from workflow.diagnose.case_files import LoadedCase
@@ -82,14 +83,19 @@ def document_of(
 
 def gaps_by_experiment(found: Diagnosis) -> dict[str, dict[str, float]]:
     """RMS of the residuals over noise of every experiment, both sensors together, for the three models."""
-    models = {
+    models = residuals_by_model(found).items()
+    return {
+        name: {model: float(np.sqrt(np.mean(residuals[name] ** 2))) for model, residuals in models}
+        for name in found.residuals_before
+    }
+
+
+def residuals_by_model(found: Diagnosis) -> dict[str, dict[str, Real]]:
+    """Residuals (T, 2) over noise of every experiment: rig as stated, values moved, effects added."""
+    return {
         "stated": found.residuals_before,
         "refit": found.residuals_refit,
         "repaired": found.residuals_after,
-    }
-    return {
-        name: {model: float(np.sqrt(np.mean(residuals[name] ** 2))) for model, residuals in models.items()}
-        for name in found.residuals_before
     }
 
 

@@ -14,6 +14,7 @@ from workflow.diagnose.words import (
     parameter_words,
     probability_words,
     sureness,
+    times_noise,
 )
 from workflow.report.words import listing, number
 
@@ -47,10 +48,11 @@ def gap_sentences(found: Diagnosis) -> list[str]:
     floor = found.noise_floor
     words = [
         "With the rig as stated the model misses the held-out experiments by "
-        f"{number(found.gap_before, 4)} times the sensor noise (RMS); noise alone would give {number(floor)}."
+        f"{times_noise(found.gap_before)} times the sensor noise (RMS); noise alone would give "
+        f"{number(floor)}."
     ]
     if found.deviations:
-        moved = f"Moving the stated values within their tolerances leaves {number(found.gap_refit, 4)}"
+        moved = f"Moving the stated values within their tolerances leaves {times_noise(found.gap_refit)}"
         words.append(moved + (", which is no more than noise." if _is_noise(found.gap_refit, floor) else "."))
     else:
         words.append("The rig file states no tolerances: its values are taken as exact.")
@@ -139,13 +141,13 @@ def closure_sentences(found: Diagnosis) -> list[str]:
     names = listing([effect_words(name) for name in found.combination])
     if np.isnan(found.gap_closed):
         return [
-            f"The held-out experiments hold no gap to close beyond noise ({number(found.gap_refit, 4)} times "
-            f"the noise before, {number(found.gap_after, 4)} with {names}): the effect shows in the "
+            f"The held-out experiments hold no gap to close beyond noise ({times_noise(found.gap_refit)} "
+            f"times the noise before, {times_noise(found.gap_after)} with {names}): the effect shows in the "
             "experiments of estimation."
         ]
     return [
-        f"With {names} in the model the held-out residual falls from {number(found.gap_before, 4)} (as "
-        f"stated) by way of {number(found.gap_refit, 4)} (values moved) to {number(found.gap_after, 4)} "
+        f"With {names} in the model the held-out residual falls from {times_noise(found.gap_before)} (as "
+        f"stated) by way of {times_noise(found.gap_refit)} (values moved) to {times_noise(found.gap_after)} "
         "times the noise.",
         f"That closes {number(100 * found.gap_closed, 4)} % of the explainable gap "
         f"(95 % by resampling blocks: {number(100 * low, 4)} to {number(100 * high, 4)} %). The held-out "
@@ -160,7 +162,7 @@ def remaining_sentences(found: Diagnosis) -> list[str]:
     if all(_is_noise(value, found.noise_floor) for value in after.values()):
         words = ["No experiment keeps more than 3 % above the noise floor."]
     else:
-        words = [f"The largest residual left is {number(after[worst], 4)} times the noise, in {worst}."]
+        words = [f"The largest residual left is {times_noise(after[worst])} times the noise, in {worst}."]
     far = {key: d for key, d in found.deviations.items() if abs(d) >= NOTABLE_TOLERANCES}
     if far:
         moved = [f"{key_words(key)} by {number(d, 2)} tolerances" for key, d in far.items()]

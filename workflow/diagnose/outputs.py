@@ -11,15 +11,17 @@ from diagnosis.diagnosis import Diagnosis, diagnose
 from diagnosis.where import where
 from workflow import storage
 from workflow.diagnose.case_files import LoadedCase
+from workflow.diagnose.content import CasePage
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.document import document_of, json_text
-from workflow.diagnose.page import CasePage, case_page
+from workflow.diagnose.following import following
+from workflow.diagnose.page import case_page
 from workflow.diagnose.repaired_rig import effects_text, rig_text
 from workflow.errors import naming
 
 Report = Callable[[float, str], None]
 # Shares of a case's time, for the progress bar only.
-_ENGINE, _WHERE, _CONTROLLER = 0.8, 0.85, 0.9
+_ENGINE, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
 
 
 @dataclass(frozen=True)
@@ -52,21 +54,24 @@ def files_of(
         report(_ENGINE, "where")
         place = where(case, found.residuals_refit, found.probabilities)
         remains = where(case, found.residuals_after)
-        following: dict[str, Any] = {}
-        report(_WHERE, "controller")
+        report(_WHERE, "next experiment")
+        coming = following(found)
+        report(_NEXT, "controller")
         check, control = _control(case, found, options)
     rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
     effects = effects_text(case.name, found.repair) if found.repair else ""
     rig = rig_text(case.name, case.rig, found.rig, found.deviations, effects_name if effects else "")
     html = case_page(
-        CasePage(loaded, found, place, remains, following, control, check, rig, effects),
+        CasePage(loaded, found, place, remains, coming, control, check, rig, effects),
         lambda f, m: report(_CONTROLLER + (1 - _CONTROLLER) * f, f"drawing {m}"),
     )
     files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
     if effects:
         files[effects_name] = effects.encode()
+    if coming.proposal is not None and coming.proposal.separates:
+        files[f"{case.name}.next.csv"] = coming.csv_text().encode()
     document = document_of(
-        loaded, found, where=place.to_dict(), next_experiment=following, controller=control
+        loaded, found, where=place.to_dict(), next_experiment=coming.document(), controller=control
     )
     document["remains"] = remains.to_dict()
     document["made_from"] = made_from(loaded, options, code_sha256)

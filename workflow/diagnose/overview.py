@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from workflow.diagnose.words import effect_words, probability_words
+from workflow.diagnose.words import effect_words, probability_words, times_noise
 from workflow.figures.gap_overview import CaseGap, draw_case_gaps
 from workflow.figures.style import render
 from workflow.report.page import Block, Plot, Section, Table, maybe
@@ -64,7 +64,7 @@ def closure_words(document: Mapping[str, Any]) -> str:
     if not document["combination"] or closed is None:
         return "–"
     low, high = (100 * v if v is not None else float("nan") for v in document["gap_closed_interval"])
-    return f"{number(100 * closed)} % ({number(low)} to {number(high)})"
+    return f"{number(100 * closed, 4)} % ({number(low, 4)} to {number(high, 4)})"
 
 
 def _row(document: Mapping[str, Any]) -> tuple[str, ...]:
@@ -72,8 +72,8 @@ def _row(document: Mapping[str, Any]) -> tuple[str, ...]:
         document["case"],
         short_answer(document),
         probability_words(document["probability"]),
-        number(document["gap_before"], 4),
-        number(document["gap_after"], 4),
+        times_noise(document["gap_before"]),
+        times_noise(document["gap_after"]),
         closure_words(document),
         f"{document['case']}.html",
     )

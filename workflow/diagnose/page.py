@@ -6,54 +6,31 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
-
-import numpy as np
-from matplotlib.figure import Figure
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.where_records import Where
-from plant.modal import linear_arm
 from workflow.diagnose import findings
-from workflow.diagnose.case_files import LoadedCase
-from workflow.diagnose.controller_check import ControllerCheck
+from workflow.diagnose.content import CasePage
 from workflow.diagnose.document import gaps_by_experiment
-from workflow.diagnose.words import GROUPS, effect_words, key_words, probability_words, unit_of
-from workflow.figures.gap_answer import draw_probabilities, draw_waterfall
-from workflow.figures.gap_controller import LoopRun, draw_controller_check
-from workflow.figures.gap_records import ResidualRecord, draw_residual_spectra, draw_residual_traces
-from workflow.figures.gap_where import draw_bands_and_experiments, draw_curves, draw_regimes
+from workflow.diagnose.pictures import drawers_of
+from workflow.diagnose.words import (
+    GROUPS,
+    key_words,
+    probability_words,
+    times_noise,
+    unit_of,
+)
+from workflow.figures.gap_style import WORDS
 from workflow.figures.style import Picture, render
 from workflow.report.page import Block, Code, Plot, Section, Table, Text, maybe
 from workflow.report.rendering import page
 from workflow.report.words import count, number
 
-_MOST_REGIMES = 6
 _LEAST_PRESENCE = 0.01  # of an effect in the table
-
-
-@dataclass(frozen=True, eq=False)
-class CasePage:
-    """Everything the page is made of; the documents stand in the JSON file as well.
-
-    where: of the gap that is left when the stated values are moved within their tolerances; remains: of what
-    the effects leave. check is None where there was nothing to compare, control says why.
-    """
-
-    loaded: LoadedCase
-    found: Diagnosis
-    where: Where
-    remains: Where
-    next_experiment: Mapping[str, Any]
-    control: Mapping[str, Any]
-    check: ControllerCheck | None
-    rig_text: str
-    effects_text: str
 
 
 def case_page(content: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
     """One self-contained HTML page; equal content gives equal bytes."""
-    drawers = _drawers(content)
+    drawers = drawers_of(content)
     pictures: dict[str, Picture] = {}
     for position, (name, draw) in enumerate(drawers.items()):
         if progress is not None:
@@ -95,7 +72,7 @@ def _summary(content: CasePage) -> list[_Part]:
         ("Where?", [content.where.headline] if found.verdict != "none" else []),
         ("Which effect?", findings.which_sentences(found)),
         ("How far does the gap shrink?", findings.closure_sentences(found) if found.combination else []),
-        ("What next?", _next_words(content)[:1]),
+        ("What next?", list(content.next_experiment.sentences[-1:])),
     ]
     return [_Part(title, tuple(items)) for title, items in parts if items]
 
@@ -140,7 +117,7 @@ def _where(content: CasePage) -> Section:
             "Residual energy while a variable lies in a range. Grey: what the same energy gives when it is "
             "shifted in time. A dot outside says that the gap depends on the variable.",
         ),
-        Plot("traces", "Residuals over noise in every experiment, rig as stated and with the effects added."),
+        Plot("traces", "Residuals over noise in every experiment: before, and with the best model there is."),
     ]
     return Section("where", "Where does it lie?", "Where", tuple(blocks))
 
@@ -178,7 +155,7 @@ def _effect_table(found: Diagnosis) -> Table:
                     key,
                     f"{number(value, 5)} {unit_of(key)}".rstrip(),
                     f"{number(low, 5)} to {number(high, 5)}",
-                    number(effect.gap_after, 4) if position == 0 else "",
+                    times_noise(effect.gap_after) if position == 0 else "",
                 )
             )
     return Table(
@@ -191,22 +168,19 @@ def _effect_table(found: Diagnosis) -> Table:
 
 def _closure(content: CasePage) -> Section:
     found = content.found
-    by_experiment = gaps_by_experiment(found)
     roles = {e.name: e.role.replace("_", " ") for e in content.loaded.case.experiments}
-    rows = tuple(
-        (name, roles[name], *(number(entry[model], 4) for model in ("stated", "refit", "repaired")))
-        for name, entry in by_experiment.items()
-    )
-    pooled = (
-        "held out, together",
-        "",
-        *(number(v, 4) for v in (found.gap_before, found.gap_refit, found.gap_after)),
-    )
+    pooled = {"stated": found.gap_before, "refit": found.gap_refit, "repaired": found.gap_after}
+    models = content.models
+    rows = [
+        (name, roles[name], *(times_noise(entry[model]) for model in models))
+        for name, entry in gaps_by_experiment(found).items()
+    ]
+    rows.append(("held out, together", "", *(times_noise(pooled[model]) for model in models)))
     blocks = _paragraphs(findings.closure_sentences(found))
     blocks.append(
         Table(
-            ("experiment", "role", "as stated", "values moved", "effects added"),
-            (*rows, pooled),
+            ("experiment", "role", *(WORDS[model] for model in models)),
+            tuple(rows),
             "Residual over noise, RMS.",
         )
     )
@@ -215,8 +189,9 @@ def _closure(content: CasePage) -> Section:
 
 def _remains(content: CasePage) -> Section:
     found = content.found
-    blocks = _paragraphs([*findings.remaining_sentences(found), content.remains.headline])
-    blocks += _paragraphs(list(content.remains.sentences.values()))
+    blocks = _paragraphs(findings.remaining_sentences(found))
+    if found.combination:
+        blocks += _paragraphs([content.remains.headline, *content.remains.sentences.values()])
     blocks.append(
         Plot(
             "spectra",
@@ -243,19 +218,32 @@ def _remains(content: CasePage) -> Section:
     return Section("remains", "What remains?", "Remains", tuple(blocks))
 
 
-def _next_words(content: CasePage) -> list[str]:
-    return [str(words) for words in content.next_experiment.get("sentences", ())]
-
-
 def _next(content: CasePage) -> Section:
-    words = _next_words(content)
-    if not words:
-        words = [
-            "No further experiment is needed to tell the answers apart."
-            if content.found.verdict != "unknown"
-            else "No experiment is proposed: there is no pair of answers it could tell apart."
-        ]
-    return Section("next", "Which experiment to run next?", "Next", tuple(_paragraphs(words)))
+    coming = content.next_experiment
+    blocks = _paragraphs(list(coming.sentences))
+    if coming.proposal is not None and coming.proposal.separates:
+        blocks.append(
+            Plot(
+                "next",
+                "Voltage of the proposed experiment, within the voltages, angles and deflections of these "
+                "records, and the difference between what the two likeliest answers predict for it, before "
+                f"the free parameters take their share. The voltage stands in "
+                f"{content.loaded.case.name}.next.csv.",
+            )
+        )
+    if coming.proposal is not None:
+        pairs = tuple(
+            (" / ".join(pair.rivals), number(pair.standard_deviations), number(pair.log_bayes_factor))
+            for pair in coming.proposal.separations
+        )
+        blocks.append(
+            Table(
+                ("rivals", "apart by [standard deviations]", "expected log Bayes factor"),
+                pairs,
+                "After both rivals' free parameters and the tolerances have absorbed what they can.",
+            )
+        )
+    return Section("next", "Which experiment to run next?", "Next", tuple(blocks))
 
 
 def _controller(content: CasePage) -> Section:
@@ -345,70 +333,3 @@ def _reproduce(content: CasePage) -> Section:
     if content.effects_text:
         blocks.append(Code("Effects to add", content.effects_text))
     return Section("made", "To reproduce this", "Reproduce", tuple(blocks))
-
-
-# Pictures
-
-
-def _drawers(content: CasePage) -> dict[str, Callable[[], Figure]]:
-    found, case, where = content.found, content.loaded.case, content.where
-    dt = case.rig.sampling.dt_s
-    regimes = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
-    curves = [curve for curve in where.curves if curve.found]
-    ranked = sorted(found.probabilities.items(), key=lambda item: -item[1])
-    accepted = set(found.combination) or {"none" if found.verdict == "none" else "unknown"}
-    drawers: dict[str, Callable[[], Figure]] = {
-        "waterfall": lambda: draw_waterfall(
-            {"stated": found.gap_before, "refit": found.gap_refit, "repaired": found.gap_after},
-            gaps_by_experiment(found),
-            found.noise_floor,
-        ),
-        "bands": lambda: draw_bands_and_experiments(where.bands, where.experiments),
-        "traces": lambda: draw_residual_traces(
-            [
-                ResidualRecord(
-                    e.name,
-                    e.role == "held_out",
-                    found.residuals_before[e.name],
-                    found.residuals_after[e.name],
-                )
-                for e in case.experiments
-            ],
-            dt,
-        ),
-        "probabilities": lambda: draw_probabilities(
-            [effect_words(name) for name, _ in ranked],
-            [p for _, p in ranked],
-            [name in accepted for name, _ in ranked],
-        ),
-        "spectra": lambda: draw_residual_spectra(
-            {
-                "stated": list(found.residuals_before.values()),
-                "refit": list(found.residuals_refit.values()),
-                "repaired": list(found.residuals_after.values()),
-            },
-            _modes_Hz(content),
-            dt,
-        ),
-    }
-    if regimes:
-        drawers["regimes"] = lambda: draw_regimes(regimes)
-    if curves:
-        drawers["curves"] = lambda: draw_curves(curves)
-    check = content.check
-    if check is not None:
-        drawers["controller"] = lambda: draw_controller_check(
-            check.time_s,
-            check.arm_m * check.reference_rad,
-            tuple(
-                LoopRun("repaired" if i > 1 else "stated", i % 2 == 1, run.tip_m, run.command_V)
-                for i, run in enumerate(check.runs)
-            ),
-        )
-    return drawers
-
-
-def _modes_Hz(content: CasePage) -> list[float]:
-    poles = linear_arm(content.loaded.case.rig).poles_rad_s()
-    upper = poles[poles.imag > 0]
-    return sorted(float(abs(pole)) / (2 * np.pi) for pole in upper)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 
@@ -109,6 +110,13 @@ def probability_words(p: float) -> str:
     if percent < 0.1:
         return "under 0.1 %"
     return f"{percent:.3g} %" if percent < 99 else f"{percent:.1f} %"
+
+
+def times_noise(rms: float) -> str:
+    """A residual over noise, fine enough to tell 1.003 from 1."""
+    if math.isnan(rms):
+        return "–"
+    return f"{rms:.3f}" if rms < 10 else f"{rms:.1f}"
 
 
 def sureness(p: float) -> str:

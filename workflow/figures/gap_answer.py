@@ -13,6 +13,11 @@ from workflow.figures import gap_style, style
 Real = npt.NDArray[np.float64]
 
 _MOST_BARS = 8
+_TICKS = {
+    "stated": "rig as\nstated",
+    "refit": "values moved\nwithin tolerances",
+    "repaired": "effects\nadded",
+}
 
 
 def draw_probabilities(
@@ -56,19 +61,20 @@ def draw_waterfall(
 ) -> Figure:
     """Pooled root mean square of (measured - model)/noise for the three models.
 
-    held_out: "stated", "refit", "repaired" -> value over the held-out experiments. by_experiment: experiment
+    held_out: "stated", "refit" and, if effects were added, "repaired" -> value over the held-out experiments.
+    by_experiment: experiment
     -> the same for it alone.
     """
     with style.house_style():
         figure = style.new_figure(max(3.4, 1.8 + 0.3 * len(by_experiment)))
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
-        names = list(gap_style.MODELS)
+        names = list(held_out)
         at = np.arange(len(names))
         values = [held_out[name] for name in names]
         left.bar(at, values, color=[gap_style.MODELS[name]["color"] for name in names], width=0.6)
         for x, value in zip(at, values, strict=True):
             left.annotate(
-                f"{value:.4g}",
+                f"{value:.3f}" if value < 10 else f"{value:.1f}",
                 (x, value),
                 xytext=(0, 3),
                 textcoords="offset points",
@@ -76,14 +82,14 @@ def draw_waterfall(
                 fontsize=10,
             )
         left.axhline(floor, **gap_style.FLOOR, label=gap_style.WORDS["floor"])
-        left.set_xticks(at, ["rig as\nstated", "values moved\nwithin tolerances", "effects\nadded"])
+        left.set_xticks(at, [_TICKS[name] for name in names])
         left.set_ylim(0, 1.15 * max(*values, floor))
         left.grid(visible=False, axis="x")
         left.set_ylabel("residual over noise, RMS [1]")
         left.set_title("Held-out experiments together")
         rows = list(by_experiment)
         for row, experiment in enumerate(rows):
-            for name, offset in zip(names, (-0.22, 0.0, 0.22), strict=True):
+            for name, offset in zip(names, (-0.22, 0.0, 0.22), strict=False):
                 right.plot(
                     by_experiment[experiment][name],
                     row + offset,

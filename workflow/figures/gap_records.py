@@ -20,12 +20,11 @@ _SEGMENT = 512
 
 @dataclass(frozen=True, eq=False)
 class ResidualRecord:
-    """One experiment's residuals over noise, (T, 2) each: rig as stated and with the effects added."""
+    """One experiment: model ("stated", "refit", "repaired") -> residuals over noise (T, 2)."""
 
     name: str
     held_out: bool
-    stated: Real
-    repaired: Real
+    residuals: Mapping[str, Real]
 
 
 def draw_residual_traces(records: Sequence[ResidualRecord], dt_s: float) -> Figure:
@@ -34,13 +33,14 @@ def draw_residual_traces(records: Sequence[ResidualRecord], dt_s: float) -> Figu
         figure = style.new_figure(0.9 + 1.25 * len(records))
         grid = figure.subplots(len(records), 2, sharex="row", squeeze=False)
         for row, record in zip(grid, records, strict=True):
-            time = np.arange(len(record.stated), dtype=np.float64) * dt_s
+            time = np.arange(len(record.residuals["stated"]), dtype=np.float64) * dt_s
             for column, axes in enumerate(row):
                 axes.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
-                for name, signal in (("stated", record.stated), ("repaired", record.repaired)):
+                for name, signal in record.residuals.items():
                     look = {**gap_style.MODELS[name], "lw": 0.7, "ls": "-"}
                     axes.plot(*outline(time, signal[:, column]), **look, label=gap_style.WORDS[name])
-                reach = max(4.0, 1.05 * float(np.max(np.abs(record.stated[:, column]))))
+                largest = max(float(np.max(np.abs(e[:, column]))) for e in record.residuals.values())
+                reach = max(4.0, 1.05 * largest)
                 axes.set_ylim(-reach, reach)
                 axes.margins(x=0.01)
                 role = " (held out)" if record.held_out else ""

@@ -9,12 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from diagnosis.where_records import BandGap, EquivalentCurve, ExperimentGap, PartGap, RegimeFinding
+from diagnosis.where_records import BandGap, EquivalentCurve, ExperimentGap, PartGap, RegimeBin, RegimeFinding
 from workflow.figures import gap_style, style
 
-_SENSOR_COLOURS = {"hub_angle": style.UNCERTAIN, "tip": style.HIGHLIGHT}
+SENSOR_COLOURS = {"hub_angle": style.UNCERTAIN, "tip": style.HIGHLIGHT}
 _SENSOR_NAMES = {"hub_angle": "hub angle", "tip": "tip position"}
 _COLUMNS = 3
+_FEW_BINS = 2
 _SMALLEST = 0.05  # noise deviations; less is drawn there
 
 
@@ -35,13 +36,13 @@ def draw_bands_and_experiments(bands: Sequence[BandGap], experiments: Sequence[E
                 left.plot(
                     [band.low_Hz, band.high_Hz],
                     [max(band.gap.gap_rms, _SMALLEST)] * 2,
-                    color=_SENSOR_COLOURS[sensor],
+                    color=SENSOR_COLOURS[sensor],
                     alpha=1.0 if band.gap.found else 0.35,
                     lw=4.0,
                     solid_capstyle="butt",
                 )
                 _whisker(left, middle, band.gap, sensor, vertical=True)
-            left.plot([], [], color=_SENSOR_COLOURS[sensor], lw=4.0, label=name)
+            left.plot([], [], color=SENSOR_COLOURS[sensor], lw=4.0, label=name)
         left.set_xscale("log")
         left.set_yscale("log")
         left.set_ylim(bottom=_SMALLEST)
@@ -54,7 +55,7 @@ def draw_bands_and_experiments(bands: Sequence[BandGap], experiments: Sequence[E
                     row + offset,
                     part.gap_rms,
                     height=0.27,
-                    color=_SENSOR_COLOURS[sensor],
+                    color=SENSOR_COLOURS[sensor],
                     alpha=1.0 if part.found else 0.35,
                 )
                 _whisker(right, row + offset, part, sensor, vertical=False)
@@ -92,6 +93,11 @@ def regime_words(axis: str) -> str:
     return _REGIMES.get(axis, axis.replace("_", " "))
 
 
+def _bin_words(one: RegimeBin, count: int) -> str:
+    """The label where there is room for words, else the range on two lines."""
+    return style.plain(one.label, 24) if count <= _FEW_BINS else f"{one.low:.2g}\nto {one.high:.2g}"
+
+
 def draw_regimes(findings: Sequence[RegimeFinding]) -> Figure:
     """Residual energy over a regime variable where it depends on it, with what chance would give."""
     count = len(findings)
@@ -111,12 +117,10 @@ def draw_regimes(findings: Sequence[RegimeFinding]) -> Figure:
                 energy,
                 "o",
                 ms=6,
-                color=_SENSOR_COLOURS[finding.sensor],
+                color=SENSOR_COLOURS[finding.sensor],
                 label=_SENSOR_NAMES[finding.sensor],
             )
-            axes.set_xticks(at, [style.plain(one.label, 18) for one in finding.bins], fontsize=8)
-            if len(finding.bins) > 3:
-                axes.tick_params(axis="x", labelrotation=30)
+            axes.set_xticks(at, [_bin_words(one, len(finding.bins)) for one in finding.bins], fontsize=8)
             axes.axhline(1.0, **gap_style.FLOOR, label=gap_style.WORDS["floor"])
             axes.set_ylim(bottom=0)
             axes.grid(visible=False, axis="x")

@@ -1,0 +1,103 @@
+"""The experiment to run next, for the answers that one case leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from diagnosis.diagnosis import Diagnosis
+from diagnosis.experiment_choices import Limits
+from diagnosis.next_experiment import NextExperiment, Rival, next_experiment
+from plant.effects import EFFECTS, Effect
+from plant.simulate import simulate
+from workflow.diagnose.words import effect_words, probability_words
+from workflow.report.words import listing
+
+# Sets of effects at least this probable are rivals; below the second limit not even a runner-up is one.
+_RIVAL, _RUNNER_UP = 0.01, 1e-4
+_MOST_RIVALS = 3
+_SHORTEST = 200  # samples
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """What to run next and why, in sentences; proposal and the two likeliest rivals where there are any."""
+
+    sentences: tuple[str, ...]
+    proposal: NextExperiment | None = None
+    rivals: tuple[Rival, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        found = {"sentences": list(self.sentences)}
+        return found if self.proposal is None else {**found, **self.proposal.to_dict()}
+
+    def csv_text(self) -> str:
+        """The proposed voltage, one row per sample; empty without a proposal."""
+        if self.proposal is None:
+            return ""
+        rows = [
+            f"{k * self.proposal.dt_s:.9g},{v:.9g}" for k, v in enumerate(self.proposal.voltage_V.tolist())
+        ]
+        return "\n".join(["time_s,voltage_V", *rows]) + "\n"
+
+    def differences(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """(T, 2) what the first rival predicts minus what the second does, in noise deviations."""
+        assert self.proposal is not None
+        first, second = (
+            simulate(rival.rig, self.proposal.voltage_V, rival.effects).output for rival in self.rivals[:2]
+        )
+        sensors = self.rivals[0].rig.sensors
+        return np.asarray((first - second) / [sensors.hub_angle_noise_rad, sensors.tip_noise_m])
+
+
+def following(found: Diagnosis) -> Following:
+    """As long as the longest record, within the largest voltage, angle and deflection of all of them."""
+    if found.verdict == "unknown":
+        left = {name: float(np.mean(e**2)) for name, e in found.residuals_after.items()}
+        worst = max(left, key=left.__getitem__)
+        return Following(
+            (
+                "What is missing is not on the list, so there are no rivals to part. Repeat "
+                f"{worst}, where most is left, at half and at twice its amplitude and at another speed: what "
+                "the residual follows then says where to look.",
+            )
+        )
+    rivals = rivals_of(found)
+    if len(rivals) < 2:
+        return Following(("No further experiment is needed: every other answer is ruled out.",))
+    names = listing([f"{rival.name} ({probability_words(rival.probability)})" for rival in rivals])
+    longest = max(e.voltage_V.size for e in found.case.experiments)
+    proposal = next_experiment(rivals, Limits.of_records(found.case), n_samples=max(longest, _SHORTEST))
+    return Following((f"Still possible: {names}.", proposal.sentence), proposal, rivals)
+
+
+def rivals_of(found: Diagnosis) -> tuple[Rival, ...]:
+    """The likeliest sets of effects, the answer among them; never fewer than two where a second one is
+    thinkable.
+
+    An effect has its parameters from the most probable set that holds it, and all rivals stand on the
+    repaired rig: what else its values could be is among the free parameters that an experiment has to see
+    through.
+    """
+    parameters = {effect.name: effect.parameters for effect in found.effects}
+    ranked = sorted(found.sets.items(), key=lambda item: -item[1])
+    known = [
+        (names, p)
+        for names, p in ranked
+        if names != ("unknown",) and all(parameters.get(name) for name in names) and p >= _RUNNER_UP
+    ]
+    chosen = [item for k, item in enumerate(known) if k < 2 or item[1] >= _RIVAL][:_MOST_RIVALS]
+    return tuple(
+        Rival(p, found.rig, tuple(_effect(name, parameters[name]) for name in names), name=_words(names))
+        for names, p in chosen
+    )
+
+
+def _effect(name: str, values: dict[str, float]) -> Effect:
+    return EFFECTS[name](**values)
+
+
+def _words(names: tuple[str, ...]) -> str:
+    return listing([effect_words(name) for name in names or ("none",)])
