@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 
 from diagnosis.case import Case, Real
 from diagnosis.fit import Fit
-from diagnosis.hypotheses import Hypothesis
 from diagnosis.next_experiment import Rival
 from diagnosis.nominal import NominalParameters
 from plant.effects import Effect
@@ -20,8 +20,18 @@ _DEVIATION_STEP = 0.02
 _SURVIVES = 0.01
 
 
+class Weighed(Protocol):
+    """A fit and the log of its weight, as `diagnosis.hypotheses.Hypothesis` has them."""
+
+    @property
+    def fit(self) -> Fit: ...
+
+    @property
+    def log_weight(self) -> float: ...
+
+
 def rivals_of(
-    case: Case, hypotheses: Sequence[Hypothesis], sets: Mapping[tuple[str, ...], float], at_most: int = 3
+    case: Case, hypotheses: Sequence[Weighed], sets: Mapping[tuple[str, ...], float], at_most: int = 3
 ) -> tuple[Rival, ...]:
     """The most probable fitted sets of effects that contradict each other; two at least if there are two.
 
@@ -38,9 +48,9 @@ def rivals_of(
     """
     if not at_most >= 2:
         raise ValueError(f"rivals come in pairs at least; got at_most = {at_most}")
-    best: dict[tuple[str, ...], Hypothesis] = {}
+    best: dict[tuple[str, ...], Weighed] = {}
     for hypothesis in hypotheses:
-        key = tuple(sorted(hypothesis.names))
+        key = tuple(sorted(hypothesis.fit.names))
         if key not in best or hypothesis.log_weight > best[key].log_weight:
             best[key] = hypothesis
     # Equally hopeless sets have probabilities of zero alike: their weight orders them.

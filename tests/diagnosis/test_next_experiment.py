@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from diagnosis import ResidualModel
 from diagnosis.candidates import candidates
 from diagnosis.experiment_choices import Excitation, Limits, excitations
 from diagnosis.fit import fit
-from diagnosis.hypotheses import Hypothesis
 from diagnosis.next_experiment import Rival, next_experiment
 from diagnosis.rivals import rival_of_fit, rivals_of
 from plant import prbs, simulate
@@ -164,7 +164,7 @@ def test_records_sharpen_the_separation():
         next_experiment(r, limits, choices=choice).separations[0].standard_deviations for r in (known, vague)
     )
     assert d > less * (1 - 1e-6)
-    ordered = rivals_of(case, [Hypothesis.of(f) for f in fits], {})
+    ordered = rivals_of(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], {})
     assert [r.name for r in ordered] == ["input_delay", "actuator_lag"]
 
 
@@ -180,7 +180,7 @@ def test_sets_that_name_the_same_cause_are_no_rivals():
 
     sets = {("input_delay",): 0.6, ("actuator_lag", "input_delay"): 0.3, ("actuator_lag",): 0.05, (): 0.05}
     fits = [fitted("input_delay"), fitted("actuator_lag", "input_delay"), fitted("actuator_lag"), fitted()]
-    rivals = rivals_of(case, [Hypothesis.of(f) for f in fits], sets)
+    rivals = rivals_of(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], sets)
     assert rivals[0].name == "input_delay"
     assert {r.name for r in rivals[1:]} == {"actuator_lag", "no effect"}
 
