@@ -110,6 +110,10 @@ SPOILT = {
         ["case.toml", "suspected[0]", "colomb_friction", "did you mean coulomb_friction?"],
     ),
     "no such log": (_case("01_prbs.csv", "01_prbs.txt"), ["case.toml", "experiments[0].file", "01_prbs.txt"]),
+    "no such variable": (
+        _case("experiments/01_prbs.csv", "${FLEXLINK_NOWHERE}/01_prbs.csv"),
+        ["case.toml", "experiments[0].file", "FLEXLINK_NOWHERE is not set"],
+    ),
     "wrong number of rows": (
         _case("samples = 240", "samples = 250"),
         ["experiments[0].samples", "250", "240"],

@@ -12,7 +12,7 @@
     tip_m = { column = "tip_mm", scale = 0.001, offset = -0.0012 }      # quantity = scale * column + offset
 
     [[experiments]]
-    file = "logs/prbs.csv"              # csv, txt, npz or mat, relative to this file
+    file = "logs/prbs.csv"              # csv, txt, npz or mat, relative to this file; ${NAME} is expanded
     role = "estimation"                 # or "held_out": judges the repaired model, never fitted
     kind = "prbs"                       # free words, shown on the page
     closed_loop = false                 # the voltage came from a feedback (its log is still exact)
@@ -43,7 +43,7 @@ from workflow import storage
 from workflow.config import Section
 from workflow.errors import InputError, naming
 from workflow.run_directory import hash_of
-from workflow.settings import check, read_toml
+from workflow.settings import check, expand, read_toml
 from workflow.stages.records import read_log
 
 CASE_FILE = "case.toml"
@@ -170,7 +170,7 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     with naming(str(file)):
         case = Case(name, machine, tuple(experiments))
     files = {CASE_FILE: file, RIG_FILE: rig_path}
-    files |= {f"{i}": folder / entry.file for i, entry in enumerate(settings.experiments)}
+    files |= {f"{i}": folder / expand(entry.file) for i, entry in enumerate(settings.experiments)}
     hashes = {key: storage.sha256_of_file(path) for key, path in files.items()}
     return LoadedCase(
         case=case,
@@ -202,7 +202,8 @@ def _rig(path: Path) -> Rig:
 def _experiment(
     file: Path, index: int, entry: ExperimentEntry, settings: CaseSettings, rig: Rig
 ) -> Experiment:
-    path = file.parent / entry.file
+    with naming(f"{file}: experiments[{index}].file"):
+        path = file.parent / expand(entry.file)
     if not path.is_file():
         raise InputError(f"{file}: experiments[{index}].file: no such file: {path}")
     names = {

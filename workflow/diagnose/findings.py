@@ -70,6 +70,8 @@ def which_sentences(found: Diagnosis) -> list[str]:
     """Which effect, how sure, and what it could be confused with."""
     p = found.probabilities
     words: list[str] = []
+    if found.detail_verdict == "not_converged":
+        words.append("The fit did not converge: what follows is the best point it reached, not an answer.")
     if found.verdict == "effect":
         sure = answer_probability(found)
         names = listing([effect_words(name) for name in found.combination])
@@ -179,22 +181,17 @@ def control_sentences(check: Mapping[str, Any]) -> list[str]:
     first, second, third, fourth = check["runs"]
     return [
         f"Designed on the rig as stated, the loop promises a cost of {number(first['cost_s'])} s and a "
-        f"distance from -1 of {number(first['modulus_margin'])}; on the repaired machine it gets "
-        f"{number(second['cost_s'])} s ({_percent(second['cost_s'], first['cost_s'])}) and "
-        f"{number(second['modulus_margin'])}" + _unsettled(second),
+        f"modulus margin of {number(first['modulus_margin'])}. On the repaired machine it reaches "
+        f"{_reached(second, first)}",
         f"Designed on the repaired rig, it promises {number(third['cost_s'])} s and "
-        f"{number(third['modulus_margin'])}, and gets {number(fourth['cost_s'])} s "
-        f"({_percent(fourth['cost_s'], third['cost_s'])}) and {number(fourth['modulus_margin'])}"
-        + _unsettled(fourth),
+        f"{number(third['modulus_margin'])}, and reaches {_reached(fourth, third)}",
     ]
 
 
-def _unsettled(run: Mapping[str, Any]) -> str:
-    return "." if run["settles"] else "; it does not settle."
-
-
-def _percent(value: float, reference: float) -> str:
-    return f"{100 * (value / reference - 1):+.1f} %"
+def _reached(achieved: Mapping[str, Any], predicted: Mapping[str, Any]) -> str:
+    percent = round(100 * (achieved["cost_s"] / predicted["cost_s"] - 1), 1) + 0.0
+    text = f"{number(achieved['cost_s'])} s ({percent:+.1f} %) and {number(achieved['modulus_margin'])}"
+    return text + ("." if achieved["settles"] else "; it does not settle.")
 
 
 def _is_noise(rms: float, floor: float) -> bool:

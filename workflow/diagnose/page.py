@@ -270,7 +270,7 @@ def _controller(content: CasePage) -> Section:
         )
         blocks.append(
             Table(
-                ("designed on", "run on", "cost [s]", "distance from -1", "peak voltage [V]", "settles"),
+                ("designed on", "run on", "cost [s]", "modulus margin", "peak voltage [V]", "settles"),
                 rows,
                 "Cost: integral of the squared tip error over the squared move. Specification: bandwidth "
                 f"{number(asked['bandwidth_rad_s'])} rad/s, modulus margin "

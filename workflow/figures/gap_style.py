@@ -9,7 +9,7 @@ from workflow.figures import style
 
 # The three models a gap is measured against, in the order of the waterfall, each with a line style.
 STATED: dict[str, Any] = {"color": "#CC79A7", "ls": (0, (3, 1.5)), "lw": 1.2}
-REFIT: dict[str, Any] = {"color": "#E69F00", "ls": (0, (5, 1.5, 1, 1.5)), "lw": 1.3}
+REFIT: dict[str, Any] = {"color": "#8C6D31", "ls": (0, (5, 1.5, 1, 1.5)), "lw": 1.3}
 REPAIRED: dict[str, Any] = {"color": style.MODEL, "ls": "-", "lw": 1.3}
 FLOOR: dict[str, Any] = {"color": style.REFERENCE, "ls": (0, (1, 1.5)), "lw": 1.1}
 
@@ -21,6 +21,5 @@ WORDS: Mapping[str, str] = {
 }
 MODELS: Mapping[str, Mapping[str, Any]] = {"stated": STATED, "refit": REFIT, "repaired": REPAIRED}
 SENSOR_WORDS = ("hub angle", "tip position")
-SENSOR_MARKERS = ("o", "s")
 # Of a share or probability bar that is not the first answer.
 PALE = "#b9c2cc"
