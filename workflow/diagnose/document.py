@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from diagnosis.case import Real
 from diagnosis.diagnosis import Diagnosis
 from workflow import storage
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.findings import answer_probability, presence_of
+
+Real = npt.NDArray[np.float64]
 
 FORMAT = "flexlink-diagnosis-1"
 LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
