@@ -6,11 +6,13 @@ import json
 
 import numpy as np
 import pytest
+from scipy.fft import dct
 
 from diagnosis import Case, Experiment, ResidualModel
 from diagnosis.distortion import period_of, periodic_findings
 from diagnosis.regimes import motions
 from diagnosis.where import subsystem_mass, where
+from diagnosis.where_energy import band_gaps, sensor_gaps
 from diagnosis.where_sentences import best_curve
 from plant import EFFECTS, multisine, multisine_lines, simulate
 from plant.effects import (
@@ -23,6 +25,8 @@ from plant.effects import (
 )
 from tests.diagnosis.recorded import recorded_case
 from tests.diagnosis.synthetic_residuals import DT, MODEL, PERIOD, RIG, inputs, made, white
+
+NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
 
 
 def _sum(a, b):
@@ -61,6 +65,47 @@ def test_a_band_is_found_in_the_sensor_it_was_put_in():
     assert f"between {band.low_Hz:g} and {band.high_Hz:g} Hz" in found.sentences["frequency"]
     tip = next(s.gap for s in found.sensors if s.sensor == "tip")
     assert tip.interval[0] <= 2.0 <= tip.interval[1]
+
+
+def test_intervals_of_energy_and_share_cover():
+    """The gap's energy and its share are known; 95 % intervals hold them in 95 of 100 noises."""
+    rng = np.random.default_rng(17)
+    time = DT * np.arange(1000)
+    gap = np.column_stack([0.4 * np.sin(2 * np.pi * 2 * time), 0.8 * np.sin(2 * np.pi * 15 * time)])
+    energy = np.sum(gap**2, axis=0)
+    # Whole periods: all of a tone's energy lies in the band that holds it but for the ends of the record.
+    spectrum = dct(gap, axis=0, norm="ortho") ** 2
+    inside = np.arange(1000) / (2 * 1000 * DT)
+    share = spectrum[(inside >= 10) & (inside < 30), 1].sum() / energy.sum()
+    seeds, held = 400, np.zeros(2)
+    for _ in range(seeds):
+        e = {"one": gap + rng.standard_normal(gap.shape)}
+        tip = sensor_gaps(e, 0.01)[1].gap
+        band = next(b.gap for b in band_gaps(e, DT, 0.01) if b.sensor == "tip" and b.low_Hz == 10)
+        held[0] += tip.interval[0] <= np.sqrt(energy[1] / 1000) <= tip.interval[1]
+        held[1] += band.share_interval[0] <= share <= band.share_interval[1]
+    # Binomial with 400 draws at 0.95: four standard deviations are 0.044.
+    assert np.all(np.abs(held / seeds - 0.95) < 0.044), held / seeds
+
+
+def test_short_and_quiet_records_are_no_trouble():
+    """Forty samples, one of them without input: little can be said, and nothing breaks."""
+    rng = np.random.default_rng(1)
+    voltages = {"rest": np.zeros(40), "step": np.ones(40), "again": np.ones(40)}
+    residuals = {name: rng.standard_normal((40, 2)) for name in voltages}
+    experiments = [
+        Experiment(
+            name,
+            "held_out" if name == "again" else "estimation",
+            v,
+            simulate(RIG, v).output + residuals[name] * NOISE,
+        )
+        for name, v in voltages.items()
+    ]
+    found = where(Case("short", RIG, tuple(experiments)), residuals, level=1e-4)
+    assert found.periodic == ()
+    assert found.sentences == {}
+    json.dumps(found.to_dict())
 
 
 def test_a_gap_near_reversals_is_found_there():
@@ -105,10 +150,9 @@ def test_a_drift_is_found_with_its_rate():
 
 def _of_effect(*effects):
     """Residuals of noisy records of a rig with effects against the nominal rig."""
-    noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
     rng = np.random.default_rng(8)
     residuals = {
-        name: (simulate(RIG, voltage, effects, rng=rng).output - MODEL[name]) / noise
+        name: (simulate(RIG, voltage, effects, rng=rng).output - MODEL[name]) / NOISE
         for name, voltage in inputs().items()
     }
     return where(made(residuals), residuals)
