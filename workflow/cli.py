@@ -403,6 +403,38 @@ def diagnose(
         raise typer.Exit(found.exit_code)
 
 
+@app.command(short_help="Test the diagnosis on sealed cases of its own.")
+def blind(
+    cases: Annotated[int, typer.Option(help="Number of cases.")],
+    seed: Annotated[int, typer.Option(help="Root of all rigs, causes, inputs and noise.")],
+    out: Annotated[Path, typer.Option(help="Directory of the run, new or empty.")],
+    jobs: Annotated[
+        int | None,
+        typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
+    ] = None,
+    simulator: Annotated[
+        str,
+        typer.Option(help="What makes the records: ritz (built in) or exudyn (extra 'blind')."),
+    ] = "ritz",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in --out; finished cases are taken up.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Cases from an independent simulator, labels sealed by a salted hash, diagnosis, opening, scores."""
+    from workflow.blind.protocol import run_blind
+    from workflow.console import TerminalProgress, print_summary
+
+    with TerminalProgress() as progress:
+        summary = run_blind(
+            cases, seed, out, jobs=jobs, simulator=simulator, resume=resume, progress=progress
+        )
+    if as_json:
+        _print_json(summary.numbers)
+    else:
+        print_summary(summary)
+
+
 def _degree(text: str | None) -> int | str | None:
     """A number where one was given, so that the settings' own complaint names what is allowed."""
     return int(text) if text is not None and text.isdigit() else text
@@ -455,7 +487,7 @@ def _interrupted(arguments: Sequence[str]) -> int:
     command = arguments[0]
     hint = (
         f"; `flexlink {command} --out DIR --resume` continues"
-        if command in ("run", "study", "diagnose")
+        if command in ("run", "study", "diagnose", "blind")
         else ""
     )
     return _complain(f"interrupted{hint}", _EXIT_INTERRUPTED)

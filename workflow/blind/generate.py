@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -24,19 +24,19 @@ from workflow.errors import InputError
 from workflow.storage import write_text
 
 Answer = dict[str, Any]
-CASES = "cases"
+Plan = tuple[Sort, bool, str]
 
 
 def case_name(index: int) -> str:
-    return f"case_{index + 1:03d}"
+    return f"case_{index + 1:04d}"
 
 
-def draw_case(seed: int, index: int, plan: tuple[Sort, bool, str]) -> BlindCase:
-    """The case of this index of a seed, whoever draws it and however many others there are."""
+def draw_case(seed: int, index: int, plan: Plan, simulator: str = "ritz") -> BlindCase:
+    """The case of this index and plan, whoever draws it."""
     return make_case(*plan, np.random.default_rng([seed, 1, index]))
 
 
-def plan_cases(n_cases: int, seed: int) -> list[tuple[Sort, bool, str]]:
+def plan_cases(n_cases: int, seed: int) -> list[Plan]:
     return schedule(n_cases, np.random.default_rng([seed, 0, n_cases]))
 
 
@@ -97,9 +97,9 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def _one(seed: int, out: Path, open_cases: bool, job: tuple[int, tuple[Sort, bool, str]]) -> Answer:
+def _one(seed: int, out: Path, open_cases: bool, simulator: str, job: tuple[int, Plan]) -> Answer:
     index, plan = job
-    case = draw_case(seed, index, plan)
+    case = draw_case(seed, index, plan, simulator)
     folder = out / case_name(index)
     write_case(case, folder)
     answer = {"case": folder.name, **case.answer}
@@ -116,34 +116,44 @@ def generate(
     *,
     jobs: int = 1,
     open_cases: bool = False,
-    report: Callable[[int], None] | None = None,
+    simulator: str = "ritz",
+    finished: Mapping[str, Answer] | None = None,
+    keep: Callable[[Answer], None] | None = None,
 ) -> list[Answer]:
     """Write the cases of a seed below `out` and return their answers; the same seed gives the same bytes.
 
-    Raises InputError where `out` already holds something.
+    finished: answers of cases that are there already (case name -> answer) and are not drawn again.
+    keep: called with every answer as soon as its case is written.
     """
     if n_cases < 1 or seed < 0 or jobs < 1:
         raise InputError(
             f"cases and jobs must be at least 1, the seed at least 0; got {n_cases}, {jobs}, {seed}"
         )
+    out.mkdir(parents=True, exist_ok=True)
+    answers = dict(finished or {})
+    work = partial(_one, seed, out, open_cases, simulator)
+    tasks = [(k, plan) for k, plan in enumerate(plan_cases(n_cases, seed)) if case_name(k) not in answers]
+
+    def take(done: Iterable[Answer]) -> None:
+        for answer in done:
+            answers[answer["case"]] = answer
+            if keep:
+                keep(answer)
+
+    if jobs == 1 or len(tasks) == 1:
+        take(map(work, tasks))
+    elif tasks:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            take(pool.map(work, tasks))
+    return [answers[name] for name in sorted(answers)]
+
+
+def refuse_filled(out: Path) -> None:
+    """Raises InputError where `out` already holds something."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is not a directory")
     if out.is_dir() and any(out.iterdir()):
         raise InputError(f"{out} is not empty: cases need a directory of their own")
-    out.mkdir(parents=True, exist_ok=True)
-    work = partial(_one, seed, out, open_cases)
-    answers = []
-    tasks = list(enumerate(plan_cases(n_cases, seed)))
-    if jobs == 1:
-        for task in tasks:
-            answers.append(work(task))
-            if report:
-                report(len(answers))
-        return answers
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for answer in pool.map(work, tasks):
-            answers.append(answer)
-            if report:
-                report(len(answers))
-    return answers
 
 
 def main() -> None:
@@ -155,6 +165,7 @@ def main() -> None:
     parser.add_argument("--open", action="store_true", help="write answers and exact rigs beside the records")
     given = parser.parse_args()
     try:
+        refuse_filled(given.out)
         generate(given.cases, given.seed, given.out, jobs=given.jobs, open_cases=given.open)
     except InputError as error:
         parser.exit(2, f"{error}\n")
