@@ -10,12 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from diagnosis.case import Case, Real
-from plant.effects import EFFECTS, Effect
+from diagnosis.machine_protocol import Dependence, Real
+from plant.effects import EFFECTS
+
+if TYPE_CHECKING:
+    from diagnosis.case import Case
 
 Scale = Literal["log", "linear", "angle"]
 
@@ -93,7 +96,13 @@ class Candidate:
             values["phase_rad"] = float(np.mod(values["phase_rad"], 2 * np.pi))
         return values
 
-    def effect_at(self, x: Real) -> Effect:
+    @property
+    def dependence(self) -> Dependence:
+        """How the outputs depend on the effect's parameters."""
+        return EFFECTS[self.effect].dependence
+
+    def effect_at(self, x: Real) -> Any:
+        """The effect of the machine's own kind (here: of `plant.effects`) at the coordinates x (A,)."""
         return EFFECTS[self.effect](**self.parameters(x))
 
     @cached_property

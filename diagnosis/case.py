@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from diagnosis.flexible_arm import FlexibleArm
 from plant.rig import Rig
 
 Real = npt.NDArray[np.float64]
@@ -66,6 +67,11 @@ class Experiment:
         object.__setattr__(self, "voltage_V", voltage)
         object.__setattr__(self, "output", output)
 
+    @property
+    def input(self) -> Real:
+        """(T, 1) the voltage."""
+        return self.voltage_V[:, None]
+
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -97,8 +103,12 @@ class Case:
     @property
     def noise(self) -> Real:
         """(2,) noise standard deviations of hub_angle_rad and tip_m."""
-        sensors = self.rig.sensors
-        return np.array([sensors.hub_angle_noise_rad, sensors.tip_noise_m])
+        return self.machine.noise
+
+    @property
+    def machine(self) -> FlexibleArm:
+        """The rig in the form the engine asks for (see `diagnosis.machine_protocol`)."""
+        return FlexibleArm(self.rig)
 
     @property
     def estimation(self) -> tuple[Experiment, ...]:

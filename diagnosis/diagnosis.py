@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from diagnosis.candidates import Candidate
-from diagnosis.case import Case, Real
 from diagnosis.fit import Fit, fit
 from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
-from diagnosis.nominal import NominalParameters
+from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.residual import ResidualModel, pooled_rms
 from diagnosis.search import Progress, search
-from plant.effects import EFFECTS, Effect
-from plant.rig import Rig
 
 Verdict = Literal["none", "effect", "unknown"]
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
@@ -80,15 +77,16 @@ class Diagnosis:
         interval over blocks of samples; nan without a gap to close.
     deviations : key -> tolerances
         How far the stated values are off, with the accepted effects in the model.
-    rig, repair : Rig, tuple of Effect
-        The repaired model: stated values moved, effects to add.
+    rig, repair
+        The repaired model: stated values moved (a Rig, or a Plant of one's own), effects to add (of
+        `plant.effects`, or changes of the own plant).
     residuals_before, residuals_refit, residuals_after : experiment -> (T, 2)
-        Whitened, every experiment, hub before tip.
+        Whitened, every experiment; (T, Y) in the machine's order of outputs.
     simulations : int
         Number of simulated records.
     """
 
-    case: Case
+    case: Any
     verdict: Verdict
     detail_verdict: DetailVerdict
     probabilities: dict[str, float]
@@ -103,8 +101,8 @@ class Diagnosis:
     gap_closed: float
     gap_closed_interval: tuple[float, float]
     deviations: dict[str, float]
-    rig: Rig
-    repair: tuple[Effect, ...]
+    rig: Any
+    repair: tuple[Any, ...]
     residuals_before: dict[str, Real]
     residuals_refit: dict[str, Real]
     residuals_after: dict[str, Real]
@@ -112,7 +110,7 @@ class Diagnosis:
 
 
 def diagnose(
-    case: Case,
+    case: CaseOfMachine,
     *,
     progress: Progress | None = None,
     rng: np.random.Generator | None = None,
@@ -122,6 +120,8 @@ def diagnose(
 
     Parameters
     ----------
+    case
+        A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
     progress
         Called with the share done (0 to 1) and what is being done.
     rng
@@ -159,7 +159,7 @@ def diagnose(
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(model.nominal.keys, map(float, last.deviations), strict=True)),
-        rig=NominalParameters(case.rig).at(last.deviations),
+        rig=model.nominal.at(last.deviations).description,
         repair=last.effects,
         residuals_before=before,
         residuals_refit=refit,
@@ -209,7 +209,7 @@ def _named(
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
     entries = []
-    for name in EFFECTS:
+    for name in model.case.machine.weighing.listed:
         holding = [h for h in hypotheses if name in h.names]
         parameters: dict[str, float] = {}
         intervals: dict[str, tuple[float, float]] = {}
@@ -262,17 +262,17 @@ def _intervals(end: Fit, k: int, rng: np.random.Generator) -> dict[str, tuple[fl
     return found
 
 
-def _held_out(case: Case, residuals: dict[str, Real]) -> float:
+def _held_out(case: CaseOfMachine, residuals: dict[str, Real]) -> float:
     return pooled_rms(np.concatenate([residuals[e.name].ravel() for e in case.held_out]))
 
 
 def _closed(
-    case: Case, before: dict[str, Real], after: dict[str, Real], rng: np.random.Generator
+    case: CaseOfMachine, before: dict[str, Real], after: dict[str, Real], rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]]:
     """Share of the explainable held-out energy that is gone, with a block bootstrap."""
     pairs = []
     for experiment in case.held_out:
-        T = experiment.voltage_V.size
+        T = len(experiment.output)
         for start in range(0, T, _BLOCK):
             part = slice(start, start + _BLOCK)
             a, b = before[experiment.name][part], after[experiment.name][part]

@@ -8,15 +8,15 @@ Levenberg-Marquardt with difference quotients, inside the boxes.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from diagnosis.candidates import Candidate
-from diagnosis.case import Real
+from diagnosis.machine_protocol import Real, Weighing
 from diagnosis.residual import ResidualModel
-from plant.effects import Effect
 
 # Steps of difference quotients along the deviations. Where contacts switch, a small step measures which way
 # one contact fell; a large one averages over many.
@@ -34,9 +34,10 @@ class Fit:
     jacobian: Real
     cost: float
     converged: bool
+    weighing: Weighing = field(default_factory=Weighing)
 
     @property
-    def effects(self) -> tuple[Effect, ...]:
+    def effects(self) -> tuple[Any, ...]:
         return tuple(c.effect_at(x) for c, x in zip(self.candidates, self.coordinates, strict=True))
 
     @property
@@ -84,7 +85,7 @@ def fit(
     x = np.clip(np.concatenate(list(coordinates)) if candidates else np.zeros(0), low, high)
     d = deviations.copy()
 
-    def effects(x: Real) -> tuple[Effect, ...]:
+    def effects(x: Real) -> tuple[Any, ...]:
         return (
             tuple(c.effect_at(part) for c, part in zip(candidates, np.split(x, splits[:-1]), strict=True))
             if candidates
@@ -130,7 +131,7 @@ def fit(
             break
     J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
     parts = tuple(np.split(x, splits[:-1])) if candidates else ()
-    return Fit(tuple(candidates), d, parts, e, J, cost, converged)
+    return Fit(tuple(candidates), d, parts, e, J, cost, converged, model.case.machine.weighing)
 
 
 def cost_at(
@@ -146,7 +147,7 @@ def _jacobian(
     d: Real,
     x: Real,
     e: Real,
-    effects: Callable[[Real], tuple[Effect, ...]],
+    effects: Callable[[Real], tuple[Any, ...]],
     steps: Real,
     high: Real,
     nominal_jacobian: Real | None,
@@ -157,9 +158,7 @@ def _jacobian(
         J[:, :P] = nominal_jacobian
     else:
         here = effects(x)
-        step = max(
-            [_DEVIATION_STEP["smooth"], *(_DEVIATION_STEP[type(effect).dependence] for effect in here)]
-        )
+        step = max([_DEVIATION_STEP["smooth"], *(_DEVIATION_STEP[effect.dependence] for effect in here)])
         for i in range(P):
             moved = d.copy()
             moved[i] += step

@@ -48,19 +48,18 @@ class Hypothesis:
     @classmethod
     def of(cls, fit: Fit, rest: Leftover) -> Hypothesis:
         beside = len(fit.names) - 1
-        jagged = any(EFFECTS[name].dependence == "jagged" for name in fit.names)
+        jagged = any(candidate.dependence == "jagged" for candidate in fit.candidates)
         allowed = _BESIDE_JAGGED * beside if jagged else 0.0
-        evidence = log_evidence(fit)
+        evidence, prior = log_evidence(fit), log_prior(fit.names, len(fit.weighing.listed))
         return cls(
             fit,
-            evidence + disagreement_gain(fit.names, rest) + log_prior(fit.names) - allowed,
-            evidence + rest.log_gain_some + log_prior(fit.names) + _UNKNOWN_BESIDE,
+            evidence + disagreement_gain(fit, rest) + prior - allowed,
+            evidence + rest.log_gain_some + prior + _UNKNOWN_BESIDE,
         )
 
 
-def log_prior(names: Sequence[str]) -> float:
-    """log prior probability of exactly this set of effects."""
-    n = len(EFFECTS)
+def log_prior(names: Sequence[str], n: int = len(EFFECTS)) -> float:
+    """log prior probability of exactly this set of effects out of n that are listed."""
     if not names:
         return float(np.log(_PRIOR_NONE))
     count = len(names)
@@ -68,12 +67,13 @@ def log_prior(names: Sequence[str]) -> float:
     return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
 
 
-def disagreement_gain(names: Sequence[str], rest: Leftover) -> float:
+def disagreement_gain(fit: Fit, rest: Leftover) -> float:
     """log evidence gained by the disagreement that two correct solvers of these effects may have.
 
     Its size has a half-normal prior; what is left over beyond that is no disagreement any more.
     """
-    scale = max([_DISAGREEMENT["smooth"], *(_DISAGREEMENT[EFFECTS[name].dependence] for name in names)])
+    solvers = [_DISAGREEMENT["smooth"], *(_DISAGREEMENT[c.dependence] for c in fit.candidates)]
+    scale = max(*solvers, fit.weighing.model_error)
     return max(0.0, rest.log_gain - 0.5 * (rest.size / scale) ** 2)
 
 
@@ -122,8 +122,9 @@ def probabilities(hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0)
     weight = np.exp(logs - np.max(logs))
     weight /= weight.sum()
     sets = {key: float(p) for key, p in zip(keys, weight, strict=True)}
-    cause = {"none": sets.get((), 0.0), **dict.fromkeys(EFFECTS, 0.0), "unknown": sets[_UNKNOWN]}
-    presence = dict.fromkeys(EFFECTS, 0.0)
+    listed = hypotheses[0].fit.weighing.listed
+    cause = {"none": sets.get((), 0.0), **dict.fromkeys(listed, 0.0), "unknown": sets[_UNKNOWN]}
+    presence = dict.fromkeys(listed, 0.0)
     for key, hypothesis in best.items():
         for name in hypothesis.names[:1]:
             cause[name] += sets[key]

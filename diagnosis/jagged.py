@@ -6,7 +6,6 @@ import numpy as np
 
 from diagnosis.fit import Fit, fit
 from diagnosis.residual import ResidualModel
-from plant.effects import EFFECTS
 
 _REACHES = (0.12, 0.04, 0.012)
 _POINTS = 15
@@ -21,7 +20,7 @@ def refined(model: ResidualModel, end: Fit) -> Fit:
     """
     best = end
     for k, candidate in enumerate(end.candidates):
-        if EFFECTS[candidate.effect].dependence != "jagged":
+        if candidate.dependence != "jagged":
             continue
         for reach in _REACHES:
             best = _round(model, best, k, reach)

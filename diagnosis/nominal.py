@@ -3,44 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
 
-from diagnosis.case import Real
-from plant.rig import Rig
+from diagnosis.machine_protocol import Real, Stated
 
 # Where a stated value would have to be more wrong than this many tolerances nothing is believed any more.
 LARGEST_DEVIATION = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class NominalParameters:
+class NominalParameters(Generic[Stated]):
     """Deviations d (P,) of the stated values in units of their tolerances; d ~ N(0, I) before any record.
 
-    A rig file with tolerances states values that are wrong by draws of that size: stated = true (1 + t d), so
-    the true value is stated / (1 + t d).
+    A rig or machine with tolerances t states values that are wrong by draws of that size: stated =
+    true (1 + t d), so the true value is stated / (1 + t d).
     """
 
-    rig: Rig
+    stated: Stated
 
     @property
     def keys(self) -> tuple[str, ...]:
-        return tuple(self.rig.tolerances)
+        return tuple(self.stated.tolerances)
 
     @property
     def count(self) -> int:
-        return len(self.rig.tolerances)
+        return len(self.stated.tolerances)
 
-    def at(self, deviations: Real) -> Rig:
-        """The rig whose stated values are off by these deviations (P,)."""
+    def at(self, deviations: Real) -> Stated:
+        """The rig or machine whose stated values are off by these deviations (P,)."""
         if not self.count:
-            return self.rig
+            return self.stated
         factors = {
             # A tolerance of 30 % and a deviation of -3 leave a tenth of the value: no lower than 5 %.
             key: 1.0 / max(1.0 + tolerance * float(d), 0.05)
-            for (key, tolerance), d in zip(self.rig.tolerances.items(), deviations, strict=True)
+            for (key, tolerance), d in zip(self.stated.tolerances.items(), deviations, strict=True)
         }
-        return self.rig.scaled(factors)
+        return self.stated.scaled(factors)
 
     def within(self, deviations: Real) -> Real:
         return np.clip(deviations, -LARGEST_DEVIATION, LARGEST_DEVIATION)

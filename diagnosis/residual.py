@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from diagnosis.case import Case, Experiment, Real
+from diagnosis.machine_protocol import CaseOfMachine, Machine, Real, RecordOfMachine
 from diagnosis.nominal import NominalParameters
-from plant.effects import Effect
-from plant.rig import Rig
-from plant.simulate import simulate
 
 
 class ResidualModel:
@@ -19,27 +17,27 @@ class ResidualModel:
     Counts its simulations, which is what a diagnosis spends its time on.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: CaseOfMachine) -> None:
         self.case = case
-        self.nominal = NominalParameters(case.rig)
+        self.nominal = NominalParameters(case.machine)
         self.simulations = 0
 
     def of(
-        self, deviations: Real, effects: Sequence[Effect], experiments: Sequence[Experiment] | None = None
+        self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
     ) -> Real:
-        """Residuals (N,) of the given experiments (default: estimation), sample by sample, hub before tip."""
+        """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs."""
         experiments = self.case.estimation if experiments is None else experiments
-        rig = self.nominal.at(deviations)
-        return np.concatenate([self._one(rig, effects, experiment).ravel() for experiment in experiments])
+        machine = self.nominal.at(deviations)
+        return np.concatenate([self._one(machine, effects, experiment).ravel() for experiment in experiments])
 
-    def by_experiment(self, deviations: Real, effects: Sequence[Effect]) -> dict[str, Real]:
-        """Residuals (T, 2) of every experiment."""
-        rig = self.nominal.at(deviations)
-        return {experiment.name: self._one(rig, effects, experiment) for experiment in self.case.experiments}
+    def by_experiment(self, deviations: Real, effects: Sequence[Any]) -> dict[str, Real]:
+        """Residuals (T, Y) of every experiment."""
+        machine = self.nominal.at(deviations)
+        return {e.name: self._one(machine, effects, e) for e in self.case.experiments}
 
-    def _one(self, rig: Rig, effects: Sequence[Effect], experiment: Experiment) -> Real:
+    def _one(self, machine: Machine, effects: Sequence[Any], experiment: RecordOfMachine) -> Real:
         self.simulations += 1
-        model = simulate(rig, experiment.voltage_V, effects).output
+        model = machine.simulate(effects, experiment.input)
         return np.asarray((experiment.output - model) / self.case.noise)
 
 

@@ -9,9 +9,11 @@ import numpy.typing as npt
 from scipy.signal import fftconvolve
 
 from diagnosis.candidates import Candidate
-from diagnosis.case import Real
 from diagnosis.fit import Fit
+from diagnosis.flexible_arm import FlexibleArm
+from diagnosis.machine_protocol import Real
 from diagnosis.residual import ResidualModel
+from plant.rig import Rig
 from plant.simulate import simulate
 
 # Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
@@ -45,12 +47,13 @@ class Screening:
         P = around.deviations.size
         self._Jn = around.jacobian[:, :P]
         self._A = self._Jn.T @ self._Jn + np.eye(P)
-        self._parts = np.cumsum([2 * e.voltage_V.size for e in model.case.estimation])[:-1]
+        self._parts = np.cumsum([e.output.size for e in model.case.estimation])[:-1]
 
     def starts(self, candidate: Candidate) -> list[Start]:
         """Every start of the candidate, best first."""
-        if candidate.effect in _HARMONIC:
-            found = self._harmonic(candidate)
+        machine = self.model.nominal.at(self.around.deviations)
+        if candidate.effect in _HARMONIC and isinstance(machine, FlexibleArm):
+            found = self._harmonic(candidate, machine.rig)
         else:
             found = [
                 start for x in candidate.starts if (start := self._at(candidate, np.array(x))) is not None
@@ -112,16 +115,15 @@ class Screening:
         return float(e @ e + d @ d + 2 * gradient @ step + step @ self._A @ step), step
 
     def _size(self, change: Real) -> float:
-        parts = np.split(change, self._parts)
-        return float(max(np.max(np.sqrt(np.mean(p.reshape(-1, 2) ** 2, axis=0))) for p in parts))
+        parts, outputs = np.split(change, self._parts), self.model.case.noise.size
+        return float(max(np.max(np.sqrt(np.mean(p.reshape(-1, outputs) ** 2, axis=0))) for p in parts))
 
-    def _harmonic(self, candidate: Candidate) -> list[Start]:
+    def _harmonic(self, candidate: Candidate, rig: Rig) -> list[Start]:
         """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""
         model, around = self.model, self.around
         P = around.deviations.size
-        rig = model.nominal.at(around.deviations)
         dt, noise = rig.sampling.dt_s, model.case.noise
-        longest = max(e.voltage_V.size for e in model.case.estimation)
+        longest = max(len(e.input) for e in model.case.estimation)
         pulse = np.zeros(longest)
         pulse[0] = 1.0
         response = simulate(rig, np.zeros(longest), hub_torque_Nm=pulse).output / noise
@@ -137,7 +139,7 @@ class Screening:
             for shift in (0.0, np.pi / 2):
                 parts = []
                 for e in model.case.estimation:
-                    time = (np.arange(e.voltage_V.size) + 0.5) * dt
+                    time = (np.arange(len(e.input)) + 0.5) * dt
                     angle = 2 * np.pi * line * time if periodic else line * e.output[:, 0]
                     torque = np.sin(angle + shift)
                     n = torque.size

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.candidates import Candidate, candidates
-from diagnosis.case import Case, Real
+from diagnosis.candidates import Candidate
 from diagnosis.fit import Fit, cost_at, fit
 from diagnosis.hypotheses import Hypothesis
 from diagnosis.jagged import refined
 from diagnosis.leftover import leftover
+from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.residual import ResidualModel
 from diagnosis.screening import Screening, Start, smallest_size
-from plant.effects import EFFECTS
 
 Progress = Callable[[float, str], None]
 
@@ -46,20 +45,20 @@ class Search:
         return self.hypotheses[0]
 
 
-def search(case: Case, progress: Progress | None = None) -> Search:
+def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     """Fit the nominal, every effect alone, and sets of effects as long as they gain."""
     report = progress or (lambda fraction, message: None)
     model = ResidualModel(case)
     base = fit(model, (), (), np.zeros(model.nominal.count))
     screening = Screening(model, base)
     listed: list[tuple[Candidate, list[Start]]] = []
-    spaces = candidates(case)
+    spaces = case.machine.candidates(case)
     for k, candidate in enumerate(spaces):
         report(0.05 + 0.3 * k / len(spaces), f"looking at {candidate.effect}")
         starts = screening.starts(candidate)
         least = smallest_size(candidate, starts, SMALLEST_SIZE_RATIO) if starts else None
         if least is not None:
-            if EFFECTS[candidate.effect].dependence == "jagged":
+            if candidate.dependence == "jagged":
                 starts = screening.zoomed(candidate, starts)
             listed.append((candidate.from_size(least), starts))
     found = [_weighed(model, base)]
@@ -83,8 +82,8 @@ def search(case: Case, progress: Progress | None = None) -> Search:
 
 
 def _weighed(model: ResidualModel, end: Fit) -> Hypothesis:
-    segments = [experiment.voltage_V.size for experiment in model.case.estimation]
-    return Hypothesis.of(end, leftover(end.residuals, segments))
+    segments = [len(experiment.output) for experiment in model.case.estimation]
+    return Hypothesis.of(end, leftover(end.residuals, segments, model.case.noise.size))
 
 
 def _part(report: Progress, begin: float, share: float) -> Progress:
