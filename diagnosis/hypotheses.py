@@ -54,7 +54,7 @@ class Hypothesis:
         return cls(
             fit,
             evidence + disagreement_gain(fit, rest) + prior - allowed,
-            evidence + rest.log_gain_some + prior + _UNKNOWN_BESIDE,
+            evidence + rest.log_gain_some + prior + _UNKNOWN_BESIDE + _beyond_model_error(fit, rest),
         )
 
 
@@ -75,6 +75,14 @@ def disagreement_gain(fit: Fit, rest: Leftover) -> float:
     solvers = [_DISAGREEMENT["smooth"], *(_DISAGREEMENT[c.dependence] for c in fit.candidates)]
     scale = max(*solvers, fit.weighing.model_error)
     return max(0.0, rest.log_gain - 0.5 * (rest.size / scale) ** 2)
+
+
+def _beyond_model_error(fit: Fit, rest: Leftover) -> float:
+    """log probability that what is left is more than the machine's simulation may leave anyway."""
+    allowed = fit.weighing.model_error
+    if not allowed > 0:
+        return 0.0
+    return float(np.log(max(-np.expm1(-0.5 * (rest.size / allowed) ** 2), 1e-12)))
 
 
 @dataclass(frozen=True, eq=False)
