@@ -40,6 +40,8 @@ from plant.simulate import simulate
 _SETTLED = 20.0
 # Below this nothing is said to separate two rivals.
 _SEPARATES = 3.0
+# A runner-up with less than this share of the first rival's probability is beaten.
+_DECIDED = 0.01
 # Relative steps of difference quotients; contacts that switch need one that averages over many of them.
 _STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
 # In tolerances: small against one, large against the wobble of friction.
@@ -446,18 +448,24 @@ def _result(
         pairs.append(Separation((a, b), float(d), float(d**2 / 2), words))
     separates = bool(np.max(distance) >= _SEPARATES)
     duration = x.voltage_V.size * dt
+    first, second = sorted(rivals, key=lambda r: -r.probability)[:2]
+    decided = (
+        f"The records already decide for {first.name}; an experiment would only confirm it. "
+        if second.probability < _DECIDED * first.probability
+        else ""
+    )
     if separates:
         told = "; it ".join(s.sentence for s in pairs)
         sentence = (
-            f"Run next: {x.words}, {duration:.3g} s. It {told}. The hub stays within "
+            f"{decided}Run next: {x.words}, {duration:.3g} s. It {told}. The hub stays within "
             f"{chosen.hub[0]:.2g} to {chosen.hub[1]:.2g} rad, the deflection within "
             f"{1e3 * chosen.deflection[0]:.2g} to {1e3 * chosen.deflection[1]:.2g} mm."
         )
     else:
         names = _listed([r.name for r in rivals])
         sentence = (
-            f"None of the {len(considered)} experiments looked at separates {names}: the best, {x.words}, "
-            f"parts them by {np.max(distance):.2g} standard deviations at most."
+            f"{decided}None of the {len(considered)} experiments looked at separates {names}: the best, "
+            f"{x.words}, parts them by {np.max(distance):.2g} standard deviations at most."
         )
     return NextExperiment(
         x.kind,

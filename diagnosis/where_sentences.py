@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
 from scipy.stats import chi2
 
 from diagnosis.where_energy import evenness
@@ -62,7 +64,7 @@ def headline(found: Where) -> str:
         places.append(f"it lies in the {sensor} sensor")
     band = concentration(found.bands)
     if band is not None:
-        places.append(f"{percent(band[2])} of its energy {frequencies(band[0], band[1], found)}")
+        places.append(f"{band.words} of its energy {frequencies(band.low_Hz, band.high_Hz, found)}")
     if any(d.sentence for d in found.drift):
         places.append("it grows steadily with time")
     elif found.linear is not None and found.linear.sentence:
@@ -83,10 +85,27 @@ def best_curve(curves: Sequence[EquivalentCurve]) -> EquivalentCurve | None:
     return max(usable, key=lambda c: c.share, default=None)
 
 
-def concentration(bands: Sequence[BandGap]) -> tuple[float, float, float] | None:
-    """Narrowest run of bands (both sensors) with at least 80 % of the gap: low, high in Hz, share.
+@dataclass(frozen=True)
+class Concentration:
+    """Share of a gap's energy between two frequencies, and half the width of its 95 % interval."""
 
-    None if only the whole range has it, or no band is found.
+    low_Hz: float
+    high_Hz: float
+    share: float
+    half_width: float
+
+    @property
+    def words(self) -> str:
+        """The share, or what it is at least where noise leaves more than five points open."""
+        if self.half_width <= 0.05:
+            return percent(self.share)
+        return f"at least {100 * (min(self.share, 1.0) - self.half_width):.0f} %"
+
+
+def concentration(bands: Sequence[BandGap]) -> Concentration | None:
+    """Narrowest run of bands (both sensors) with at least 80 % of the gap.
+
+    None if only the whole range has it, no band is found, or it may be less than half.
     """
     if not any(b.gap.found for b in bands):
         return None
@@ -101,7 +120,11 @@ def concentration(bands: Sequence[BandGap]) -> tuple[float, float, float] | None
     if not runs:
         return None
     length, share, low, high = min(runs)
-    return None if length == len(shares) else (low, high, -share)
+    if length == len(shares):
+        return None
+    halves = [np.ptp(b.gap.share_interval) / 2 for b in bands if low <= b.low_Hz < high]
+    half = float(np.sqrt(np.sum(np.square(halves))))
+    return Concentration(low, high, -share, half) if min(-share, 1.0) - half >= 0.5 else None
 
 
 def percent(share: float) -> str:
@@ -174,15 +197,15 @@ def _experiments(gaps: Sequence[ExperimentGap]) -> str:
 
 def _frequency(found: Where) -> str:
     parts: list[str] = []
-    runs: dict[tuple[float, float], list[tuple[str, float]]] = {}
+    runs: dict[tuple[float, float], list[tuple[str, str]]] = {}
     for s in found.sensors:
         word = sensor_word(s.sensor)
         own = [b for b in found.bands if b.sensor == s.sensor]
         if not s.gap.found:
             # Concentrated gaps can hide in the sum over all frequencies; a band on its own still speaks.
             parts += [
-                f"The {word} sensor has a gap {frequencies(b.low_Hz, b.high_Hz, found)} of "
-                f"{b.gap.gap_rms:.2g} noise deviations."
+                f"The {word} sensor stands out of the noise {frequencies(b.low_Hz, b.high_Hz, found)}, by "
+                f"{b.gap.gap_rms:.2g} times the noise in that band."
                 for b in own
                 if b.gap.found
             ]
@@ -196,11 +219,12 @@ def _frequency(found: Where) -> str:
         else:
             run = concentration(own_shares(own))
             if run is not None:
-                runs.setdefault(run[:2], []).append((word, run[2]))
+                runs.setdefault((run.low_Hz, run.high_Hz), []).append((word, run.words))
     for (low, high), members in runs.items():
-        shares = listed(list(dict.fromkeys(percent(share) for _, share in members)))
+        different = list(dict.fromkeys(words for _, words in members))
+        shares = listed(different)
         sensors = f"{listed([word for word, _ in members])} sensor{'s' if len(members) > 1 else ''}"
-        verb = "lie" if len(members) > 1 else "lies"
+        verb = "lie" if len(different) > 1 else "lies"
         parts.append(
             f"{shares[0].upper()}{shares[1:]} of the gap energy of the {sensors} {verb} "
             f"{frequencies(low, high, found)}."

@@ -46,6 +46,14 @@ def test_what_differs_only_at_high_voltage_gets_high_voltage():
     assert below.separations[0].standard_deviations == pytest.approx(0.0, abs=1e-6)
 
 
+def test_what_the_records_decided_is_said():
+    first = Rival(0.97, RIG, (TipPayload(mass_kg=0.01),))
+    second = Rival(0.001, RIG)
+    assert next_experiment((first, second), Limits(1.0)).sentence.startswith(
+        "The records already decide for tip_payload"
+    )
+
+
 def test_identical_rivals_are_not_separated():
     effect = CoulombFriction(torque_Nm=0.01)
     chosen = next_experiment(_rivals(effect, effect), Limits(1.0))
