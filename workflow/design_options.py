@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from control_design.prefilter import PrefilterOptions
@@ -11,6 +12,7 @@ from control_design.specification import RationalWeight
 from control_design.youla import YoulaOptions
 
 FEWEST_DRAWS = 100
+_LASTING = 100.0  # how much more than a passing error one weighs that lasts
 
 
 class CertificateOptions(BaseModel):
@@ -27,7 +29,8 @@ class CertificateOptions(BaseModel):
     calibrate: bool = Field(
         False,
         description="certify over ellipses of the level at which the worst case holds for joint_coverage of "
-        "the whole responses, where that is above the level of the ellipses; false: say what it holds for",
+        "the whole responses, where that is above the level of the ellipses, and design so that 99.9 % of "
+        "them are stable; false: say what the worst case holds for",
     )
 
     @model_validator(mode="after")
@@ -57,8 +60,11 @@ class PrefilterSettings(PrefilterOptions):
     model: RationalWeight | None = Field(
         None, description="the model itself: numerator and denominator in s, e.g. of a step with overshoot"
     )
-    weight: RationalWeight | None = Field(
-        None, description="weight of the matching error, numerator and denominator in s; none: 1"
+    weight: Literal["steps", "flat"] | RationalWeight = Field(
+        "steps",
+        description="weight of the matching error. steps: (s + w)/(s + w/100), w the corner of the model, so "
+        "that errors which last weigh most; flat: 1, the largest error at any frequency, which a filter may "
+        "then keep for seconds; or numerator and denominator in s",
     )
 
     @model_validator(mode="after")
@@ -68,6 +74,25 @@ class PrefilterSettings(PrefilterOptions):
         if self.model is not None and "model_order" in self.model_fields_set:
             raise ValueError("model_order goes with corner_rad_s")
         return self
+
+    @property
+    def error_weight(self) -> RationalWeight | None:
+        """W(s) of the matching error; None is 1."""
+        if self.weight == "flat":
+            return None
+        if isinstance(self.weight, RationalWeight):
+            return self.weight
+        corner = self.corner_rad_s or self._corner()
+        return RationalWeight(numerator=(1.0, corner), denominator=(1.0, corner / _LASTING))
+
+    def _corner(self) -> float:
+        """Where the model has fallen by 3 dB, rad/s; its fastest pole where it never does."""
+        model = self.reference_model
+        poles = np.abs(np.roots(model.denominator))
+        omega = np.geomspace(1e-3 * poles.min(initial=1.0), 1e3 * poles.max(initial=1.0), 4000)
+        size = np.abs(model.at(1j * omega))
+        below = np.flatnonzero(size < size[0] / np.sqrt(2))
+        return float(omega[below[0]] if below.size else poles.max(initial=1.0))
 
     @property
     def reference_model(self) -> RationalWeight:

@@ -321,7 +321,9 @@ def _stated(
             remark = "no uncertainty is stated ([uncertainty] in the design file): the design and its "
             remark += "certificate hold for exactly this model"
             return DesignSource(UncertainPlant(name, nominal), origin, (remark,))
-        return DesignSource(UncertainPlant(name, nominal, design.uncertainty.around(nominal)), origin)
+        with naming(f"{design.name} [uncertainty]"):
+            discs = design.uncertainty.around(nominal)
+        return DesignSource(UncertainPlant(name, nominal, discs), origin)
 
 
 def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSpace:
@@ -443,6 +445,7 @@ def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
     except (OSError, UnicodeDecodeError):
         header = "variance_real"  # whoever reads it in earnest complains properly
     if "variance_real" in header:
+        _refuse_strange_spread(path, header)
         return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level)
     repeats = FrfRepeats.from_csv(path)
     try:
@@ -456,6 +459,16 @@ def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _refuse_strange_spread(path: Path, header: str) -> None:
+    """A covariance under another name would be left out in silence, and the ellipses be wrong."""
+    known = {"variance_real", "variance_imag", "covariance_real_imag"}
+    for column in (name.strip().strip('"') for name in header.split(",")):
+        if column not in known and ("covar" in column.lower() or "varian" in column.lower()):
+            raise InputError(
+                f"{path}, line 1: unknown column {column!r}; the spread stands in {', '.join(sorted(known))}"
+            )
 
 
 def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:

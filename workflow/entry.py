@@ -17,7 +17,7 @@ from control_design.certificate import Certificate
 from control_design.controller import Controller
 from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
-from control_design.synthesis import SynthesisOptions, synthesise
+from control_design.synthesis_options import SynthesisOptions
 from control_design.synthesis_result import Outcome
 from ident.record import Record
 from workflow import storage
@@ -28,7 +28,13 @@ from workflow.errors import InputError, naming
 from workflow.pipeline import config_of, run_pipeline
 from workflow.progress import Progress
 from workflow.randomness import stage_rng
-from workflow.reference_filter import find_prefilter, prefilter_bytes, prefilter_file, prefilter_of
+from workflow.reference_filter import (
+    check_prefilter,
+    find_prefilter,
+    prefilter_bytes,
+    prefilter_file,
+    prefilter_of,
+)
 from workflow.run_directory import RunDirectory, default_directory
 from workflow.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 from workflow.summary import (
@@ -42,7 +48,7 @@ from workflow.summary import (
     whole_rows,
     yardstick_rows,
 )
-from workflow.whole_responses import certify_whole, joint_numbers
+from workflow.whole_responses import certify_whole, joint_numbers, open_words, synthesise_asked
 from workflow.yardstick import bracket_numbers, find_bracket, order_advice
 
 BetweenPoints = Literal["nothing", "linear"]
@@ -208,11 +214,18 @@ def _design(
 ) -> _Designed:
     with naming("design"):
         try:
-            result = synthesise(plants, asked.specification, asked.synthesis, rng=stage_rng(seed, "design"))
+            result, jointly = synthesise_asked(
+                plants, asked.specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
+            )
         except SpecificationError as impossible:
             reason = f"specification not met: {impossible}"
             return _Designed({"synthesis": None, "met": False, "reason": reason}, {})
-        design = {"synthesis": result.to_dict(), "met": result.gamma <= 1.0, "reason": result.explain()}
+        design = {
+            "synthesis": result.to_dict(),
+            "met": result.gamma <= 1.0,
+            "reason": result.explain(),
+            "jointly": jointly,
+        }
         yardstick = find_bracket(plants, asked.specification, asked.yardstick)
         if result.outcome is Outcome.NOT_CONVERGED:
             return _Designed(design, yardstick)
@@ -254,6 +267,7 @@ def design_controller(
     found = load_sources(paths, file)
     asked = _Asked.of(file, found[0].config, paths)
     plants = [source.plant for source in found]
+    check_prefilter(asked.prefilter, plants[0].dt_s, str(file.path or paths[0]))
     done = _design(plants, asked, file.plant.between_points, seed)
     certificate, order = done.certificate, asked.specification.controller_order
     certified = certificate is not None and certificate.certified
@@ -286,7 +300,7 @@ def design_controller(
             ),
             Section(
                 "certificate",
-                (*certificate_rows(verdict), *whole_rows(done.whole), *_not_checked_rows(certificate)),
+                (*certificate_rows(verdict), *whole_rows(done.whole), *_not_checked_rows(done)),
             ),
             *prefilter_sections(done.prefilter),
             *([Section("written", tuple(Row("", str(path)) for path in files))] if files else []),
@@ -343,8 +357,8 @@ def _reason(done: _Designed, advice: str | None) -> str:
     return f"{text}; {advice}" if advice else text
 
 
-def _not_checked_rows(certificate: Certificate | None) -> list[Row]:
-    words = () if certificate is None else certificate.not_checked
+def _not_checked_rows(done: _Designed) -> list[Row]:
+    words = [] if done.certificate is None else open_words(done.certificate.not_checked, done.whole)
     return [Row("not checked" if number == 0 else "", text) for number, text in enumerate(words)]
 
 

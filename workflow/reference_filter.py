@@ -26,32 +26,42 @@ def find_prefilter(
 ) -> dict[str, Any]:
     """{prefilter: Prefilter.to_dict() or null, reason: null or why there is none}.
 
-    A loop that is not robustly stable has no worst-case error: a result, with the reason. Raises InputError
-    for a pole that this sampling time does not allow.
+    A loop that is not robustly stable has no worst-case error: a result, with the reason. Raises InputError:
+    see `check_prefilter`.
     """
     if settings is None:
         return {"prefilter": None, "reason": None}
-    nyquist = np.pi / controller.dt_s
-    for rate in settings.poles_rad_s or ():
-        if not 0 < rate < nyquist:
-            raise InputError(
-                f"prefilter.poles_rad_s: {rate:.4g} is not between 0 and the Nyquist frequency "
-                f"{nyquist:.4g} rad/s"
-            )
-    if settings.corner_rad_s is not None and not settings.corner_rad_s < nyquist:
-        raise InputError(
-            f"prefilter.corner_rad_s: {settings.corner_rad_s:.4g} lies beyond the Nyquist frequency "
-            f"{nyquist:.4g} rad/s"
-        )
+    check_prefilter(settings, controller.dt_s)
     own = {"corner_rad_s", "model_order", "model", "weight"}
     options = PrefilterOptions(**settings.model_dump(exclude=own))
     try:
         found = design_prefilter(
-            controller, plants, settings.reference_model, options, weight=settings.weight
+            controller, plants, settings.reference_model, options, weight=settings.error_weight
         )
     except ValueError as unfit:
         return {"prefilter": None, "reason": f"no prefilter: {unfit}"}
     return {"prefilter": found.to_dict(), "reason": None}
+
+
+def check_prefilter(settings: PrefilterSettings | None, dt_s: float, source: str = "") -> None:
+    """Refuse frequencies that a sampling time does not allow, before anything is designed.
+
+    source: the file, for the complaint. Raises InputError: one line naming the key.
+    """
+    if settings is None:
+        return
+    nyquist, where = np.pi / dt_s, f"{source}: prefilter" if source else "prefilter"
+    for rate in settings.poles_rad_s or ():
+        if not 0 < rate < nyquist:
+            raise InputError(
+                f"{where}.poles_rad_s: {rate:.4g} is not between 0 and the Nyquist frequency "
+                f"{nyquist:.4g} rad/s"
+            )
+    corner = settings.corner_rad_s
+    if corner is not None and not corner < nyquist:
+        raise InputError(
+            f"{where}.corner_rad_s: {corner:.4g} lies beyond the Nyquist frequency {nyquist:.4g} rad/s"
+        )
 
 
 def prefilter_of(document: Mapping[str, Any]) -> Prefilter | None:
@@ -69,8 +79,9 @@ def prefilter_words(document: Mapping[str, Any]) -> str | None:
     gain = found.error_before / found.error_after if found.error_after > 0 else np.inf
     verdict = f", {gain:.3g} times smaller" if gain >= 1.005 else ": it buys nothing here"
     return (
-        f"order {found.order}: largest model-matching error over the ellipses {found.error_after:.4g} with "
-        f"it, {found.error_before:.4g} without{verdict} (largest at {found.worst_rad_s:.4g} rad/s)"
+        f"order {found.order}: largest weighted model-matching error over the ellipses "
+        f"{found.error_after:.4g} with it, {found.error_before:.4g} without{verdict} (largest at "
+        f"{found.worst_rad_s:.4g} rad/s)"
     )
 
 

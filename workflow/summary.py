@@ -234,6 +234,8 @@ def design_rows(design: Mapping[str, Any]) -> tuple[Row, ...]:
                 "controller", f"order {len(synthesis['controller']['A'])}, gamma {_text(synthesis['gamma'])}"
             ),
         )
+    if design.get("jointly"):
+        rows.append(Row("sampled", design["jointly"]))
     return tuple(rows)
 
 
@@ -269,9 +271,12 @@ def certificate_rows(certify: Mapping[str, Any]) -> tuple[Row, ...]:
 
 
 def gamma_of(design: Mapping[str, Any]) -> float | None:
-    """Weighted worst case of the design on its own grid; None without a controller."""
+    """Weighted worst case of the design on its own grid; None without a controller, inf without a stable
+    one."""
     synthesis = design["synthesis"]
-    return None if synthesis is None else float(synthesis["gamma"])
+    if synthesis is None:
+        return None
+    return math.inf if synthesis["gamma"] is None else float(synthesis["gamma"])
 
 
 def yardstick_rows(yardstick: Mapping[str, Any], design: Mapping[str, Any], order: int) -> tuple[Row, ...]:

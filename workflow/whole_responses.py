@@ -3,19 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from control_design.certificate import Certificate, certify
 from control_design.controller import Controller
-from control_design.joint_coverage import JointCoverage, ResponseDraws
+from control_design.joint_coverage import JointCoverage, ResponseDraws, joint_coverage
+from control_design.joint_synthesis import synthesise_jointly
 from control_design.plant_set import UncertainPlant
 from control_design.specification import Specification
+from control_design.synthesis import synthesise
+from control_design.synthesis_options import SynthesisOptions
+from control_design.synthesis_result import SynthesisResult
 from ident.uncertainty import ResponsePosterior
 from workflow.design_options import CertificateOptions
 from workflow.proportions import wilson_interval
+
+
+def synthesise_asked(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    synthesis: SynthesisOptions,
+    options: CertificateOptions,
+    rng: np.random.Generator,
+    progress: Callable[[float, str], None] | None = None,
+) -> tuple[SynthesisResult, str | None]:
+    """The design; with `calibrate`, and plants to draw from, one whose sampled responses are stable as often
+    as the certificate then asks. Second: what became of that, in one sentence."""
+    if not options.calibrate or undrawable(plants) is not None:
+        return synthesise(plants, specification, synthesis, rng=rng, progress=progress), None
+    found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
+    return found.result, found.sentence()
 
 
 def certify_whole(
@@ -29,31 +49,35 @@ def certify_whole(
 ) -> tuple[Certificate, dict[str, Any]]:
     """Certificate, and {joint: JointCoverage.to_dict() or null, calibrated, reason: null or why none}.
 
-    Without `calibrate` the ellipses keep their level, whatever the draws say.
+    Without `calibrate` the certificate is that of the ellipses at their own level, whatever the draws say;
+    with it the ellipses are of the calibrated level where that is higher, and the share of stable draws is an
+    item of the certificate.
     """
     reason = undrawable(plants) if options.joint_draws else "no responses were drawn (joint_draws = 0)"
+    if reason is None and options.calibrate:
+        certificate = certify(
+            controller,
+            plants,
+            specification,
+            between_own_points=between_own_points,
+            joint_coverage=options.joint_coverage,
+            rng=rng,
+            joint_draws=options.joint_draws,
+        )
+        assert certificate.joint is not None
+        return certificate, {"joint": certificate.joint.to_dict(), "calibrated": True, "reason": None}
+    certificate = certify(controller, plants, specification, between_own_points=between_own_points)
     if reason is not None:
-        plain = certify(controller, plants, specification, between_own_points=between_own_points)
-        return plain, {"joint": None, "calibrated": False, "reason": reason}
-    certificate = certify(
+        return certificate, {"joint": None, "calibrated": False, "reason": reason}
+    joint = joint_coverage(
         controller,
         plants,
         specification,
-        between_own_points=between_own_points,
-        joint_coverage=options.joint_coverage,
         rng=rng,
-        joint_draws=options.joint_draws,
+        coverage=options.joint_coverage,
+        draws=options.joint_draws,
     )
-    joint = certificate.joint
-    assert joint is not None
-    raised = any(joint.level > plant.level for plant in plants)
-    if raised and not options.calibrate:
-        certificate = certify(controller, plants, specification, between_own_points=between_own_points)
-    return certificate, {
-        "joint": joint.to_dict(),
-        "calibrated": raised and options.calibrate,
-        "reason": None,
-    }
+    return certificate, {"joint": joint.to_dict(), "calibrated": False, "reason": None}
 
 
 def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
@@ -65,10 +89,21 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
             if uncertainty is None:
                 continue
             if not isinstance(uncertainty, ResponsePosterior | ResponseDraws):
-                known = "its own frequencies" if plant.own_grid is not None else "a bound, not a distribution"
-                return f"whole responses of {plant.name} cannot be drawn: its uncertainty is {known} only"
+                known = (
+                    "known at its own frequencies only"
+                    if plant.own_grid is not None
+                    else "a bound, not a distribution"
+                )
+                return f"whole responses of {plant.name} cannot be drawn: its uncertainty is {known}"
             drawn = True
     return None if drawn else "no uncertainty is stated: there is nothing to draw from"
+
+
+def open_words(not_checked: Sequence[str], whole: Mapping[str, Any]) -> list[str]:
+    """What a certificate did not check, with what sampling said of it meanwhile."""
+    sampled = "joint level: sampled, not certified; see the whole responses"
+    known = joint_of(whole) is not None
+    return [sampled if known and words.startswith("joint level") else words for words in not_checked]
 
 
 def joint_of(document: Mapping[str, Any]) -> JointCoverage | None:
@@ -110,6 +145,8 @@ def joint_words(document: Mapping[str, Any]) -> str | None:
         f"holds for {_percent(joint.coverage_given)} (95 % interval {_between(held)}), {loop}"
     )
     wanted = _percent(joint.coverage)
+    if document["calibrated"] and joint.level <= joint.given_level:
+        return f"{words}; the ellipses were certified as they are: {_percent(joint.level)} would do"
     if document["calibrated"]:
         return (
             f"{words}; certified over ellipses of {_percent(joint.level)}, whose worst case "

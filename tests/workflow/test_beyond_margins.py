@@ -8,16 +8,19 @@ import shutil
 import subprocess
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.io
 from pydantic import ValidationError
 
+from control_design.certificate import certify
 from control_design.joint_coverage import JointCoverage
 from control_design.plant_set import UncertainPlant
 from control_design.prefilter import Prefilter
 from control_design.specification import RationalWeight, Specification
+from control_design.synthesis_options import SynthesisOptions
 from tests.workflow.report_examples import (
     DT_S,
     bracket_document,
@@ -38,7 +41,14 @@ from workflow.reference_filter import (
     prefilter_of,
     prefilter_words,
 )
-from workflow.whole_responses import certify_whole, joint_numbers, joint_words, undrawable
+from workflow.whole_responses import (
+    certify_whole,
+    joint_numbers,
+    joint_words,
+    open_words,
+    synthesise_asked,
+    undrawable,
+)
 from workflow.yardstick import (
     bracket_numbers,
     bracket_of,
@@ -133,23 +143,47 @@ def test_whole_responses_agree_with_drawing_them_here():
 
 
 def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
-    asked = []
-
-    def calibrate(law, plants, specification, *, rng, coverage, draws, omega_min_rad_s):
-        asked.append(coverage)
-        return JointCoverage(coverage, draws, 0.9, 0.99, 0.95, 0.88, 0.9, 0.4, 0.998, 1.0)
+    def calibrate(law, plants, specification, *, rng, coverage, draws, omega_min_rad_s=1e-4):
+        return JointCoverage(coverage, draws, 0.9, 0.99, 0.95, 0.88, 0.9, 0.4, 0.998, 0.99)
 
     monkeypatch.setattr("control_design.certificate.calibrate", calibrate)
+    monkeypatch.setattr("workflow.whole_responses.joint_coverage", calibrate)
     found = {}
     for wanted in (False, True):
         options = CertificateOptions.model_validate({"calibrate": wanted, "joint_draws": 100})
         found[wanted] = certify_whole(controller(), [plant()], spec(), options, np.random.default_rng(1))
-    assert asked == [0.95, 0.95]
     kept, raised = found[False], found[True]
+    assert kept[0] == certify(controller(), [plant()], spec())
     assert raised[0].gamma > kept[0].gamma, "ellipses of 99 % are larger"
-    assert (kept[0].joint, kept[1]["calibrated"], raised[1]["calibrated"]) == (None, False, True)
+    assert not raised[0].certified, "99 % of the draws are stable, and 99.9 % are an item"
+    assert (kept[1]["calibrated"], raised[1]["calibrated"]) == (False, True)
     assert "calibrate = true" in str(joint_words(kept[1]))
     assert "certified over ellipses of 99 %" in str(joint_words(raised[1]))
+    assert any("joint level: sampled" in words for words in open_words(kept[0].not_checked, kept[1]))
+    assert open_words(kept[0].not_checked, {}) == list(kept[0].not_checked)
+
+
+def test_calibration_is_designed_for(monkeypatch):
+    asked = []
+
+    def plain(plants, specification, options, *, rng, progress):
+        asked.append("plain")
+        return "result"
+
+    def jointly(plants, specification, options, *, rng, progress):
+        asked.append("jointly")
+        return SimpleNamespace(result="result", sentence=lambda: "2 of 10000 unstable")
+
+    monkeypatch.setattr("workflow.whole_responses.synthesise", plain)
+    monkeypatch.setattr("workflow.whole_responses.synthesise_jointly", jointly)
+    exact = UncertainPlant("exact", model().to_control())
+    options = CertificateOptions.model_validate({"calibrate": True})
+    rng, how = np.random.default_rng(1), SynthesisOptions()
+    assert synthesise_asked([plant()], spec(), how, options, rng) == ("result", "2 of 10000 unstable")
+    assert synthesise_asked([exact], spec(), how, options, rng) == ("result", None)
+    kept = CertificateOptions.model_validate({})
+    assert synthesise_asked([plant()], spec(), how, kept, rng) == ("result", None)
+    assert asked == ["jointly", "plain", "plain"]
 
 
 def test_words_of_whole_responses():
@@ -193,6 +227,21 @@ def test_model_of_a_corner_is_a_power_of_a_lag():
     settings = PrefilterSettings.model_validate({"corner_rad_s": 3.0, "model_order": 3})
     s = 1j * np.array([0.1, 3.0, 20.0])
     assert settings.reference_model.at(s) == pytest.approx(1 / (s / 3 + 1) ** 3)
+
+
+def test_weight_of_a_prefilter_is_for_steps_unless_said():
+    steps = PrefilterSettings.model_validate({"corner_rad_s": 3.0}).error_weight
+    assert steps is not None
+    assert np.abs(steps.at(1j * np.array([0.0, 3e4]))) == pytest.approx([100.0, 1.0])
+    assert PrefilterSettings.model_validate({"corner_rad_s": 3.0, "weight": "flat"}).error_weight is None
+    # Of a model given as it is, the corner is where |1/(s/5 + 1)| has fallen by 3 dB: 5 rad/s.
+    lag = {"numerator": [1.0], "denominator": [0.2, 1.0]}
+    weight = PrefilterSettings.model_validate({"model": lag}).error_weight
+    assert weight is not None
+    assert weight.numerator[1] == pytest.approx(5.0, rel=0.01)
+    given = PrefilterSettings.model_validate({"corner_rad_s": 3.0, "weight": lag}).error_weight
+    assert given is not None
+    assert given.denominator == (0.2, 1.0)
 
 
 def test_answer_of_the_model_settles_as_it_should():

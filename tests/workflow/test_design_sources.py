@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 
 from control_design.controller import Controller
+from control_design.prefilter import Prefilter
 from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.model import GobfModel
 from ident.model_files import ModelFile
@@ -124,6 +125,25 @@ def test_state_space_with_stated_uncertainty(flexlink, wish, tmp_path):
         assert np.max(np.abs(1 / (1 + factor * law(z) * arm()(z)))) <= verdict["worst_peak_sensitivity"]
 
 
+def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexlink, wish, tmp_path):
+    write_json(tmp_path / "arm.json", document(arm()))
+    more = "[uncertainty]\nmultiplicative = 0.1\n[prefilter]\ncorner_rad_s = 2.0\ndense_points = 1000\n"
+    out = tmp_path / "law.json"
+    answer = flexlink("design", tmp_path / "arm.json", "--spec", wish(more), "--out", out, "--json")
+    found = numbers(answer)
+    yardstick, gamma = found["yardstick"], found["design"]["synthesis"]["gamma"]
+    assert yardstick["floor"] <= yardstick["reached"] <= gamma
+    assert yardstick["above_percent"] == pytest.approx(100 * (gamma / yardstick["reached"] - 1))
+    assert "a bound, not a distribution" in found["whole_responses"]["reason"]
+    filtered = Prefilter.from_dict(found["prefilter"])
+    assert filtered.error_after < filtered.error_before
+    assert found["prefilter_file"] == str(tmp_path / "law_prefilter.json")
+    assert np.array_equal(Prefilter.from_json((tmp_path / "law_prefilter.json").read_text()).A, filtered.A)
+    table = {row["label"]: row["value"] for row in json.loads(answer.out)["table"]}
+    assert "what a controller of any order is known to reach" in table["against any order"]
+    assert "times smaller" in table["model matching"]
+
+
 def test_model_without_uncertainty_says_what_its_certificate_holds_for(flexlink, wish, tmp_path):
     write_json(tmp_path / "arm.json", document(arm()))
     found = numbers(flexlink("design", tmp_path / "arm.json", "--spec", wish(), "--json"))
@@ -202,15 +222,23 @@ def test_order_too_low_is_said_with_what_a_higher_one_reaches(flexlink, wish, tm
     assert "NOT CERTIFIED" in Controller.from_json(out.read_text()).name
 
 
-def test_too_fast_for_any_order_is_said(flexlink, wish, tmp_path):
+def test_too_fast_for_any_order_is_said(flexlink, wish, tmp_path, monkeypatch):
     """A zero at +2 rad/s: refused before optimising, with the bandwidth that is left."""
+    from control_design.order_search import OrderSearch
+
+    def never(self):
+        raise AssertionError("the optimiser was started")
+
+    monkeypatch.setattr(OrderSearch, "run", never)
     system = control.sample_system(control.ss(control.tf([-1.0, 2.0], [1.0, 3.0, 2.0])), DT_S)
     write_json(tmp_path / "zero.json", document(system))
     spec = wish("", WISH.replace("0.7", "5.0"))
     answer = flexlink("design", tmp_path / "zero.json", "--spec", spec)
     assert answer.code == 3
     assert "non-minimum-phase zero" in answer.err
-    assert "at most" in answer.err
+    # |W1| at the zero: (0.4 x 2 + 5 sqrt(2 - 0.16))/(2 + ...) against 1; solved for the bandwidth by hand.
+    assert "impossible by a factor 3.7" in answer.err
+    assert "bandwidth_rad_s = 5, at most 0.88" in answer.err
 
 
 def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypatch):
@@ -243,6 +271,18 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
         ("[uncertainty]\nmultiplicative = 0.1\nadditive = 0.1", "either multiplicative or additive"),
         ("[plant]\nintegrators = 1", "the model has 0 at z = 1"),
         ("[plant]\nfit = { integrators = 1 }", "say integrators in [plant] itself"),
+        ("[prefilter]\norder = 1", "either corner_rad_s or model"),
+        (
+            "[prefilter]\ncorner_rad_s = 100.0",
+            "wish.toml: prefilter.corner_rad_s: 100 lies beyond the Nyquist",
+        ),
+        ("[prefilter]\nmodel = { numerator = [1.0, 1.0], denominator = [1.0] }", "improper"),
+        ("[prefilter]\nmodel = { numerator = [1.0], denominator = [1.0, -1.0] }", "unstable"),
+        ("[certificate]\njoint_draws = 5", "joint_draws must be 0 or at least 100"),
+        ("[certificate]\njoint_coverage = 1.0", "joint_coverage"),
+        ("[yardstick]\ncompute = true\nreal_pole = 3", "did you mean real_poles"),
+        ("bandwidth_rad_s = nan", "bandwidth_rad_s: input should be a finite number"),
+        ("controller_order = 0", "controller_order"),
         ("[specification]\nbandwidth_rad_s = 1.0\n[uncertanty]\nmultiplicative = 0.1", "uncertanty"),
     ],
 )
@@ -298,6 +338,8 @@ def test_measured_response_is_refused(refused, wish, tmp_path):
     assert "not positive semidefinite (first at omega = 0.2 rad/s)" in line
     path.write_text(header + "0.1,1,0,1e-4,1e-4,0\n0.2,1,0,-1e-4,1e-4,0\n")
     assert "line 3: a variance is negative" in refused("design", path, "--spec", spec)
+    path.write_text(header.replace("_real_imag", "") + "0.1,1,0,1e-4,1e-4,0\n0.2,1,0,1e-4,1e-4,0\n")
+    assert "line 1: unknown column 'covariance'" in refused("design", path, "--spec", spec)
     path.write_text("omega_rad_s,real,imag\n0.1,1,0\n0.1,1,0.1\n0.2,1,0\n")
     assert "there are 2 repeats" in refused("design", path, "--spec", spec)
 

@@ -109,6 +109,15 @@ def whole_blocks(data: RunData) -> list[Block]:
     ]
 
 
+def _weight_words(data: RunData) -> str:
+    settings = data.config.prefilter
+    weight = None if settings is None else settings.error_weight
+    if weight is None:
+        return "W = 1."
+    shown = [", ".join(number(c, 4) for c in part) for part in (weight.numerator, weight.denominator)]
+    return f"W(s) has the coefficients {shown[0]} over {shown[1]}, highest power of s first."
+
+
 def prefilter_blocks(data: RunData) -> list[Block]:
     """The prefilter: what it buys in the worst case, and its state space."""
     words = prefilter_sentence(data)
@@ -118,13 +127,14 @@ def prefilter_blocks(data: RunData) -> list[Block]:
     if found is None:
         return [heading("Prefilter"), Remarks((sentence(words),), "warning")]
     table = Table(
-        ("reference", "largest model-matching error over the ellipses"),
+        ("reference", "largest weighted model-matching error over the ellipses"),
         (
             ("as it is, F = 1", number(found.error_before, 4)),
             (f"through F, order {found.order}", number(found.error_after, 4)),
         ),
         f"Largest |W (F T - T_ref)| of any member at any of the checked frequencies; with F it lies at "
-        f"{frequency(found.worst_rad_s)}. The feedback loop, and all that is certified of it, is the same.",
+        f"{frequency(found.worst_rad_s)}. {_weight_words(data)} The feedback "
+        "loop, and all that is certified of it, is the same.",
     )
     return [
         heading("Prefilter"),

@@ -13,6 +13,7 @@ from workflow.report.beyond_margins import order_blocks, prefilter_blocks, whole
 from workflow.report.data import RunData
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text, maybe
 from workflow.report.words import count, decibels, frequency, listing, number, percent, quantity, sentence
+from workflow.whole_responses import open_words
 
 _NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
 
@@ -179,7 +180,11 @@ def margins_section(data: RunData) -> Section:
     blocks += [
         *whole_blocks(data),
         Remarks(tuple(map(sentence, certificate.checked)), "good", "What was checked"),
-        Remarks(tuple(map(sentence, certificate.not_checked)), "warning", "What was not checked"),
+        Remarks(
+            tuple(map(sentence, open_words(certificate.not_checked, data.whole))),
+            "warning",
+            "What was not checked",
+        ),
     ]
     return Section("margins", "Margins and certificate", "Margins", tuple(blocks))
 

@@ -10,6 +10,7 @@ from workflow.report.beyond_margins import beyond_words
 from workflow.report.data import ChannelData, RunData
 from workflow.report.page import Block, Code, Section, Table, Text
 from workflow.report.words import count, frequency, listing, number, percent, sentence
+from workflow.whole_responses import open_words
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ def _sure(data: RunData) -> list[str]:
 def _open(data: RunData) -> list[str]:
     if data.certificate is None:
         return ["without a controller, nothing about a closed loop was checked"]
-    items = list(data.certificate.not_checked)
+    items = open_words(data.certificate.not_checked, data.whole)
     if data.closed_loop is not None and data.closed_loop.document["machine"] != "simulated":
         items.append("the controller has not run on the real machine")
     return items

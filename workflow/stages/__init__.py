@@ -42,7 +42,7 @@ uncertainty.npz
 design.json
     document  synthesis: SynthesisResult.to_dict(), or null where the specification is impossible from the
               start; met (bool); reason (one line: met, or how far, and which frequency and requirement
-              block it)
+              block it); jointly: null, or with certificate.calibrate a line on the stable share
 
 yardstick.json
     document  bracket: YoulaBracket.to_dict() (what a controller of any order could reach), or null; reason

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from control_design.specification import SpecificationError
-from control_design.synthesis import synthesise
 from workflow.config import RunConfig
 from workflow.errors import naming
 from workflow.run_directory import StageData
 from workflow.stages.base import StageInput
 from workflow.stages.results import load_plant
+from workflow.whole_responses import synthesise_asked
 
 
 def settings(config: RunConfig) -> Mapping[str, Any]:
@@ -21,6 +21,7 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
         "synthesis": config.synthesis.model_dump(mode="json"),
         "purposes": [config.purpose_of(index) for index in range(len(config.channels))],
         "levels": [channel.uncertainty.level for channel in config.channels],
+        "calibrate": config.certificate.calibrate,
     }
 
 
@@ -38,15 +39,23 @@ def design_controller(stage: StageInput) -> StageData:
     with naming("design"):
         plant = load_plant(stage.results, config)
         try:
-            result = synthesise(
-                [plant], config.specification, config.synthesis, rng=stage.rng("design"), progress=report
+            result, jointly = synthesise_asked(
+                [plant],
+                config.specification,
+                config.synthesis,
+                config.certificate,
+                stage.rng("design"),
+                report,
             )
         except SpecificationError as impossible:
-            return StageData(document={"synthesis": None, "met": False, "reason": str(impossible)})
+            return StageData(
+                document={"synthesis": None, "met": False, "reason": str(impossible), "jointly": None}
+            )
     return StageData(
         document={
             "synthesis": result.to_dict(),
             "met": result.gamma <= 1.0,
             "reason": result.explain(),
+            "jointly": jointly,
         }
     )
