@@ -154,7 +154,7 @@ def free_response(poles: Poles, n_samples: int) -> RealArray:
     return rows.T
 
 
-@numba.njit(cache=True, fastmath={"contract"})
+@numba.njit(cache=True, forceinline=True, fastmath={"contract"})
 def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
     """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
     output.

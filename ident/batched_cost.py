@@ -22,7 +22,7 @@ _PIECE = 64
 COLUMNS = 2
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def batched_rss(
     units: Any,
     n_real: int,
@@ -128,7 +128,7 @@ def _strike(point: Any, n_real: int, state: Any, lane: int) -> None:
             row += 2
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _advance(
     blocks: Any, n_real: int, n_blocks: int, state: Any, drive: Any, signal: Any, rows: Any, first_row: int
 ) -> None:
@@ -172,7 +172,7 @@ def _advance(
             row += 2
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _add_products(rows: Any, i: int, j: int, length: int, gram: Any, n_rows: int) -> None:
     """gram[i : i + 2, j : j + 2] += products of rows i, i + 1 with rows j, j + 1."""
     a, b = i * _PIECE * WIDTH, j * _PIECE * WIDTH
@@ -193,7 +193,7 @@ def _add_products(rows: Any, i: int, j: int, length: int, gram: Any, n_rows: int
     store(gram, below + WIDTH, g11)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _add_cross_products(rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any) -> None:
     """cross[i : i + 2, j : j + 2] += products of rows i, i + 1 with columns j, j + 1 of against."""
     a, n = i * _PIECE * WIDTH, against.shape[1] * WIDTH
@@ -213,7 +213,7 @@ def _add_cross_products(rows: Any, i: int, against: Any, start: int, j: int, len
     store(cross, at + n + WIDTH, c11)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _add_four_cross_products(
     rows: Any, i: int, against: Any, start: int, j: int, length: int, cross: Any
 ) -> None:

@@ -237,7 +237,7 @@ def _n_columns(order: int, feedthrough: bool, free: bool) -> int:
     return order * (2 if free else 1) + (1 if feedthrough else 0)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _fit_by_products(
     blocks: Any,
     n_real: int,
@@ -293,7 +293,7 @@ def _fit_by_products(
     return float(rss)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _sensitivities_by_products(
     blocks: Any,
     n_real: int,
@@ -342,7 +342,7 @@ def _put(target: Any, values: Any) -> None:
         target[k] = values[k]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _project_products(
     rows: Any, pitch: int, first: int, last: int, local_q: Any, starts: Any, on_local: Any, gram: Any
 ) -> None:

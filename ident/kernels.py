@@ -2,6 +2,10 @@
 
 Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1].
 Matrices are kept as rows (columns of the regression), so that every inner loop runs over contiguous memory.
+
+Here and in the other compiled modules a function whose products and sums may be fused or reordered is always
+compiled into its callers (forceinline): left as a call, the copy of whichever kernel was loaded first would
+be taken, and copies round differently.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from ident.basis import run_cascade, run_cascade_free
 _RANK_TOLERANCE = 1e-11
 
 
-@numba.njit(cache=True, fastmath={"reassoc", "contract"})
+@numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
 def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
     # Slices counted from 0: with a[k], lo <= k < hi, the compiler has to allow for negative k and does not
     # vectorise (ten times slower).
@@ -43,7 +47,7 @@ def _copy(target: Any, source: Any) -> None:
         target[k] = source[k]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _dots(rows: Any, others: Any, lo: int, hi: int) -> Any:
     """Inner products (A, B) of rows (A, N) and others (B, N) over lo..hi."""
     products = np.empty((rows.shape[0], others.shape[0]))
@@ -100,7 +104,7 @@ def _schur_drop(gram: Any, b: Any) -> float:
     return drop
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def candidate_rss(
     blocks: Any, n_real: int, w: Any, residual: Any, starts: Any, local_q: Any, shared_q: Any, free: bool
 ) -> float:
@@ -163,7 +167,7 @@ def candidate_rss(
     return _dot(residual, residual, 0, n_total) - _schur_drop(gram, b)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def linearise(
     blocks: Any,
     n_real: int,
@@ -269,7 +273,7 @@ def linearise(
     return _dot(residual, residual, 0, n_total)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _normalise(row: Any, size_before: float, lo: int, hi: int) -> float:
     """Scale row[lo:hi] to length 1 and return the length it had, or set it to zero if nothing of it is
     left."""

@@ -40,7 +40,7 @@ def _coefficients(blocks: Any, n_real: int, first: int) -> Any:
     return c
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def cascade_states(
     blocks: Any, n_real: int, signal: Any, lo: int, hi: int, rows: Any, row: int, pitch: int
 ) -> None:
@@ -82,7 +82,7 @@ def cascade_states(
         row += 2 * n_lanes - min(max(n_real - first, 0), n_lanes)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def single_states(
     blocks: Any, n_real: int, signal: Any, lo: int, hi: int, rows: Any, row: int, pitch: int
 ) -> None:
@@ -138,7 +138,7 @@ def _spread(
             row += 1
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def products(rows: Any, pitch: int, first: int, n_rows: int, gram: Any) -> None:
     """gram[i, j] = row i times row j for first <= i < n_rows, j <= i; both multiples of four."""
     for i in range(first, n_rows, 4):
@@ -146,7 +146,7 @@ def products(rows: Any, pitch: int, first: int, n_rows: int, gram: Any) -> None:
             _sixteen_products(rows, i * pitch, j * pitch, pitch, gram[i : i + 4, j : j + 4])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _sixteen_products(rows: Any, a: int, b: int, pitch: int, target: Any) -> None:
     g00, g01, g02, g03 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
     g10, g11, g12, g13 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
@@ -181,7 +181,7 @@ def _sixteen_products(rows: Any, a: int, b: int, pitch: int, target: Any) -> Non
     target[3, 0], target[3, 1], target[3, 2], target[3, 3] = total(g30), total(g31), total(g32), total(g33)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def row_products(rows: Any, pitch: int, n_rows: int, vector: Any, target: Any) -> None:
     """target[i] = row i times vector (pitch,), for i < n_rows, a multiple of four."""
     for i in range(0, n_rows, 4):
@@ -196,7 +196,7 @@ def row_products(rows: Any, pitch: int, n_rows: int, vector: Any, target: Any) -
         target[i], target[i + 1], target[i + 2], target[i + 3] = total(g0), total(g1), total(g2), total(g3)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def combine(rows: Any, pitch: int, n_rows: int, factors: Any, target: Any) -> None:
     """target (pitch,) = sum of factors[i] times row i over i < n_rows, a multiple of four."""
     for k in range(0, pitch, WIDTH):
