@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import workflow.report
+from control_design.prefilter import Prefilter
 from tests.workflow import report_examples as example
 from workflow.errors import InputError
 from workflow.figures.style import Picture
@@ -355,3 +356,45 @@ def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, und
     page = page_for(tmp_path, example.config(machine="identified"))
     assert "Sensitivity on the arm" not in page.text
     assert "The loop under other conditions" not in page.text
+
+
+def test_page_tells_of_any_order_whole_responses_and_prefilter(tmp_path, undrawn):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+    gamma = run.load_stage("design").document["synthesis"]["gamma"]
+    # Made up: 0.8 reached by any order, and the worst case of the ellipses holds for 990 of 1000 draws.
+    off = f"{100 * abs(gamma / 0.8 - 1):.2g}"
+    assert f"{off} % {'above' if gamma > 0.8 else 'below'} the 0.8 that a controller of any order" in text
+    assert "Against a controller of any order" in text
+    assert "99 % stay within the worst case of the 95 % ellipses (98.17 % to 99.46 %" in text
+    assert "Joint level: sampled, not certified" in text
+    assert "Prefilter" not in text
+    filtered = Prefilter(
+        A=np.array([[0.9]]),
+        B=np.array([[0.1]]),
+        C=np.array([[1.0]]),
+        D=np.array([[0.0]]),
+        dt_s=example.DT_S,
+        error_before=0.95,
+        error_after=0.19,
+        worst_rad_s=3.0,
+    )
+    with run.locked():
+        run.save_stage("prefilter", StageData(document={"prefilter": filtered.to_dict()}), "x")
+    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+    assert "0.19 with it, 0.95 without, 5 times smaller" in text
+
+
+def test_page_of_a_run_made_before_there_were_these_stages(tmp_path, undrawn):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    certify = dict(run.load_stage("certify").document)
+    del certify["whole"]
+    with run.locked():
+        run.save_stage("certify", StageData(document=certify), "x")
+        for name in ("yardstick", "prefilter"):
+            run.stage_file(name).unlink()
+    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+    assert "Margins and certificate" in text
+    assert "controller of any order" not in text

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from control_design.prefilter import Prefilter
 from workflow.reference_filter import prefilter_of, prefilter_words
 from workflow.report.data import RunData
@@ -12,16 +14,45 @@ from workflow.yardstick import bracket_of, order_advice, yardstick_words
 
 
 def beyond_words(data: RunData) -> list[str]:
-    """For the verdict: how far from any order, and how many whole responses the worst case holds for."""
+    """For the verdict: how far from any order, how many whole responses the worst case holds for, and what
+    the prefilter buys."""
     if data.synthesis is None or not data.has_controller:
         return []
     gamma, order = data.synthesis.gamma, data.config.specification.controller_order
-    words = [joint_words(data.whole), prefilter_sentence(data)]
-    if bracket_of(data.yardstick) is not None:
-        words.insert(0, yardstick_words(data.yardstick, gamma, order))
+    words = [*_any_order(data, gamma, order), *_whole(data), prefilter_sentence(data)]
     if gamma > 1:
         words.append(order_advice(data.yardstick, gamma, order))
     return [text for text in words if text]
+
+
+def _any_order(data: RunData, gamma: float, order: int) -> list[str]:
+    bracket = bracket_of(data.yardstick)
+    if bracket is None or not (math.isfinite(bracket.ellipse) and math.isfinite(gamma)):
+        return []
+    above = percent(100 * abs(bracket.excess(gamma)), 2)
+    side = "above" if bracket.excess(gamma) >= 0 else "below"
+    return [
+        f"the weighted worst case (1 or less is met) is {number(gamma)} with this controller of order "
+        f"{order}: {above} {side} the {number(bracket.ellipse)} that a controller of any order is known to "
+        f"reach; none goes below about {number(bracket.floor)}"
+    ]
+
+
+def _whole(data: RunData) -> list[str]:
+    joint = joint_of(data.whole)
+    if joint is None:
+        return []
+    numbers = joint_numbers(data.whole)
+    stable = f"{percent(100 * joint.stable_share, 4)} give a stable loop"
+    stable += f" (at least {percent(100 * numbers['stable_interval'][0], 4)} with 95 % confidence)"
+    if not math.isfinite(joint.gamma_given):
+        return [f"of {joint.draws} whole responses drawn from the posterior {stable}"]
+    low, high = (percent(100 * value, 4) for value in numbers["held_interval"])
+    return [
+        f"of {joint.draws} whole responses drawn from the posterior {percent(100 * joint.coverage_given, 4)} "
+        f"stay within the worst case of the {percent(100 * joint.given_level, 4)} ellipses ({low} to {high} "
+        f"with 95 % confidence), and {stable}"
+    ]
 
 
 def prefilter_sentence(data: RunData) -> str | None:

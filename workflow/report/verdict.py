@@ -56,11 +56,12 @@ def _certified(data: RunData) -> tuple[str, list[str]]:
             else f"all {len(certificate.items)} items of the specification are"
         )
         headline, in_time = _in_time(data)
+        proved = all(plant.all_frequencies.proved for plant in certificate.plants)
+        where = "proved for all frequencies" if proved else "on a dense grid of frequencies"
         return headline, [
             *in_time,
             f"the nominal loop is stable, no {level} ellipse reaches -1, and {met} met in the worst case "
-            "over the "
-            "ellipses, on a dense grid of frequencies",
+            f"over the ellipses, {where}",
             f"the loop stays {number(worst)} away from -1 or farther (asked for: "
             f"{number(data.config.specification.modulus_margin)}), nearest at "
             f"{frequency(at.worst_margin_omega_rad_s)}",
