@@ -21,7 +21,7 @@ from workflow.diagnose.case_files import load_case
 from workflow.diagnose.command import diagnose_cases
 from workflow.diagnose.outputs import Options, files_of
 from workflow.diagnose.processes import Step, perform
-from workflow.errors import InputError
+from workflow.errors import InputError, StageError
 from workflow.figures.style import Picture
 
 QUESTIONS = (
@@ -225,6 +225,13 @@ def test_bad_input_beside_good_cases_is_exit_code_2(cases, tmp_path, here):
     )
     assert found.exit_code == 2
     assert len(found.documents) == 2
+
+
+def test_a_single_case_that_fails_leaves_nothing(cases, tmp_path, here):
+    out = tmp_path / "out"
+    with pytest.raises(StageError, match="no such luck"):
+        diagnose_cases(cases[:1], out, controller=False, engine=KnownAnswer((FRICTION,), fails=("one",)))
+    assert not out.exists()
 
 
 def test_a_fit_that_did_not_converge_is_exit_code_3(cases, tmp_path, here):

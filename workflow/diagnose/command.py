@@ -23,6 +23,7 @@ from workflow.errors import (
     EXIT_NOT_CERTIFIED,
     EXIT_OK,
     InputError,
+    StageError,
     one_line,
 )
 from workflow.progress import Progress, Silence
@@ -91,8 +92,9 @@ def diagnose_cases(
     """Diagnose every case into `out`.
 
     rig: file in each case folder that is read in place of the one its case file names. jobs: processes
-    (default: one per processor). A case that fails does not lose the others. Raises InputError (one line,
-    nothing written) if no case can be read, two have one name, or `out` cannot be used.
+    (default: one per processor). A case that fails does not lose the others; one that fails alone raises
+    InputError or StageError. Raises InputError (one line, nothing written) if no case can be read, two have
+    one name, or `out` cannot be used.
     """
     progress = progress or Silence()
     if jobs is not None and jobs < 1:
@@ -115,6 +117,9 @@ def diagnose_cases(
             directory, loaded, options, code, engine or Engine(), jobs or os.cpu_count() or 1, progress
         )
         failures = [*unreadable, *failures]
+        if len(places) == 1 and failures:
+            directory.discard_if_empty()
+            raise (InputError if failures[0].bad_input else StageError)(failures[0].reason)
         page = out / f"{loaded[0].case.name}.html"
         if len(places) > 1:
             page = out / "index.html"

@@ -135,6 +135,13 @@ class DiagnosisDirectory:
             return {}
         return found if isinstance(found, dict) else {}
 
+    def discard_if_empty(self) -> None:
+        """Take back what `begin` wrote if there is no answer: a corrected case may come. Hold the lock."""
+        if self._held() <= {MANIFEST}:
+            (self.path / MANIFEST).unlink(missing_ok=True)
+            (self.path / "lock").unlink(missing_ok=True)
+            self.path.rmdir()
+
     def _held(self) -> set[str]:
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"cannot write {self.path}: it is not a directory")
