@@ -16,6 +16,7 @@ from diagnosis.distortion import periodic_findings
 from diagnosis.linear_correction import linear_correction
 from diagnosis.missing_function import missing_functions
 from diagnosis.regimes import motions, regime_axes, regime_findings
+from diagnosis.where_common import common_findings
 from diagnosis.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
 from diagnosis.where_records import Where
 from diagnosis.where_sentences import headline, sentences
@@ -70,6 +71,7 @@ def where(
         bands=band_gaps(e, case.rig.sampling.dt_s, level),
         regimes=regime_findings(e, regime_axes(moved, ripple_cycles_per_rev), level, rng),
         drift=drift_findings(case, e, level),
+        common=common_findings(case, e, level),
         curves=missing_functions(case, e, moved, level, rng),
         periodic=periodic_findings(case, e, level),
         amplitude=amplitude_finding(case, e, level, rng),

@@ -124,6 +124,34 @@ class DriftFinding:
 
 
 @dataclass(frozen=True)
+class CommonFinding:
+    """The part of a sensor's gap that is the same in all experiments at the same time since the start.
+
+    Whatever the input was: a drift, an offset, a disturbance that starts with the record.
+
+    Attributes
+    ----------
+    share : float
+        Of the sensor's gap energy over the experiments' common length.
+    share_by_chance : float
+        Largest share when the sign of some of the experiments is turned.
+    peak_Hz, peak_share : float
+        Strongest line of the common part above the two slowest ones, and the share of the common energy
+        within one line of it.
+    """
+
+    sensor: str
+    experiments: int
+    share: float
+    share_by_chance: float
+    peak_Hz: float
+    peak_share: float
+    p_value: float
+    found: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
 class EquivalentCurve:
     """The residuals read as one missing function of a regime variable, at one place of the machine.
 
@@ -248,15 +276,15 @@ class Where:
     headline : str
     gap : PartGap
         All records together.
-    sensors, experiments, bands, regimes, drift, curves
+    sensors, experiments, bands, regimes, drift, common, curves
         See their records.
     periodic, amplitude, linear
         None where the records do not allow it.
     subsystem : dict
         Probability of none, actuator, joint, link, sensor, environment, unknown; empty without probabilities.
     sentences : dict
-        One per axis (sensors, experiments, frequency, regimes, time, amplitude, curves, linear, periodic,
-        subsystem); only axes that have something to say.
+        One per axis (sensors, experiments, frequency, regimes, time, common, amplitude, curves, linear,
+        periodic, subsystem); only axes that have something to say.
     level : float
         Chance of any finding of an axis when there is nothing.
     """
@@ -268,6 +296,7 @@ class Where:
     bands: tuple[BandGap, ...]
     regimes: tuple[RegimeFinding, ...]
     drift: tuple[DriftFinding, ...]
+    common: tuple[CommonFinding, ...]
     curves: tuple[EquivalentCurve, ...]
     periodic: tuple[PeriodicFinding, ...]
     amplitude: AmplitudeFinding | None

@@ -9,7 +9,15 @@ import numpy as np
 from scipy.stats import chi2
 
 from diagnosis.where_energy import evenness
-from diagnosis.where_records import BandGap, EquivalentCurve, ExperimentGap, PartGap, RegimeFinding, Where
+from diagnosis.where_records import (
+    BandGap,
+    CommonFinding,
+    EquivalentCurve,
+    ExperimentGap,
+    PartGap,
+    RegimeFinding,
+    Where,
+)
 
 # A statement about where "most" of the gap lies covers at least this share of it.
 _MOST = 0.8
@@ -38,6 +46,7 @@ def sentences(found: Where) -> dict[str, str]:
         "frequency": _frequency(found),
         "regimes": _regimes(found.regimes),
         "time": " ".join(d.sentence for d in found.drift if d.sentence),
+        "common": _common(found.common),
         "amplitude": _amplitude(found),
         "curves": _curves(found.curves),
         "linear": "" if found.linear is None else found.linear.sentence,
@@ -67,6 +76,8 @@ def headline(found: Where) -> str:
         places.append(f"{band.words} of its energy {frequencies(band.low_Hz, band.high_Hz, found)}")
     if any(d.sentence for d in found.drift):
         places.append("it grows steadily with time")
+    elif any(c.sentence for c in found.common):
+        places.append("it is the same in all experiments, whatever the input")
     elif found.linear is not None and found.linear.sentence:
         follows = "follows" if found.linear.share >= 0.9 else "does not follow"
         places.append(f"it {follows} the voltage linearly")
@@ -279,6 +290,15 @@ def _curves(curves: Sequence[EquivalentCurve]) -> str:
         return best.sentence
     others = [f"{ROUTES[c.route]} over {AXES[c.axis]} ({percent(c.share)})" for c in near]
     return f"{best.sentence} Not far behind: {listed(others)}."
+
+
+def _common(findings: Sequence[CommonFinding]) -> str:
+    """The sentence of the sensor with the larger share; the other one is named with it."""
+    spoken = sorted((c for c in findings if c.sentence), key=lambda c: -c.share)
+    if not spoken:
+        return ""
+    others = [f"the {sensor_word(c.sensor)} sensor ({percent(c.share)})" for c in spoken[1:]]
+    return spoken[0].sentence + (f" The same holds for {listed(others)}." if others else "")
 
 
 def _amplitude(found: Where) -> str:

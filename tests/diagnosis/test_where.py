@@ -12,6 +12,7 @@ from diagnosis import Case, Experiment, ResidualModel
 from diagnosis.distortion import period_of, periodic_findings
 from diagnosis.regimes import motions
 from diagnosis.where import subsystem_mass, where
+from diagnosis.where_common import common_findings
 from diagnosis.where_energy import band_gaps, sensor_gaps
 from diagnosis.where_sentences import best_curve
 from plant import EFFECTS, multisine, multisine_lines, simulate
@@ -19,6 +20,7 @@ from plant.effects import (
     CoulombFriction,
     HardeningSpring,
     LinkStiffness,
+    PeriodicDisturbance,
     Quantisation,
     SensorGain,
     TipPayload,
@@ -205,6 +207,31 @@ def test_a_known_ripple_period_is_a_regime_of_its_own():
     assert "angle_in_period" not in {r.axis for r in where(case, residuals).regimes}
 
 
+def test_a_disturbance_is_the_same_whatever_the_input():
+    frequency = 3.1
+    found = _of_effect(PeriodicDisturbance(amplitude_Nm=0.01, frequency_Hz=frequency, phase_rad=0.4))
+    for finding in found.common:
+        assert finding.found
+        assert finding.experiments == 4
+        assert finding.share == pytest.approx(1.0, abs=0.02)
+        # Lines lie one over the record apart; the shortest has 1200 samples.
+        assert abs(finding.peak_Hz - frequency) <= 1 / (1200 * DT)
+    assert "not from the input" in found.sentences["common"]
+    # A gap that follows the inputs is shared by four experiments as chance has it.
+    assert not any(c.found for c in _of_effect(TipPayload(mass_kg=0.02)).common)
+
+
+def test_experiments_with_the_same_input_do_not_count_as_different():
+    rng = np.random.default_rng(6)
+    voltage = inputs()["prbs_high"]
+    residuals = {f"run{i}": rng.standard_normal((voltage.size, 2)) for i in range(5)}
+    experiments = [
+        Experiment(name, "held_out" if i else "estimation", voltage * (1 + i), e)
+        for i, (name, e) in enumerate(residuals.items())
+    ]
+    assert common_findings(Case("same", RIG, tuple(experiments)), residuals, 0.01) == ()
+
+
 def test_linear_and_nonlinear_causes_are_told_apart():
     heavier = _of_effect(TipPayload(mass_kg=0.02))
     assert heavier.linear.share > 0.9
@@ -359,3 +386,9 @@ def test_recorded_linear_causes_are_called_linear(gap_cases, name, linear):
     found = _recorded(gap_cases, name)
     assert (found.linear.share > 0.9) == linear
     assert (found.linear.share < 0.6) == (not linear)
+
+
+def test_recorded_disturbance_comes_with_the_clock(gap_cases):
+    found = _recorded(gap_cases, "periodic_disturbance")
+    assert all(c.found for c in found.common)
+    assert "whatever the input" in found.headline

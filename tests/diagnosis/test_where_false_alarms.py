@@ -20,6 +20,7 @@ def _alarms(found):
         "bands": any(b.gap.found for b in found.bands),
         "regimes": any(r.found for r in found.regimes),
         "drift": any(d.found for d in found.drift),
+        "common": any(c.found for c in found.common),
         "curves": any(c.found for c in found.curves),
         "periodic": any(v.found for p in found.periodic for v in (*p.bands, *p.groups)),
     }
