@@ -4,8 +4,9 @@
 
 Plant P1 (one mode, double integrator, 30 dB). Fits: two real poles and a pair sought without prior
 knowledge, N = 1000, on noise seeds 0 .. FITS - 1, ours and an output-error fit (Steiglitz-McBride start,
-NumPy and SciPy) taking turns. Warnings are worked out when they are asked for: the row that names them asks. Cost: residual sum of squares at points of the unit cube of that search, with
-the offset of the output as nuisance; "one by one" as an optimiser calls it, "together" as the search does.
+NumPy and SciPy) taking turns. Warnings are worked out when they are asked for: the row that names them asks.
+Cost: residual sum of squares at points of the unit cube of that search, with the offset of the output as
+nuisance; "one by one" as an optimiser calls it, "together" as the search does.
 Peak memory is that of the process, libraries included. Compiling: CPU time of the first fit of a process
 without any stored code, and of the first fit of one that finds it.
 """

@@ -28,7 +28,7 @@ _ROUNDS = 6
 # Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
 # end.
 ROUGH = 1e-3
-# So many starts that end in one place make a rescan superfluous.
+# So many starts that end in one place make further ones and a rescan superfluous.
 _STARTS_TO_AGREE = 3
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
 _PAIR_EVALUATIONS = 240
@@ -85,8 +85,9 @@ class PoleSearch:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
         cost = self.candidate_cost(space, self.fixed, self.fixed)
-        few = self.options.starts
-        points = self._global(title, cost, self.options.evaluations, self.patience * few)
+        few = min(self.options.starts, _STARTS_TO_AGREE)
+        most = self.options.starts * self.patience
+        points = self._global(title, cost, self.options.evaluations, most)
 
         def starts(chosen: RealArray) -> list[Poles]:
             return [self.fixed.appended(space.poles(point)) for point in chosen]
@@ -94,7 +95,7 @@ class PoleSearch:
         known = len(self.minima)
         best = self._best_descent(starts(points[:few]), title)
         ends = self.minima[known : known + len(points[:few])]
-        agreed = len(ends) >= _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
+        agreed = len(ends) == _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
         if agreed and self._is_trusted(best):
             self._settled = best
             return best

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import next_fast_len
 from scipy.special import chdtri
 
 from ident.arrays import RealArray
@@ -31,7 +32,7 @@ def residual_colour(residual: RealArray, starts: npt.NDArray[np.int64]) -> Resid
     covariance = np.zeros(lags + 1)
     for lo, hi in pairwise(starts):
         part = residual[lo:hi]
-        size = 1 << int(2 * part.size - 1).bit_length()
+        size = next_fast_len(part.size + lags, real=True)  # no lag up to there wraps around
         covariance += np.fft.irfft(np.abs(np.fft.rfft(part, size)) ** 2, size)[: lags + 1]
     if not covariance[0] > 0:
         return ResidualColour(float(n), False)
