@@ -19,40 +19,42 @@ def beyond_words(data: RunData) -> list[str]:
     if data.synthesis is None or not data.has_controller:
         return []
     gamma, order = data.synthesis.gamma, data.config.specification.controller_order
-    words = [*_any_order(data, gamma, order), *_whole(data), prefilter_sentence(data)]
+    words = [_any_order(data, gamma, order), _whole(data), prefilter_sentence(data)]
     if gamma > 1:
         words.append(order_advice(data.yardstick, gamma, order))
     return [text for text in words if text]
 
 
-def _any_order(data: RunData, gamma: float, order: int) -> list[str]:
+def _any_order(data: RunData, gamma: float | None, order: int) -> str | None:
     bracket = bracket_of(data.yardstick)
-    if bracket is None or not (math.isfinite(bracket.ellipse) and math.isfinite(gamma)):
-        return []
+    if bracket is None or gamma is None:
+        return None
+    if not (math.isfinite(bracket.ellipse) and math.isfinite(gamma)):
+        return None
     above = percent(100 * abs(bracket.excess(gamma)), 2)
     side = "above" if bracket.excess(gamma) >= 0 else "below"
-    return [
+    return (
         f"the weighted worst case (1 or less is met) is {number(gamma)} with this controller of order "
         f"{order}: {above} {side} the {number(bracket.ellipse)} that a controller of any order is known to "
         f"reach; none goes below about {number(bracket.floor)}"
-    ]
+    )
 
 
-def _whole(data: RunData) -> list[str]:
+def _whole(data: RunData) -> str | None:
     joint = joint_of(data.whole)
     if joint is None:
-        return []
+        return None
     numbers = joint_numbers(data.whole)
     stable = f"{percent(100 * joint.stable_share, 4)} give a stable loop"
     stable += f" (at least {percent(100 * numbers['stable_interval'][0], 4)} with 95 % confidence)"
     if not math.isfinite(joint.gamma_given):
-        return [f"of {joint.draws} whole responses drawn from the posterior {stable}"]
+        return f"of {joint.draws} whole responses drawn from the posterior {stable}"
     low, high = (percent(100 * value, 4) for value in numbers["held_interval"])
-    return [
+    return (
         f"of {joint.draws} whole responses drawn from the posterior {percent(100 * joint.coverage_given, 4)} "
         f"stay within the worst case of the {percent(100 * joint.given_level, 4)} ellipses ({low} to {high} "
         f"with 95 % confidence), and {stable}"
-    ]
+    )
 
 
 def prefilter_sentence(data: RunData) -> str | None:
@@ -78,7 +80,7 @@ def order_blocks(data: RunData) -> list[Block]:
         rows.append((f"this controller, order {order}", number(gamma, 4), "on the grid of the design"))
     rows += [
         ("a controller of any order", number(bracket.ellipse, 4), "reached: such a controller is known"),
-        ("no controller", number(bracket.floor, 4), "lower bound, within the basis searched"),
+        ("no controller goes below", number(bracket.floor, 4), "lower bound, within the basis searched"),
     ]
     table = Table(
         ("who", "weighted worst case, gamma", "how it is known"),
@@ -90,7 +92,7 @@ def order_blocks(data: RunData) -> list[Block]:
     advice = None if gamma is None or gamma <= 1 else order_advice(data.yardstick, gamma, order)
     return [
         heading("Against a controller of any order"),
-        Text(sentence(words)),
+        Text(sentence(_any_order(data, gamma, order) or words)),
         table,
         *maybe(() if advice is None else (sentence(advice),), "warning"),
     ]
@@ -116,7 +118,7 @@ def whole_blocks(data: RunData) -> list[Block]:
         (
             f"worst case that holds for {percent(100 * joint.coverage, 4)}",
             number(joint.gamma, 4),
-            f"{percent(100 * joint.coverage, 4)}: ellipses of {percent(100 * joint.level, 4)}",
+            f"{percent(100 * joint.coverage, 4)} (that of {percent(100 * joint.level, 4)} ellipses)",
         ),
         ("stable loop", "–", f"{percent(100 * joint.stable_share, 4)} ({stable_low} to {stable_high})"),
         (
@@ -135,7 +137,7 @@ def whole_blocks(data: RunData) -> list[Block]:
     short = joint.level > joint.given_level and not data.whole["calibrated"]
     return [
         heading("Whole responses"),
-        *(maybe((sentence(words),), "warning") if short else (Text(sentence(words)),)),
+        *(maybe((sentence(words),), "warning") if short else (Text(sentence(_whole(data) or words)),)),
         table,
     ]
 
