@@ -242,15 +242,16 @@ def design(
         typer.Option(
             "--spec",
             "--specification",
-            help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis] where "
-            "needed; for a run directory its own if left out.",
+            help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis], "
+            "[certificate], [yardstick], [prefilter] where needed; for a run directory its own if left out.",
             show_default=False,
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99).",
+            help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99); "
+            "a prefilter beside it, as NAME_prefilter.",
             show_default=False,
         ),
     ] = None,

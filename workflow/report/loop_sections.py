@@ -250,7 +250,8 @@ def closed_loop_section(data: RunData) -> Section:
     blocks: list[Block] = [Text(lead)]
     if document.get("prefiltered"):
         words = (
-            "Every reference goes through the prefilter; the errors below are against the reference itself."
+            "Every reference goes through the prefilter, which makes the loop follow its model (dotted in "
+            "the picture); the errors below are against the reference itself."
         )
         blocks.append(Text(words))
     if not document["tracking"]:
