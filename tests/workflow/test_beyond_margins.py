@@ -41,6 +41,7 @@ from workflow.reference_filter import (
     prefilter_of,
     prefilter_words,
 )
+from workflow.summary import gamma_of, verdict_of
 from workflow.whole_responses import (
     certify_whole,
     joint_numbers,
@@ -112,6 +113,16 @@ def test_advice_on_the_order():
     assert "controller_order = 3 is too low" in str(order_advice(bracket_document(0.8), 1.2, 3))
     assert "a higher order does not help" in str(order_advice(bracket_document(1.1), 1.2, 3))
     assert order_advice({}, 1.2, 3) is None
+
+
+def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
+    design = {"met": False, "reason": "gamma 1.2", "synthesis": {"gamma": 1.2}}
+    words = verdict_of(design, {}, {}, bracket_document(0.8), 3)
+    assert words.startswith("specification not met: gamma 1.2; controller_order = 3 is too low")
+    assert verdict_of(design, {}, {}, {}, 3) == "specification not met: gamma 1.2"
+    lost = design | {"synthesis": {"gamma": None}}
+    assert gamma_of(lost) == float("inf")
+    assert "is too low" in verdict_of(lost, {}, {}, bracket_document(0.8), 3)
 
 
 def test_yardstick_not_asked_for_or_impossible_says_why():
