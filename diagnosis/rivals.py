@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from diagnosis.case import Case, Real
+from diagnosis.discrimination import Rival
 from diagnosis.fit import Fit
-from diagnosis.next_experiment import Rival
 from diagnosis.nominal import NominalParameters
 from plant.effects import Effect
 from plant.simulate import simulate

@@ -11,9 +11,10 @@ from scipy.optimize import minimize_scalar
 
 from diagnosis import ResidualModel
 from diagnosis.candidates import candidates
+from diagnosis.discrimination import Rival
 from diagnosis.experiment_choices import Excitation, Limits, excitations
 from diagnosis.fit import fit
-from diagnosis.next_experiment import Rival, next_experiment
+from diagnosis.next_experiment import next_experiment
 from diagnosis.rivals import rival_of_fit, rivals_of
 from plant import prbs, simulate
 from plant.effects import (
@@ -201,7 +202,8 @@ def test_effort_is_bounded(monkeypatch):
         calls.append(1)
         return simulate(*args, **kwargs)
 
-    monkeypatch.setattr("diagnosis.next_experiment.simulate", counted)
+    for module in ("next_experiment", "discrimination"):
+        monkeypatch.setattr(f"diagnosis.{module}.simulate", counted)
     rivals = _rivals(
         CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), None, rig=TOLERANT
     )

@@ -392,3 +392,13 @@ def test_recorded_disturbance_comes_with_the_clock(gap_cases):
     found = _recorded(gap_cases, "periodic_disturbance")
     assert all(c.found for c in found.common)
     assert "whatever the input" in found.headline
+
+
+def test_more_noise_than_stated_is_called_that():
+    residuals = {name: e * (1.0, 1.5) for name, e in white(np.random.default_rng(12)).items()}
+    found = where(made(residuals), residuals)
+    assert "The gap of the tip sensor is spread evenly over all frequencies" in found.sentences["frequency"]
+    assert "lies in the tip sensor" in found.headline
+    tip = found.sensors[1].gap
+    # 1.5^2 - 1 beyond the noise
+    assert tip.gap_rms == pytest.approx(np.sqrt(1.25), rel=0.1)
