@@ -239,12 +239,14 @@ def _named(
 def _intervals(end: Fit, k: int, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
     """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
 
-    What is left beyond the noise widens them in proportion.
+    What is left beyond the noise widens them in proportion, its correlation too where the machine states one.
     """
     candidate: Candidate = end.candidates[k]
     at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(at, at + len(candidate.axes))
     covariance = end.covariance()[rows, rows] * max(1.0, end.rms**2)
+    if end.weighing.model_error > 0:
+        covariance *= end.weighing.correlation_samples
     x = end.coordinates[k]
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -14,6 +14,7 @@ import numpy as np
 
 from diagnosis.fit import Fit, log_evidence
 from diagnosis.leftover import Leftover
+from diagnosis.model_error import log_evidence_with_model_error
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); with play two correct solvers differ by 0.2.
@@ -50,11 +51,15 @@ class Hypothesis:
         beside = len(fit.names) - 1
         jagged = any(candidate.dependence == "jagged" for candidate in fit.candidates)
         allowed = _BESIDE_JAGGED * beside if jagged else 0.0
-        evidence, prior = log_evidence(fit), log_prior(fit.names, len(fit.weighing.listed))
+        prior = log_prior(fit.names, len(fit.weighing.listed))
+        if fit.weighing.model_error > 0:
+            exactly, besides = log_evidence_with_model_error(fit)
+            return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
+        evidence = log_evidence(fit)
         return cls(
             fit,
             evidence + disagreement_gain(fit, rest) + prior - allowed,
-            evidence + rest.log_gain_some + prior + _UNKNOWN_BESIDE + _beyond_model_error(fit, rest),
+            evidence + rest.log_gain_some + prior + _UNKNOWN_BESIDE,
         )
 
 
@@ -73,16 +78,7 @@ def disagreement_gain(fit: Fit, rest: Leftover) -> float:
     Its size has a half-normal prior; what is left over beyond that is no disagreement any more.
     """
     solvers = [_DISAGREEMENT["smooth"], *(_DISAGREEMENT[c.dependence] for c in fit.candidates)]
-    scale = max(*solvers, fit.weighing.model_error)
-    return max(0.0, rest.log_gain - 0.5 * (rest.size / scale) ** 2)
-
-
-def _beyond_model_error(fit: Fit, rest: Leftover) -> float:
-    """log probability that what is left is more than the machine's simulation may leave anyway."""
-    allowed = fit.weighing.model_error
-    if not allowed > 0:
-        return 0.0
-    return float(np.log(max(-np.expm1(-0.5 * (rest.size / allowed) ** 2), 1e-12)))
+    return max(0.0, rest.log_gain - 0.5 * (rest.size / max(solvers)) ** 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,11 +33,14 @@ class Weighing:
         Effects that are looked for; prior probabilities are shared among them.
     model_error : float
         What even the right set of effects may leave over, in noise deviations (scale of a half-normal prior,
-        RMS over all samples). Zero where the simulation is as good as the machine it describes.
+        RMS over all samples). Zero where the simulation is as good as the sensors.
+    correlation_samples : float
+        Samples per independent value of what is left over; counts only beside a model error.
     """
 
     listed: tuple[str, ...] = tuple(EFFECTS)
     model_error: float = 0.0
+    correlation_samples: float = 1.0
 
 
 class StatedValues(Protocol):

@@ -174,6 +174,9 @@ class Plant:
         What the simulation may leave over even with the right effects, in noise deviations (RMS, scale of a
         half-normal prior). No simulation of a real machine reaches its noise; with zero here what is left
         over makes the answer "unknown".
+    correlation_samples : float
+        Samples per independent value of what is left over (`diagnosis.model_error.correlation_length` of the
+        residuals, times the passes of a repeated motion). Counts only beside a model error.
     """
 
     simulation: Simulate
@@ -183,6 +186,7 @@ class Plant:
     noise: Real
     effects: tuple[PlantEffect, ...]
     model_error: float = 0.0
+    correlation_samples: float = 1.0
     _weighing: Weighing = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -199,6 +203,8 @@ class Plant:
             )
         if not self.model_error >= 0:
             raise ValueError(f"plant: model_error must not be negative; got {self.model_error}")
+        if not self.correlation_samples >= 1:
+            raise ValueError(f"plant: correlation_samples must be at least 1; got {self.correlation_samples}")
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
                 raise ValueError(f"plant: tolerance of {key}, which is no parameter of it")
@@ -210,7 +216,8 @@ class Plant:
                 raise ValueError(f"plant: effect {name} is listed twice")
         if not names:
             raise ValueError("plant: lists no effect that may be missing")
-        object.__setattr__(self, "_weighing", Weighing(tuple(names), float(self.model_error)))
+        weighing = Weighing(tuple(names), float(self.model_error), float(self.correlation_samples))
+        object.__setattr__(self, "_weighing", weighing)
 
     @property
     def weighing(self) -> Weighing:
