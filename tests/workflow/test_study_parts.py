@@ -26,6 +26,7 @@ from workflow.settings import check
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.keys import last_name, parse_key, with_values
 from workflow.study.local import LocalProcesses
+from workflow.study.page import point_tables
 from workflow.study.points import short
 from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
@@ -326,3 +327,22 @@ def test_search_without_its_extra(refused, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     line = refused("study", "--config", write_study(tmp_path, SEARCH), "--out", tmp_path / "out")
     assert "needs the extra 'optuna': pip install 'flexlink[optuna]'" in line
+
+
+def test_tables_show_what_was_asked_for_and_no_empty_column():
+    axis = Axis.model_validate({"key": "specification.bandwidth_rad_s", "label": "asked", "values": [1.0]})
+    numbers = dict.fromkeys(COLUMNS) | {
+        "worst_gamma": 0.9,
+        "any_order_gamma": 0.8,
+        "predicted_peak_sensitivity": 1.4,
+        "measured_peak_sensitivity": 1.42,
+        "settled_draws": 1,
+        "draws": 2,
+    }
+    row = PointRow(1, "a", {axis.key: 1.0}, "does not settle", "why", numbers)
+    certified, achieved = point_tables((axis,), [row], {})
+    assert certified.head == ("point", "asked", "worst-case gamma", "gamma of any order", "state")
+    assert certified.rows == (("1", "1", "0.9", "0.8", "does not settle"),)
+    assert achieved.head == ("point", "asked", "peak of S, predicted", "peak of S, measured", "settle")
+    assert achieved.rows == (("1", "1", "1.4", "1.42", "1 of 2"),)
+    assert (certified.met, achieved.met) == ((False,), (False,))
