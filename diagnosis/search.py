@@ -26,6 +26,8 @@ _CLOSE = 60.0
 _LEAST_GAIN = 10.0
 _ROUGH_ITERATIONS, _FINE_ITERATIONS = 8, 15
 _MOST_EFFECTS = 3
+# Where two effects leave more than this share of the gap, a third would only imitate something unknown.
+_HOPELESS = 0.1
 # Sets whose members are tried without one of them.
 _SETS_TO_REDUCE = 3
 # Further effects that are fitted beside the best hypothesis, by the cost their screening promises.
@@ -66,6 +68,8 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     found.sort(key=lambda h: -h.log_weight)
     while found[0].names and len(found[0].names) < _MOST_EFFECTS:
         lead = found[0]
+        if len(lead.names) > 1 and _beyond_noise(lead.fit) > _HOPELESS * _beyond_noise(base):
+            break
         further = [
             (candidate, screening.beside(lead.fit, starts))
             for candidate, starts in listed
@@ -79,6 +83,10 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
             break
     report(1.0, "done")
     return Search(base, tuple(found), model.simulations)
+
+
+def _beyond_noise(end: Fit) -> float:
+    return max(end.rms**2 - 1.0, 0.0)
 
 
 def _weighed(model: ResidualModel, end: Fit) -> Hypothesis:
