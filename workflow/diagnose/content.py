@@ -33,5 +33,6 @@ class CasePage:
 
     @property
     def models(self) -> tuple[str, ...]:
-        """The models to compare, the last one only where effects were added."""
-        return ("stated", "refit", "repaired") if self.found.combination else ("stated", "refit")
+        """Models to compare: values are moved where there are tolerances, effects where any were found."""
+        moved = ("refit",) if self.found.deviations else ()
+        return ("stated", *moved, *(("repaired",) if self.found.combination else ()))

@@ -47,7 +47,7 @@ def gap_sentences(found: Diagnosis) -> list[str]:
     """Is there a gap beyond noise?"""
     floor = found.noise_floor
     words = [
-        "With the rig as stated the model misses the held-out experiments by "
+        "With the rig as stated the residual of the held-out experiments is "
         f"{times_noise(found.gap_before)} times the sensor noise (RMS); noise alone would give "
         f"{number(floor)}."
     ]
@@ -148,13 +148,16 @@ def closure_sentences(found: Diagnosis) -> list[str]:
             "experiments of estimation."
         ]
     return [
-        f"With {names} in the model the held-out residual falls from {times_noise(found.gap_before)} (as "
-        f"stated) by way of {times_noise(found.gap_refit)} (values moved) to {times_noise(found.gap_after)} "
-        "times the noise.",
+        f"With {names} in the model the held-out residual falls from {times_noise(found.gap_before)} (rig "
+        f"as stated){_by_way_of(found)} to {times_noise(found.gap_after)} times the noise.",
         f"That closes {number(100 * found.gap_closed, 4)} % of the explainable gap "
         f"(95 % by resampling blocks: {number(100 * low, 4)} to {number(100 * high, 4)} %). The held-out "
         "experiments were never fitted.",
     ]
+
+
+def _by_way_of(found: Diagnosis) -> str:
+    return f" by way of {times_noise(found.gap_refit)} (values moved)" if found.deviations else ""
 
 
 def remaining_sentences(found: Diagnosis) -> list[str]:

@@ -92,7 +92,7 @@ def _gap(content: CasePage) -> Section:
     blocks.append(
         Plot(
             "waterfall",
-            "Root mean square of (measured - model) over the sensor noise for the three models. 1 is what "
+            "Root mean square of (measured - model) over the sensor noise for each model. 1 is what "
             "white noise of the stated size leaves. Held-out experiments were never fitted.",
         )
     )

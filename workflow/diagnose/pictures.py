@@ -31,7 +31,7 @@ def drawers_of(content: CasePage) -> dict[str, Callable[[], Figure]]:
     residuals = residuals_by_model(found)
     held_out = {"stated": found.gap_before, "refit": found.gap_refit, "repaired": found.gap_after}
     models = content.models
-    shown = ("stated", models[-1])
+    shown = tuple(dict.fromkeys(("stated", models[-1])))
     drawers: dict[str, Callable[[], Figure]] = {
         "waterfall": lambda: draw_waterfall(
             {model: held_out[model] for model in models},

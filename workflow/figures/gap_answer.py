@@ -80,9 +80,11 @@ def draw_waterfall(
                 textcoords="offset points",
                 ha="center",
                 fontsize=10,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
             )
-        left.axhline(floor, **gap_style.FLOOR, label=gap_style.WORDS["floor"])
+        left.axhline(floor, **gap_style.FLOOR, label=gap_style.WORDS["floor"], zorder=1)
         left.set_xticks(at, [_TICKS[name] for name in names])
+        left.set_xlim(-0.6, max(len(names), 3) - 0.4)
         left.set_ylim(0, 1.15 * max(*values, floor))
         left.grid(visible=False, axis="x")
         left.set_ylabel("residual over noise, RMS [1]")

@@ -76,6 +76,8 @@ def draw_residual_spectra(
                 if mode < 0.5 / dt_s:
                     axes.axvline(mode, color="#999999", lw=0.8, ls=":")
                     style.tag_below(axes, mode, f"mode {number}")
+            low, high = axes.get_ylim()
+            axes.set_ylim(min(low, 0.1), max(high, 10.0))
             axes.set_xlabel("frequency [Hz]")
             axes.set_title(f"Residual of the {gap_style.SENSOR_WORDS[column]}")
         panels[0].set_ylabel("power over that of the noise [1]")
