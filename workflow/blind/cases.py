@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -13,7 +13,12 @@ from workflow.blind.rigs import Rig, draw_rig, draw_tolerances, rounded, stated
 from workflow.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, sizable
 from workflow.blind.truth import LISTED, UNLISTED, Clean, Real, Truth
 
+if TYPE_CHECKING:
+    from workflow.blind.exudyn_truth import ExudynTruth
+
 Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
+Simulator = Literal["ritz", "exudyn"]
+SIMULATORS: tuple[Simulator, ...] = ("ritz", "exudyn")
 # Shares of a set of cases. The sets this imitates say nothing about the next one's mix; nor does this.
 SHARES: dict[Sort, float] = {"none": 0.25, "clear": 0.25, "faint": 0.17, "pair": 0.17, "unlisted": 0.16}
 # Wanted largest gap over the noise.
@@ -75,22 +80,28 @@ def schedule(n_cases: int, rng: np.random.Generator) -> list[tuple[Sort, bool, s
     return [plan[i] for i in rng.permutation(n_cases)]
 
 
-def make_case(sort: Sort, exact: bool, first_effect: str, rng: np.random.Generator) -> BlindCase:
+def make_case(
+    sort: Sort, exact: bool, first_effect: str, rng: np.random.Generator, simulator: Simulator = "ritz"
+) -> BlindCase:
     """Draw rigs, partners and sizes until the gap is as wanted.
 
-    Raises ValueError if forty draws do not suffice.
+    Sizes are tuned with the built-in simulator either way; `simulator` makes the records. Raises ValueError
+    if forty draws do not suffice.
     """
+    pool = _pool(sort, simulator)
+    if first_effect and first_effect not in pool:
+        first_effect = str(rng.choice(pool))
     for attempt in range(_TRIES):
         rig = draw_rig(rng)
         tolerances = {} if exact else draw_tolerances(rng)
         # An effect that cannot be of the wanted size on any of these rigs gives way to another one.
-        name = first_effect if attempt < _TRIES // 4 else str(rng.choice(_pool(sort)))
+        name = first_effect if attempt < _TRIES // 4 else str(rng.choice(pool))
         try:
             plans = plan_experiments(Truth(rig), rng)
-            effects = _effects(sort, name, rig, plans, tolerances, rng)
+            effects = _effects(sort, name, pool, rig, plans, tolerances, rng)
             if effects is None:
                 continue
-            records = _run(rig, effects, plans, rng)
+            records = _run(rig, effects, plans, rng, simulator)
             if not _seen_where_fitted(records):
                 continue
         except ValueError as error:
@@ -111,13 +122,28 @@ def _seen_where_fitted(records: tuple[Record, ...]) -> bool:
     return largest["estimation"] >= _SHARE_IN_ESTIMATION * largest["held_out"]
 
 
-def _pool(sort: Sort) -> tuple[str, ...]:
-    return UNLISTED if sort == "unlisted" else LISTED
+def _pool(sort: Sort, simulator: Simulator) -> tuple[str, ...]:
+    """Causes to choose from that the simulator can make."""
+    names = UNLISTED if sort == "unlisted" else LISTED
+    if simulator == "exudyn":
+        from workflow.blind.exudyn_truth import SUPPORTED
+
+        return tuple(name for name in names if name in SUPPORTED)
+    return names
+
+
+def _machine(rig: Rig, effects: list[Table], simulator: Simulator) -> Truth | ExudynTruth:
+    if simulator == "exudyn":
+        from workflow.blind.exudyn_truth import ExudynTruth
+
+        return ExudynTruth(rig, effects)
+    return Truth(rig, effects)
 
 
 def _effects(
     sort: Sort,
     name: str,
+    pool: tuple[str, ...],
     rig: Rig,
     plans: tuple[Planned, ...],
     tolerances: dict[str, float],
@@ -127,7 +153,7 @@ def _effects(
         return []
     names = [name]
     if sort == "pair":
-        others = [n for n in LISTED if n != name and {n, name} not in NOT_TOGETHER]
+        others = [n for n in pool if n != name and {n, name} not in NOT_TOGETHER]
         names.append(str(rng.choice(others)))
     low, high = RANGES[sort]
     found = []
@@ -211,9 +237,13 @@ class _Nominal:
 
 
 def _run(
-    rig: Rig, effects: list[Table], plans: tuple[Planned, ...], rng: np.random.Generator
+    rig: Rig,
+    effects: list[Table],
+    plans: tuple[Planned, ...],
+    rng: np.random.Generator,
+    simulator: Simulator,
 ) -> tuple[Record, ...]:
-    machine, nominal = Truth(rig, effects), Truth(rig)
+    machine, nominal = _machine(rig, effects, simulator), Truth(rig)
     records = []
     for plan in plans:
         noise = rng.standard_normal((plan.voltage_V.size, 2)) * machine.noise

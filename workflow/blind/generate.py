@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from workflow.blind.cases import BlindCase, Sort, make_case, schedule
+from workflow.blind.cases import SIMULATORS, BlindCase, Simulator, Sort, make_case, schedule
+from workflow.blind.exudyn_truth import load_exudyn
 from workflow.blind.rigs import rig_toml
 from workflow.errors import InputError
 from workflow.storage import write_text
@@ -31,9 +32,9 @@ def case_name(index: int) -> str:
     return f"case_{index + 1:04d}"
 
 
-def draw_case(seed: int, index: int, plan: Plan, simulator: str = "ritz") -> BlindCase:
+def draw_case(seed: int, index: int, plan: Plan, simulator: Simulator = "ritz") -> BlindCase:
     """The case of this index and plan, whoever draws it."""
-    return make_case(*plan, np.random.default_rng([seed, 1, index]))
+    return make_case(*plan, np.random.default_rng([seed, 1, index]), simulator)
 
 
 def plan_cases(n_cases: int, seed: int) -> list[Plan]:
@@ -97,7 +98,7 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def _one(seed: int, out: Path, open_cases: bool, simulator: str, job: tuple[int, Plan]) -> Answer:
+def _one(seed: int, out: Path, open_cases: bool, simulator: Simulator, job: tuple[int, Plan]) -> Answer:
     index, plan = job
     case = draw_case(seed, index, plan, simulator)
     folder = out / case_name(index)
@@ -116,7 +117,7 @@ def generate(
     *,
     jobs: int = 1,
     open_cases: bool = False,
-    simulator: str = "ritz",
+    simulator: Simulator = "ritz",
     finished: Mapping[str, Answer] | None = None,
     keep: Callable[[Answer], None] | None = None,
 ) -> list[Answer]:
@@ -129,6 +130,8 @@ def generate(
         raise InputError(
             f"cases and jobs must be at least 1, the seed at least 0; got {n_cases}, {jobs}, {seed}"
         )
+    if simulator == "exudyn":
+        load_exudyn()
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
     work = partial(_one, seed, out, open_cases, simulator)
@@ -162,11 +165,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--simulator", choices=SIMULATORS, default="ritz")
     parser.add_argument("--open", action="store_true", help="write answers and exact rigs beside the records")
     given = parser.parse_args()
     try:
         refuse_filled(given.out)
-        generate(given.cases, given.seed, given.out, jobs=given.jobs, open_cases=given.open)
+        generate(
+            given.cases,
+            given.seed,
+            given.out,
+            jobs=given.jobs,
+            open_cases=given.open,
+            simulator=given.simulator,
+        )
     except InputError as error:
         parser.exit(2, f"{error}\n")
 

@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import workflow
+from workflow.blind.cases import SIMULATORS, Simulator
+from workflow.blind.exudyn_truth import load_exudyn
 from workflow.blind.generate import Answer, folder_hash, generate, refuse_filled
 from workflow.blind.report import confusion_figure, summary, text
 from workflow.blind.scores import scores
@@ -38,7 +40,6 @@ from workflow.progress import Progress, Silence
 from workflow.storage import read_json, sha256_of_file, strict_json, write_bytes, write_json, write_text
 from workflow.summary import RunSummary
 
-SIMULATORS = ("ritz", "exudyn")
 _FORMAT = "flexlink-blind-1"
 # Expected seconds per case: they shape the progress bar only.
 _CASE_S, _DIAGNOSIS_S = 8.0, 40.0
@@ -63,8 +64,11 @@ def run_blind(
     diagnose: (case folder, directory it must keep out of) -> document; the default starts a process.
     """
     progress = progress or Silence()
-    if simulator not in SIMULATORS:
+    chosen = next((name for name in SIMULATORS if name == simulator), None)
+    if chosen is None:
         raise InputError(f"--simulator must be one of {', '.join(SIMULATORS)}; got {simulator!r}")
+    if chosen == "exudyn":
+        load_exudyn()
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     if n_cases < 1 or seed < 0:
@@ -72,7 +76,7 @@ def run_blind(
     width = jobs or os.cpu_count() or 1
     _begin(out, {"format": _FORMAT, "cases": n_cases, "seed": seed, "simulator": simulator}, resume)
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
-    _sealed_cases(out, n_cases, seed, width, simulator, progress)
+    _sealed_cases(out, n_cases, seed, width, chosen, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
     _predict(out, names, width, diagnose or diagnose_in_process, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
@@ -113,7 +117,9 @@ def _begin(out: Path, settings: Mapping[str, Any], resume: bool) -> None:
     write_json(manifest, settings)
 
 
-def _sealed_cases(out: Path, n_cases: int, seed: int, jobs: int, simulator: str, progress: Progress) -> None:
+def _sealed_cases(
+    out: Path, n_cases: int, seed: int, jobs: int, simulator: Simulator, progress: Progress
+) -> None:
     """Cases and closed seal; an interrupted generation goes on where it stopped."""
     progress.start("cases")
     started = time.monotonic()

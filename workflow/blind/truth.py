@@ -56,7 +56,6 @@ UNLISTED = (
     "sensor_clipping",  # tip reading ends at +-limit
     "winding_heat",  # resistance grows linearly in time during a record
     "encoder_eccentricity",  # a (sin(theta + p) - sin p) added to the hub angle
-    "encoder_gain",  # hub angle multiplied by a ratio
 )
 
 PRE_SLIDING_RAD = 1e-5
@@ -187,18 +186,8 @@ class Truth:
         """
         get, p = self._get, self._physics
         commanded = np.array(voltage_V, dtype=np.float64)
-        limit = get("actuator_saturation", "limit_V", 1e9)
-        static = np.array(
-            [
-                get("actuator_gain", "ratio", 1.0),
-                get("actuator_dead_zone", "width_V", 0.0),
-                limit,
-                get("amplifier_cubic", "cubic_1_V2", 0.0),
-            ]
-        )
-        value = static[0] * commanded
-        value = value + static[3] * value**3
-        acting = np.sign(value) * np.clip(np.abs(value) - static[1], 0.0, limit)
+        static = self.amplifier
+        acting = amplified(commanded, static)
         whole, late = _delay(get("input_delay", "delay_s", 0.0), self.dt_s)
         if feedback is None:
             gains, reference = np.zeros(0), np.zeros(0)
@@ -217,13 +206,30 @@ class Truth:
         )  # fmt: skip
         if not fine or not np.all(np.isfinite(outputs)):
             raise ValueError("the motion leaves every bound: the loop is unstable or the voltage too high")
+        return self.sensed(commanded, outputs)
+
+    @property
+    def amplifier(self) -> Real:
+        """(gain, dead zone, limit, cubic part) of the voltage's static path."""
+        get = self._get
+        return np.array(
+            [
+                get("actuator_gain", "ratio", 1.0),
+                get("actuator_dead_zone", "width_V", 0.0),
+                get("actuator_saturation", "limit_V", 1e9),
+                get("amplifier_cubic", "cubic_1_V2", 0.0),
+            ]
+        )
+
+    def sensed(self, commanded: Real, outputs: Real) -> Clean:
+        """The record as sensors see it, but for noise, clipping and quantisation; outputs (T, 2)."""
+        get = self._get
         hub, tip = outputs.T
-        hub = hub * get("encoder_gain", "ratio", 1.0)
         a, phase = (
             get("encoder_eccentricity", "amplitude_rad", 0.0),
             get("encoder_eccentricity", "phase_rad", 0.0),
         )
-        hub = hub + a * (np.sin(outputs[:, 0] + phase) - np.sin(phase))
+        hub = hub + a * (np.sin(hub + phase) - np.sin(phase))
         time = np.arange(commanded.size) * self.dt_s
         tip = get("sensor_gain", "ratio", 1.0) * tip + get("sensor_drift", "rate_m_s", 0.0) * time
         return Clean(
@@ -280,6 +286,13 @@ class Truth:
             fastest = max(fastest, p.resistance / p.inductance)
         fewest = _FEWEST_CONTACT if p.play >= 0 else _FEWEST
         return int(np.clip(np.ceil(self.dt_s * fastest / 0.9), fewest, _MOST))
+
+
+def amplified(voltage_V: Real, static: Real) -> Real:
+    """Gain, cubic part, dead zone and limit; see `Truth.amplifier`."""
+    value = static[0] * voltage_V
+    value = value + static[3] * value**3
+    return np.asarray(np.sign(value) * np.clip(np.abs(value) - static[1], 0.0, static[2]))
 
 
 def _basis(length: float, bending: float, line: float, tip_mass: float) -> LinkBasis:
