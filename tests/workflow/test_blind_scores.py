@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from plant.effects import EFFECTS
+from workflow.blind.generate import answer_toml
 from workflow.blind.report import confusion_figure, text
+from workflow.blind.score import score
 from workflow.blind.scores import scores, wilson
 from workflow.blind.sizes import FAMILY
+from workflow.errors import InputError
+from workflow.storage import write_json
 
 
 def _said(case, verdict, ranked=(), *, combination=None, parameters=None, gap_after=1.0):
@@ -211,3 +215,24 @@ def test_text_and_picture_stand_without_any_right_answer():
     assert "out of memory" in words
     assert "baseline: parameters only" in words
     assert confusion_figure(found).startswith(b"\x89PNG")
+
+
+def test_open_cases_are_scored_by_the_rig_file_that_was_read(tmp_path):
+    cases, diagnosis = tmp_path / "cases", tmp_path / "diagnosis"
+    diagnosis.mkdir()
+    for case, tolerance in (("a", False), ("b", True), ("c", False)):
+        (cases / case).mkdir(parents=True)
+        answer = _true(case, "effect", [GRAVITY])
+        answer |= {"severity": "clear", "sort": "clear", "nominal": "-", "experiments": {}, "unlisted": []}
+        (cases / case / "answer.toml").write_text(answer_toml(answer))
+        text = '[tolerances]\n"hub.inertia_kg_m2" = 0.05\n' if tolerance else ""
+        (cases / case / "rig.toml").write_text(text)
+    for case in "ab":
+        write_json(diagnosis / f"{case}.json", _said(case, "effect", [("gravity", 1.0)]))
+    write_json(diagnosis / "timings.json", {"a": {"cpu_s": 7.0}})
+    found, missing = score(diagnosis, cases)
+    assert missing == ["c"]
+    assert found["table"]["uncertain"]["top-1, ratio >= 3"]["count"] == 1
+    assert found["table"]["exact"]["CPU per case [s]"]["median"] == 7.0
+    with pytest.raises(InputError, match="answers none of the cases"):
+        score(tmp_path, cases)

@@ -41,16 +41,24 @@ def text(document: Mapping[str, Any]) -> str:
         f"--simulator {settings['simulator']}",
         f"commitment (salted SHA-256 of the labels, published before the diagnosis): "
         f"{document['commitment']}",
-        f"{found['n_cases']} cases; shares with 95 % Wilson intervals",
         "",
-        *_table(found),
+        scores_text(found).rstrip("\n"),
     ]
     for name, scored in document["baselines"].items():
         lines += ["", f"baseline: {name}", *_table(scored)]
+    lines += [f"  {case}: {reason}" for case, reason in document["failed"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def scores_text(found: Mapping[str, Any]) -> str:
+    """One set of scores: table, counts, calibration, and every case that is wrong."""
+    lines = [f"{found['n_cases']} cases; shares with 95 % Wilson intervals", "", *_table(found)]
     lines += ["", "true cause -> answers (single effects, none, unknown)"]
     lines += _counts(found["confusion"])
-    lines += ["", "causes beyond the list -> answers", *_counts(found["unlisted"])]
-    lines += ["", "several effects", *(f"  {word}: {n}" for word, n in sorted(found["several"].items()))]
+    if found["unlisted"]:
+        lines += ["", "causes beyond the list -> answers", *_counts(found["unlisted"])]
+    if found["several"]:
+        lines += ["", "several effects", *(f"  {word}: {n}" for word, n in sorted(found["several"].items()))]
     lines += ["", "probability of the first answer -> how often it was right"]
     lines += [
         f"  {b['low']:.1f}-{b['high']:.1f}: {b['count']} cases, said {b['probability']:.2f}, "
@@ -64,7 +72,6 @@ def text(document: Mapping[str, Any]) -> str:
         f"with p = {w['probability']:.2f}"
         for w in found["wrong"]
     ]
-    lines += [f"  {case}: {reason}" for case, reason in document["failed"].items()]
     return "\n".join(lines) + "\n"
 
 
