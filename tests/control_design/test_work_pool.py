@@ -39,6 +39,7 @@ def _plant() -> UncertainPlant:
     return UncertainPlant("hub", hub_arm(), RelativeDisc(hub_arm(), 0.03, 60.0))
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_does_not_change_the_result():
     results = [
         synthesise(
