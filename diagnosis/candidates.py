@@ -134,6 +134,7 @@ class Scales:
     voltage_V: float
     torque_Nm: float
     angle_rad: float
+    speed_rad_s: float
     duration_s: float
     dt_s: float
     link_mass_kg: float
@@ -151,6 +152,7 @@ class Scales:
             voltage_V=voltage,
             torque_Nm=rig.motor.torque_per_volt_Nm_V * voltage,
             angle_rad=max(float(np.max(np.abs(e.output[:, 0]))) for e in case.experiments),
+            speed_rad_s=max(_speed(e.output[:, 0]) for e in case.experiments) / rig.sampling.dt_s,
             duration_s=max(e.voltage_V.size for e in case.experiments) * rig.sampling.dt_s,
             dt_s=rig.sampling.dt_s,
             link_mass_kg=link.mass_per_length_kg_m * link.length_m,
@@ -159,6 +161,11 @@ class Scales:
             damping_Nms=rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms,
             tip_noise_m=rig.sensors.tip_noise_m,
         )
+
+
+def _speed(angle_rad: Real, samples: int = 10) -> float:
+    """Largest mean speed over so many samples, per sample."""
+    return float(np.max(np.abs(angle_rad[samples:] - angle_rad[:-samples]))) / samples
 
 
 def candidates(case: Case) -> tuple[Candidate, ...]:
@@ -174,7 +181,9 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
             [
                 _log("static_torque_Nm", 1e-5 * tau, 2 * tau, 2e-3),
                 Axis("coulomb_torque_Nm", "linear", 0.0, 0.98, 2e-3),  # share of the static level
-                _log("stribeck_velocity_rad_s", 2e-3, 5.0, 2e-3),
+                # A fall over less than a hundredth of the largest speed is over before it shows: dry friction
+                # of the Coulomb kind by another name.
+                _log("stribeck_velocity_rad_s", 0.01 * s.speed_rad_s, 5.0, 2e-3),
             ],
             [_geom(3e-4 * tau, 0.6 * tau, 8), [0.5, 0.8], [0.02, 0.1, 0.5]],
         ),

@@ -28,6 +28,10 @@ _UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
 # Where contacts switch, what two correct solvers disagree about is not white: further effects beside a jagged
 # one can follow some of it, so they have to gain more (in log weight) to be believed.
 _BESIDE_JAGGED = 20.0
+# What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
+# records determine: an effect that contains another (Stribeck and Coulomb friction) costs nothing where it
+# imitates it, and the simpler name is the better one then.
+_PER_PARAMETER = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,8 @@ class Hypothesis:
         beside = len(fit.names) - 1
         jagged = any(candidate.dependence == "jagged" for candidate in fit.candidates)
         allowed = _BESIDE_JAGGED * beside if jagged else 0.0
-        prior = log_prior(fit.names, len(fit.weighing.listed))
+        further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
+        prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
         if fit.weighing.model_error > 0:
             exactly, besides = log_evidence_with_model_error(fit)
             return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
