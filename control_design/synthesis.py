@@ -29,6 +29,7 @@ __all__ = ["Progress", "SynthesisOptions", "synthesise"]
 Progress = Callable[[float, str], None]
 
 _STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
+_MEANINGLESS = 1e4  # a weighted worst case above it is a loop on the edge of stability, whatever its digits
 _EMBEDDINGS = 3  # ways to add a cancelling section to the result of the order below
 _LOWEST_ORDER, _LOWEST_TRACKING = 2, 3  # first rung of the ladder; two states rarely track and damp
 
@@ -92,9 +93,10 @@ def synthesise(
         StartReport(number + 1, r.status, r.iterations, r.gamma_grid, r.gamma_dense)
         for number, r in enumerate(reports)
     )
-    if result.best is None:
-        return _nothing_stable(problem, cascade, result.nearest, numbered)
     best = result.best
+    if best is None or best.gamma >= _MEANINGLESS:
+        nearest = result.nearest if best is None else best.parameters
+        return _nothing_stable(problem, cascade, nearest, best, numbered)
     tell(1.0, f"gamma {best.gamma:.4g}")
     return SynthesisResult(
         outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
@@ -124,7 +126,11 @@ def _part(tell: Progress, number: int, count: int, order: int) -> Progress:
 
 
 def _nothing_stable(
-    problem: Problem, cascade: Cascade, nearest: Real | None, reports: tuple[StartReport, ...]
+    problem: Problem,
+    cascade: Cascade,
+    nearest: Real | None,
+    edge: Candidate | None,
+    reports: tuple[StartReport, ...],
 ) -> SynthesisResult:
     """No controller, and where the search came nearest to one: which requirement fails there."""
     zero = np.zeros((1, 1))
@@ -139,6 +145,8 @@ def _nothing_stable(
     )
     points = sum(grid.size for grid in problem.grids)
     blocking = () if nearest is None else what_destabilises(problem, cascade, nearest)
+    if not blocking and edge is not None:
+        blocking = _blocking(problem, cascade, edge)
     return SynthesisResult(Outcome.NOT_CONVERGED, nothing, float("inf"), blocking, reports, (), points)
 
 
