@@ -16,6 +16,7 @@ from workflow.figures.bands import outline
 Real = npt.NDArray[np.float64]
 
 _SEGMENT = 512
+_TRACE_BINS = 250  # a panel is some 400 pixels wide
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,9 @@ def draw_residual_traces(records: Sequence[ResidualRecord], dt_s: float) -> Figu
                 axes.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
                 for name, signal in record.residuals.items():
                     look = {**gap_style.MODELS[name], "lw": 0.7, "ls": "-"}
-                    axes.plot(*outline(time, signal[:, column]), **look, label=gap_style.WORDS[name])
+                    axes.plot(
+                        *outline(time, signal[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[name]
+                    )
                 largest = max(float(np.max(np.abs(e[:, column]))) for e in record.residuals.values())
                 reach = max(4.0, 1.05 * largest)
                 axes.set_ylim(-reach, reach)
