@@ -12,6 +12,7 @@ from diagnosis.candidates import Candidate
 from diagnosis.fit import Fit, fit
 from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
 from diagnosis.machine_protocol import CaseOfMachine, Real
+from diagnosis.model_error import at_its_own_level
 from diagnosis.residual import ResidualModel, pooled_rms
 from diagnosis.search import Progress, search
 
@@ -25,6 +26,8 @@ TEMPERATURE = 1.0
 FAR_OFF = 3.0
 # Below this probability of the first answer, or with a rival above that one, the answer is called ambiguous.
 _SURE, _RIVAL = 0.8, 0.05
+# Difference of |e|^2 + |d|^2 that the records do not tell apart (chi-square, 95 %, two parameters).
+_AS_GOOD = 6.0
 _LAST_ITERATIONS = 30
 _DRAWS, _BLOCKS, _BLOCK = 4000, 2000, 50
 
@@ -142,7 +145,7 @@ def diagnose(
     after = model.by_experiment(last.deviations, last.effects)
     gap_before, gap_refit, gap_after = (_held_out(case, r) for r in (before, refit, after))
     closed, interval = _closed(case, refit, after, rng)
-    ambiguous_with = _rivals(weighed, accepted.names, answer)
+    ambiguous_with = _rivals(weighed, found.hypotheses, accepted, answer)
     return Diagnosis(
         case=case,
         verdict=verdict,
@@ -192,12 +195,23 @@ def _detail(verdict: Verdict, weighed: Probabilities, rivals: Sequence[str], las
     return "ambiguous" if weighed.cause[weighed.answer] < _SURE or rivals else "effect"
 
 
-def _rivals(weighed: Probabilities, combination: Sequence[str], answer: str) -> tuple[str, ...]:
-    """Other answers that keep more than a few per cent, most probable first."""
-    share = {name: p for name, p in weighed.presence.items() if name not in combination}
+def _rivals(
+    weighed: Probabilities, hypotheses: Sequence[Hypothesis], accepted: Hypothesis, answer: str
+) -> tuple[str, ...]:
+    """Other answers that keep more than a few per cent, most probable first, then effects that fit as well.
+
+    An effect that contains the accepted one (Stribeck friction beside Coulomb's) is improbable for its
+    needless parameters, yet the records do not rule it out.
+    """
+    share = {name: p for name, p in weighed.presence.items() if name not in accepted.names}
     share |= {name: weighed.cause[name] for name in ("none", "unknown")}
     share.pop(answer, None)
-    return tuple(name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _RIVAL)
+    likely = [name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _RIVAL]
+    if accepted.names and answer not in ("none", "unknown"):
+        for h in sorted(hypotheses, key=lambda h: h.fit.cost):
+            if len(h.names) == len(accepted.names) and h.fit.cost <= accepted.fit.cost + _AS_GOOD:
+                likely += [name for name in h.names if name not in (*accepted.names, *likely)]
+    return tuple(likely)
 
 
 def _named(
@@ -220,7 +234,7 @@ def _named(
             parameters = end.candidates[k].parameters(end.coordinates[k])
             intervals = _intervals(end, k, rng)
             held_out = model.of(end.deviations, end.effects, model.case.held_out)
-            gap = pooled_rms(held_out)
+            gap = pooled_rms(held_out) * model.scale
         entries.append(
             NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
         )
@@ -241,12 +255,12 @@ def _intervals(end: Fit, k: int, rng: np.random.Generator) -> dict[str, tuple[fl
 
     What is left beyond the noise widens them in proportion, its correlation too where the machine states one.
     """
+    if end.weighing.model_error > 0:
+        end = at_its_own_level(end)
     candidate: Candidate = end.candidates[k]
     at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(at, at + len(candidate.axes))
     covariance = end.covariance()[rows, rows] * max(1.0, end.rms**2)
-    if end.weighing.model_error > 0:
-        covariance *= end.weighing.correlation_samples
     x = end.coordinates[k]
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -126,7 +126,7 @@ def fit(
         gain, cost = cost - step_cost, step_cost
         d, x, e = trial_d, trial_x, trial_e
         damping *= 0.2
-        if gain < tolerance:
+        if gain < tolerance / model.scale:
             converged = True
             break
     J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)

@@ -42,6 +42,13 @@ class Weighing:
     model_error: float = 0.0
     correlation_samples: float = 1.0
 
+    @property
+    def scale(self) -> float:
+        """Residuals count by this much less than white noise of the sensors would."""
+        if not self.model_error > 0:
+            return 1.0
+        return float(np.sqrt(self.correlation_samples * (1 + self.model_error**2)))
+
 
 class StatedValues(Protocol):
     """Something with stated parameters that may be off."""

@@ -24,13 +24,8 @@ _UNKNOWN_REACH = 100.0
 def log_evidence_with_model_error(fit: Fit) -> tuple[float, float]:
     """log evidence of exactly the fitted effects, and of them with something unknown besides."""
     allowed, n = fit.weighing.model_error, fit.residuals.size / fit.weighing.correlation_samples
-    rss = float(fit.residuals @ fit.residuals) / fit.weighing.correlation_samples
-
-    def named(delta: float) -> float:
-        return _gain(delta, n, rss) - 0.5 * (delta / allowed) ** 2
-
-    best = minimize_scalar(lambda delta: -named(delta), bounds=(0.0, 5 * allowed), method="bounded")
-    delta = float(best.x)
+    rss = _squares(fit)
+    delta = _level(fit)
     exactly = _evidence(fit, delta) - 0.5 * n * np.log1p(delta**2) - 0.5 * (delta / allowed) ** 2
     delta = float(np.clip(np.sqrt(max(rss / n - 1, 0.0)), allowed, _UNKNOWN_REACH * allowed))
     # log-uniform size: width of the likelihood in log delta over the range (Laplace).
@@ -40,17 +35,39 @@ def log_evidence_with_model_error(fit: Fit) -> tuple[float, float]:
     return float(exactly), float(besides)
 
 
-def _gain(delta: float, n: float, rss: float) -> float:
-    """log likelihood of n values with variance 1 + delta^2 over that with variance 1."""
-    return float(-0.5 * n * np.log1p(delta**2) + 0.5 * rss * delta**2 / (1 + delta**2))
+def at_its_own_level(fit: Fit) -> Fit:
+    """The fit with residuals weighed by the model error it shows, in place of the one allowed."""
+    return _weighed(fit, _level(fit))
+
+
+def _squares(fit: Fit) -> float:
+    """Sum of squares of the independent values, in noise deviations."""
+    return float(fit.residuals @ fit.residuals) * (1 + fit.weighing.model_error**2)
+
+
+def _level(fit: Fit) -> float:
+    """Most probable model error."""
+    allowed, rss = fit.weighing.model_error, _squares(fit)
+    n = fit.residuals.size / fit.weighing.correlation_samples
+
+    def loss(delta: float) -> float:
+        variance = 1 + delta**2
+        return float(0.5 * n * np.log(variance) + 0.5 * rss / variance + 0.5 * (delta / allowed) ** 2)
+
+    return float(minimize_scalar(loss, bounds=(0.0, 5 * allowed), method="bounded").x)
+
+
+def _weighed(fit: Fit, delta: float) -> Fit:
+    """The fit with the residuals' variance c (1 + delta^2)."""
+    scale = np.sqrt((1 + delta**2) / (1 + fit.weighing.model_error**2))
+    e = fit.residuals / scale
+    cost = float(e @ e + fit.deviations @ fit.deviations)
+    return replace(fit, residuals=e, jacobian=fit.jacobian / scale, cost=cost)
 
 
 def _evidence(fit: Fit, delta: float) -> float:
-    """log evidence with the residuals' variance c (1 + delta^2), without its normalising constant."""
-    scale = np.sqrt(fit.weighing.correlation_samples * (1 + delta**2))
-    e = fit.residuals / scale
-    cost = float(e @ e + fit.deviations @ fit.deviations)
-    return log_evidence(replace(fit, residuals=e, jacobian=fit.jacobian / scale, cost=cost))
+    """log evidence without the normalising constant of the residuals."""
+    return log_evidence(_weighed(fit, delta))
 
 
 def correlation_length(residuals: Real) -> float:

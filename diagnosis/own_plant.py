@@ -165,7 +165,8 @@ class Plant:
         It must be a function of its arguments alone.
     parameters : name -> stated value
     tolerances : name -> relative standard deviation of the stated value
-        Parameters without one are exact.
+        Parameters without one are exact. A value fitted to these same records is no knowledge beside them:
+        give it a tolerance of 1 or more.
     output_names : (Y,)
     noise : (Y,)
         Noise standard deviations, from repeats of an experiment where there are any.
@@ -208,8 +209,8 @@ class Plant:
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
                 raise ValueError(f"plant: tolerance of {key}, which is no parameter of it")
-            if not 0 < tolerance < 1:
-                raise ValueError(f"plant: tolerance of {key} must be between 0 and 1; got {tolerance}")
+            if not 0 < tolerance <= 10:
+                raise ValueError(f"plant: tolerance of {key} must be between 0 and 10; got {tolerance}")
         names = [effect.name for effect in self.effects]
         for name in names:
             if names.count(name) > 1:

@@ -21,14 +21,21 @@ class ResidualModel:
         self.case = case
         self.nominal = NominalParameters(case.machine)
         self.simulations = 0
+        self.scale = case.machine.weighing.scale
 
     def of(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
     ) -> Real:
-        """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs."""
+        """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs.
+
+        Over `scale`, so that stated values and records weigh what they should beside a model error.
+        """
         experiments = self.case.estimation if experiments is None else experiments
         machine = self.nominal.at(deviations)
-        return np.concatenate([self._one(machine, effects, experiment).ravel() for experiment in experiments])
+        whole = np.concatenate(
+            [self._one(machine, effects, experiment).ravel() for experiment in experiments]
+        )
+        return whole if self.scale == 1.0 else whole / self.scale
 
     def by_experiment(self, deviations: Real, effects: Sequence[Any]) -> dict[str, Real]:
         """Residuals (T, Y) of every experiment."""
