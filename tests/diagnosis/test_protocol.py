@@ -1,0 +1,212 @@
+"""A machine that is no flexible link goes through the same diagnosis, by the protocol alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
+from diagnosis.fit import Fit
+from diagnosis.machine_protocol import Weighing
+from diagnosis.model_error import at_its_own_level, correlation_length, log_evidence_with_model_error
+from examples import own_plant
+from plant import simulate
+from tests.diagnosis.synthetic_residuals import RIG, made, white
+
+NOISE_M = 1e-3
+
+
+def _force(k, n=400):
+    return (3.0 + k) * np.random.default_rng([7, k]).choice([-1.0, 1.0], n // 20).repeat(20)
+
+
+def _integrated(force, acceleration):
+    """Position of a carriage by an adaptive integrator, sample by sample: not the solver on trial."""
+    state, position = np.zeros(2), []
+    for k, f in enumerate(force):
+        position.append(state[0])
+        t = k * own_plant.DT_S
+        run = solve_ivp(
+            lambda t, s, f=f: (s[1], acceleration(t, s[0], s[1], f)),
+            (t, t + own_plant.DT_S),
+            state,
+            method="DOP853",
+            rtol=1e-9,
+            atol=1e-12,
+        )
+        state = run.y[:, -1]
+    return np.array(position)
+
+
+def _case(acceleration, **changes):
+    experiments = []
+    for k, role in enumerate(("estimation", "estimation", "held_out")):
+        noise = NOISE_M * np.random.default_rng([8, k]).standard_normal(400)
+        output = _integrated(_force(k), acceleration) + noise
+        experiments.append(PlantExperiment(f"{k}", role, _force(k)[:, None], output[:, None]))
+    plant = Plant(
+        own_plant.simulate,
+        own_plant.STATED,
+        own_plant.TOLERANCES,
+        ("position_m",),
+        np.array([NOISE_M]),
+        own_plant.EFFECTS,
+        **changes,
+    )
+    return PlantCase("carriage", plant, tuple(experiments))
+
+
+def test_stiffening_spring_is_found_and_sized():
+    found = diagnose(_case(lambda t, x, v, f: (f - 78.0 * x - 4e3 * x**3 - 3.2 * v) / 2.03))
+    assert found.combination == ("stiffening",)
+    assert found.verdict == "effect"
+    assert found.probabilities["stiffening"] > 0.9
+    assert sum(found.probabilities.values()) == pytest.approx(1)
+    low, high = found.effects[0].intervals["cubic_N_m3"]
+    # Half the distance between interval and value more than the interval: one seed, and a mass known to 2 %.
+    assert low - (high - low) / 2 < 4e3 < high + (high - low) / 2
+    # Held-out residuals at the floor within four standard errors of 400 samples.
+    assert found.gap_after < 1 + 4 / np.sqrt(800)
+    assert found.gap_before > found.gap_refit > 2
+    assert found.gap_closed > 0.95
+    assert found.repair[0].to_dict()["name"] == "stiffening"
+    assert found.rig.parameters["mass_kg"] == pytest.approx(2.03, rel=0.02)
+
+
+def test_a_plant_as_stated_is_no_alarm():
+    found = diagnose(_case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v) / 2.0))
+    assert (found.verdict, found.combination) == ("none", ())
+
+
+def test_what_no_listed_effect_describes_is_unknown():
+    found = diagnose(_case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 2 * np.sin(25 * t)) / 2.0))
+    assert found.verdict == "unknown"
+
+
+def test_a_stated_model_error_is_no_unknown_cause():
+    # The same tone, small beside what is stated that the simulation may miss.
+    case = _case(
+        lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 0.1 * np.sin(25 * t)) / 2.0,
+        model_error=10.0,
+        correlation_samples=10.0,
+    )
+    found = diagnose(case)
+    assert (found.verdict, found.combination) == ("none", ())
+
+
+def test_the_example_runs_and_finds_what_it_lacks(capsys):
+    own_plant.main()
+    said = capsys.readouterr().out
+    assert "verdict: effect" in said
+    found = own_plant.run(seed=1)
+    assert set(found.combination) == {"dry_friction", "constant_force"}
+    by_name = {effect.name: effect.parameters for effect in found.effects}
+    # Same equations on both sides: 1 % is several of the intervals' widths (0.2 %).
+    assert by_name["dry_friction"]["force_N"] == pytest.approx(0.8, rel=0.01)
+    assert by_name["constant_force"]["force_N"] == pytest.approx(-0.5, rel=0.01)
+
+
+def test_the_flexible_arm_answers_by_the_same_protocol():
+    case = made(white(np.random.default_rng(1)))
+    voltage = case.experiments[0].voltage_V
+    np.testing.assert_array_equal(
+        case.machine.simulate((), case.experiments[0].input), simulate(case.rig, voltage, ()).output
+    )
+    assert case.machine.description is case.rig
+    assert case.machine.weighing == Weighing()
+    assert case.machine.tolerances == RIG.tolerances
+
+
+def test_model_error_makes_the_evidence_of_many_samples_that_of_few():
+    rng = np.random.default_rng(2)
+    better, worse = (size * rng.standard_normal(4000) for size in (5.0, 6.0))
+
+    def weight(e, c):
+        weighing = Weighing(model_error=5.0, correlation_samples=c)
+        scaled = e / weighing.scale
+        cost = float(scaled @ scaled)
+        fit = Fit((), np.zeros(0), (), scaled, np.zeros((e.size, 0)), cost, True, weighing)
+        return np.array(log_evidence_with_model_error(fit))
+
+    many, few = (weight(better, c) - weight(worse, c) for c in (1.0, 100.0))
+    # N log(ratio of sizes) to leading order, the prior of the size aside.
+    assert many[0] == pytest.approx(4000 * np.log(6 / 5), rel=0.1)
+    assert few[0] == pytest.approx(many[0] / 100, rel=0.2)
+
+
+def test_a_fit_is_weighed_at_the_level_that_it_shows():
+    rng = np.random.default_rng(3)
+    weighing = Weighing(model_error=10.0, correlation_samples=4.0)
+    e = 3.0 * rng.standard_normal(20000) / weighing.scale
+    fit = Fit((), np.zeros(0), (), e, np.zeros((e.size, 0)), float(e @ e), True, weighing)
+    # Variance nine per sample, one independent value in four: a mean square of a quarter at its own level.
+    assert at_its_own_level(fit).rms ** 2 == pytest.approx(1 / 4, rel=0.05)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8, 0.97])
+def test_correlation_length_of_an_autoregression(rho):
+    rng = np.random.default_rng(4)
+    e = np.zeros(200_000)
+    for k, w in enumerate(rng.standard_normal(e.size - 1)):
+        e[k + 1] = rho * e[k] + w
+    # (1 + rho)/(1 - rho); the estimate wanders by a few lengths over the root of the samples.
+    assert correlation_length(e) == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
+
+
+GOOD = PlantExperiment("a", "estimation", np.ones((30, 1)), np.arange(30.0)[:, None])
+PLANT = Plant(
+    lambda parameters, effects, inputs: parameters["k"] * inputs,
+    {"k": 2.0},
+    {"k": 0.1},
+    ("y",),
+    np.array([0.1]),
+    (PlantEffect("offset", (EffectParameter("y", 0.1, 1.0),), signed=True),),
+)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: replace(GOOD, input=np.ones(30)), r"input must be \(T, channels\)"),
+        (lambda: replace(GOOD, input=np.ones((31, 1))), "31 samples of input, 30 of output"),
+        (lambda: replace(GOOD, role="test"), "role must be"),
+        (lambda: replace(GOOD, output=np.full((30, 1), np.nan)), "not finite"),
+        (lambda: PlantExperiment("s", "held_out", np.ones((9, 1)), np.ones((9, 1))), "needs at least 20"),
+        (lambda: replace(PLANT, noise=np.array([0.0])), "one noise level above zero per output"),
+        (lambda: replace(PLANT, tolerances={"m": 0.1}), "tolerance of m, which is no parameter"),
+        (lambda: replace(PLANT, tolerances={"k": 0.0}), "must be between 0 and 10"),
+        (lambda: replace(PLANT, effects=()), "lists no effect"),
+        (lambda: replace(PLANT, effects=PLANT.effects * 2), "listed twice"),
+        (lambda: replace(PLANT, model_error=-1.0), "model_error"),
+        (lambda: replace(PLANT, correlation_samples=0.5), "correlation_samples"),
+        (lambda: EffectParameter("y", 2.0, 1.0), "low < high"),
+        (lambda: EffectParameter("y", 0.0, 1.0), "above zero on a log scale"),
+        (lambda: EffectParameter("y", 1.0, 2.0, (3.0,)), "start 3 is outside 1 to 2"),
+        (lambda: PlantEffect("e", ()), "at least one parameter"),
+        (lambda: PlantEffect("unknown", PLANT.effects[0].parameters), "an answer of its own"),
+        (lambda: PlantEffect("e", PLANT.effects[0].parameters, dependence="wild"), "dependence"),
+        (lambda: PlantCase("c", PLANT, (GOOD,)), "no experiment has the role held_out"),
+        (lambda: PlantCase("c", PLANT, (GOOD, GOOD)), "given twice"),
+        (
+            lambda: PlantCase(
+                "c", PLANT, (GOOD, replace(GOOD, name="b", role="held_out", output=GOOD.input))
+            ),
+            "is the sensor dead",
+        ),
+        (
+            lambda: PlantCase(
+                "c",
+                replace(PLANT, simulation=lambda p, e, u: u[:-1]),
+                (GOOD, replace(GOOD, name="b", role="held_out")),
+            ),
+            r"must give finite outputs \(30, 1\)",
+        ),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(make, message):
+    with pytest.raises(ValueError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)
