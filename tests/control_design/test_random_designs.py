@@ -14,7 +14,7 @@ from benchmarks.random_designs import (
     state_space,
     unstable_samples,
 )
-from control_design import Controller, Specification, certify, synthesise
+from control_design import Controller, Outcome, Specification, certify, synthesise
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -57,3 +57,15 @@ def test_returned_designs_are_proved_and_their_sampled_plants_stable(seed):
     assert certificate.plants[0].all_frequencies.proved
     assert certificate.gamma <= certificate.gamma_bound <= 1.005 * certificate.gamma
     assert unstable_samples(result.controller, posterior, np.random.default_rng(seed)) == 0
+
+
+@pytest.mark.slow
+def test_a_case_without_a_design_is_not_handed_out_as_one():
+    """Seed 149: nothing robust was found; a loop on the edge of stability must not pass for a design."""
+    plant, _, specification = random_case(149)
+    result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(149))
+    if result.outcome is Outcome.NOT_CONVERGED:
+        assert result.blocking[0].plant == plant.name
+        assert "rad/s blocks" in result.explain()
+    else:
+        assert certify(result.controller, [plant], specification).plants[0].all_frequencies.proved
