@@ -91,10 +91,13 @@ def draw_rig(rng: np.random.Generator) -> Rig:
 
 
 def draw_tolerances(rng: np.random.Generator) -> dict[str, float]:
-    """Half of the makers state the usual tolerances, the others their own: 0.6 to 1.6 times as large."""
+    """Half of the makers state the usual tolerances, the others their own: 0.6 to 1.6 times as large.
+
+    None beyond 30 %: two tolerances then still leave 40 % of the value.
+    """
     if rng.random() < 0.5:
         return dict(TOLERANCES)
-    return {key: round(value * rng.uniform(0.6, 1.6), 3) for key, value in TOLERANCES.items()}
+    return {key: round(min(value * rng.uniform(0.6, 1.6), 0.3), 3) for key, value in TOLERANCES.items()}
 
 
 def stated(rig: RigTable, tolerances: dict[str, float], rng: np.random.Generator) -> Rig:
