@@ -2,10 +2,16 @@
 
 from diagnosis.case import Case, Experiment
 from diagnosis.diagnosis import Diagnosis, NamedEffect, diagnose
+from diagnosis.discrimination import Rival
+from diagnosis.experiment_choices import Limits
 from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
+from diagnosis.next_experiment import NextExperiment, next_experiment
 from diagnosis.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.residual import ResidualModel, pooled_rms
+from diagnosis.rivals import rivals_of
 from diagnosis.search import Search, search
+from diagnosis.where import subsystem_mass, where
+from diagnosis.where_records import Where
 
 __all__ = [
     "Case",
@@ -13,16 +19,24 @@ __all__ = [
     "EffectParameter",
     "Experiment",
     "Hypothesis",
+    "Limits",
     "NamedEffect",
+    "NextExperiment",
     "Plant",
     "PlantCase",
     "PlantEffect",
     "PlantExperiment",
     "Probabilities",
     "ResidualModel",
+    "Rival",
     "Search",
+    "Where",
     "diagnose",
+    "next_experiment",
     "pooled_rms",
     "probabilities",
+    "rivals_of",
     "search",
+    "subsystem_mass",
+    "where",
 ]

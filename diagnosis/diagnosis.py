@@ -9,11 +9,14 @@ from typing import Any, Literal
 import numpy as np
 
 from diagnosis.candidates import Candidate
+from diagnosis.case import Case
+from diagnosis.discrimination import Rival
 from diagnosis.fit import Fit, fit
 from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
 from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.model_error import at_its_own_level
 from diagnosis.residual import ResidualModel, pooled_rms
+from diagnosis.rivals import rivals_of
 from diagnosis.search import Progress, search
 
 Verdict = Literal["none", "effect", "unknown"]
@@ -87,6 +90,9 @@ class Diagnosis:
         Whitened, every experiment; (T, Y) in the machine's order of outputs.
     simulations : int
         Number of simulated records.
+    rivals : tuple of Rival
+        Fitted explanations that contradict each other, most probable first, for `next_experiment`; only for a
+        flexible link.
     """
 
     case: Any
@@ -110,6 +116,7 @@ class Diagnosis:
     residuals_refit: dict[str, Real]
     residuals_after: dict[str, Real]
     simulations: int
+    rivals: tuple[Rival, ...] = ()
 
 
 def diagnose(
@@ -168,6 +175,7 @@ def diagnose(
         residuals_refit=refit,
         residuals_after=after,
         simulations=found.simulations + model.simulations,
+        rivals=rivals_of(case, found.hypotheses, weighed.sets) if isinstance(case, Case) else (),
     )
 
 

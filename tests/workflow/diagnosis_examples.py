@@ -12,8 +12,10 @@ import numpy as np
 
 from diagnosis.case import Case
 from diagnosis.diagnosis import Diagnosis, NamedEffect
+from diagnosis.discrimination import Rival
 from diagnosis.residual import ResidualModel, pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
+from plant.effects import Effect
 from plant.presets import paper_link
 from workflow.diagnose.outputs import Engine
 
@@ -139,4 +141,9 @@ class KnownAnswer(Engine):
             residuals_refit=before,
             residuals_after=after,
             simulations=model.simulations,
+            rivals=self._rivals(case, effects, sure),
         )
+
+    def _rivals(self, case: Case, effects: tuple[Effect, ...], sure: float) -> tuple[Rival, ...]:
+        other = parse_effects([{"name": "viscous_friction", "coefficient_Nms": 2e-3}])
+        return (Rival(sure, case.rig, effects), Rival(1 - sure, case.rig, other))

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
+from diagnosis.discrimination import Rival
 from diagnosis.experiment_choices import Limits
-from diagnosis.next_experiment import NextExperiment, Rival, next_experiment
-from plant.effects import EFFECTS, Effect
+from diagnosis.next_experiment import NextExperiment, next_experiment
 from plant.simulate import simulate
 from workflow.diagnose.words import effect_words, probability_words
 from workflow.report.words import listing
 
-# Sets of effects at least this probable are rivals; below the second limit not even a runner-up is one.
-_RIVAL, _RUNNER_UP = 0.01, 1e-4
-_MOST_RIVALS = 3
+# Below this probability not even a runner-up is a rival.
+_THINKABLE = 1e-4
 _SHORTEST = 200  # samples
 
 
@@ -64,7 +63,7 @@ def following(found: Diagnosis) -> Following:
                 "the residual follows then says where to look.",
             )
         )
-    rivals = rivals_of(found)
+    rivals = _left(found)
     if len(rivals) < 2:
         return Following(("No further experiment is needed: every other answer is ruled out.",))
     names = listing([f"{rival.name} ({probability_words(rival.probability)})" for rival in rivals])
@@ -73,30 +72,13 @@ def following(found: Diagnosis) -> Following:
     return Following((f"Still possible: {names}.", proposal.sentence), proposal, rivals)
 
 
-def rivals_of(found: Diagnosis) -> tuple[Rival, ...]:
-    """The likeliest sets of effects, the answer among them; never fewer than two where a second one is
-    thinkable.
-
-    An effect has its parameters from the most probable set that holds it, and all rivals stand on the
-    repaired rig: what else its values could be is among the free parameters that an experiment has to see
-    through.
-    """
-    parameters = {effect.name: effect.parameters for effect in found.effects}
-    ranked = sorted(found.sets.items(), key=lambda item: -item[1])
-    known = [
-        (names, p)
-        for names, p in ranked
-        if names != ("unknown",) and all(parameters.get(name) for name in names) and p >= _RUNNER_UP
-    ]
-    chosen = [item for k, item in enumerate(known) if k < 2 or item[1] >= _RIVAL][:_MOST_RIVALS]
+def _left(found: Diagnosis) -> tuple[Rival, ...]:
+    """The rivals by name; a second one only where it is thinkable at all."""
     return tuple(
-        Rival(p, found.rig, tuple(_effect(name, parameters[name]) for name in names), name=_words(names))
-        for names, p in chosen
+        replace(rival, name=_words(tuple(type(effect).id for effect in rival.effects)))
+        for k, rival in enumerate(found.rivals)
+        if k == 0 or rival.probability >= _THINKABLE
     )
-
-
-def _effect(name: str, values: dict[str, float]) -> Effect:
-    return EFFECTS[name](**values)
 
 
 def _words(names: tuple[str, ...]) -> str:
