@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -181,3 +182,33 @@ def test_bad_effects_are_refused_in_one_line():
         Truth(RIG, [{"name": "gremlins"}])
     with pytest.raises(ValueError, match="given twice"):
         Truth(RIG, [{"name": "gravity", "acceleration_m_s2": 1.0}] * 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "none",
+        "gravity",
+        "input_delay",
+        "joint_compliance",
+        "periodic_disturbance",
+        "coulomb_friction_and_tip_payload",
+    ],
+)
+def test_recorded_cases_are_explained_to_the_noise(gap_cases, name):
+    # Records of a third rig, by others: driven by the logged voltage, slew under control included.
+    folder = gap_cases / "labelled" / name
+    rig = tomllib.loads((folder / "rig.toml").read_text())
+    answer = tomllib.loads((folder / "answer.toml").read_text())
+    machine = Truth(rig, [{"name": e["name"], **e["parameters"]} for e in answer.get("effects", [])])
+    for role in ("estimation", "held_out"):
+        left = []
+        for entry in tomllib.loads((folder / "case.toml").read_text())["experiments"]:
+            if entry["role"] == role:
+                data = np.loadtxt(folder / entry["file"], delimiter=",", skiprows=1)
+                clean = machine.record(data[:, 1]).measured(np.zeros((len(data), 2)))
+                left.append(((data[:, 2:] - clean) / machine.noise).ravel())
+        rms = np.sqrt(np.mean(np.concatenate(left) ** 2))
+        # Measured: equal to what the case's own answer states to four digits.
+        assert rms == pytest.approx(answer["pooled_gap"][f"{role}_gap_after_oracle"], rel=2e-3)
