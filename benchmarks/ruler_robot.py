@@ -1,0 +1,211 @@
+"""The single-link robot of R. Krauss (SLFR, 2009) as a plant of one's own: hub, motor and two strip modes.
+
+    theta'' + sum_i b_i eta_i'' = gain v - damping theta'
+    eta_i'' + 2 zeta_i w_i eta_i' + w_i^2 eta_i = -b_i theta''
+
+in counts, with the feedback v = u - theta of the record. No physical nominal exists (volts per count are not
+published), so the stated values are a fit at one amplitude of the swept sine: what the other amplitude shows
+beyond it is not linear. Theta alone: the accelerometer's scale is not published either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.linalg import expm
+from scipy.optimize import least_squares
+
+from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
+
+Real = npt.NDArray[np.float64]
+
+DT_S, SUBSTEPS = 0.002, 1
+# A spring that pushes away makes the arm unstable: such a fit has to end somewhere finite.
+RUNAWAY_COUNTS = 1e4
+COUNTS_PER_RAD = 1024 / (2 * np.pi)
+MODEL_ERROR = 0.1
+# Mode frequencies and first damping from the free decays with the hub held; the rest only starts the fit.
+GUESS = {
+    "gain_1_s2": 300.0,
+    "damping_1_s": 20.0,
+    "first_mode_rad_s": 2 * np.pi * 2.52,
+    "first_damping": 0.007,
+    "first_share": 0.3,
+    "second_mode_rad_s": 2 * np.pi * 17.96,
+    "second_damping": 0.01,
+    "second_share": 0.2,
+}
+
+
+def effects() -> tuple[PlantEffect, ...]:
+    P = EffectParameter
+    dry = P("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear"), P("velocity_counts_s", 1.0, 1000.0)
+    return (
+        PlantEffect("coulomb_friction", (P("drive_counts", 0.01, 40.0),), dependence="continuous"),
+        PlantEffect("stribeck_friction", (P("static_counts", 0.01, 60.0), *dry), dependence="continuous"),
+        PlantEffect("drive_offset", (P("drive_counts", 0.01, 40.0),), signed=True, dependence="continuous"),
+        PlantEffect("angle_offset", (P("counts", 0.01, 40.0),), signed=True),
+        PlantEffect("input_delay", (P("delay_s", 1e-4, 0.03),)),
+        PlantEffect("actuator_lag", (P("time_constant_s", 1e-4, 0.1),)),
+        PlantEffect("actuator_dead_zone", (P("width_counts", 0.01, 40.0),), dependence="continuous"),
+        PlantEffect(
+            "actuator_saturation", (P("limit_counts", 10.0, 200.0),), grows=False, dependence="continuous"
+        ),
+        PlantEffect("quadratic_friction", (P("per_count", 1e-6, 0.1),), signed=True),
+        PlantEffect("hardening_spring", (P("cubic", 1e-6, 1.0),), signed=True),
+    )
+
+
+def simulate(
+    parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
+) -> Real:
+    """Reference (T, 1) -> theta (T, 1), both in counts, from rest."""
+
+    def value(effect: str, parameter: str, without: float = 0.0) -> float:
+        return float(effects[effect][parameter]) if effect in effects else without
+
+    static = value("stribeck_friction", "static_counts")
+    coulomb = value("coulomb_friction", "drive_counts")
+    A, B = state_space(parameters)
+    held = expm(np.block([[A, B], [np.zeros((1, 7))]]) * (DT_S / SUBSTEPS))
+    theta = _run(
+        np.ascontiguousarray(inputs[:, 0]),
+        np.ascontiguousarray(held[:6, :6]),
+        np.ascontiguousarray(held[:6, 6]),
+        coulomb + static * value("stribeck_friction", "coulomb_share"),
+        coulomb + static,
+        value("stribeck_friction", "velocity_counts_s", 1.0),
+        value("drive_offset", "drive_counts"),
+        value("angle_offset", "counts"),
+        value("input_delay", "delay_s"),
+        value("actuator_lag", "time_constant_s"),
+        value("actuator_dead_zone", "width_counts"),
+        value("actuator_saturation", "limit_counts", np.inf),
+        value("quadratic_friction", "per_count"),
+        value("hardening_spring", "cubic"),
+    )
+    return np.asarray(theta[:, None])
+
+
+def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
+    """A (6, 6) and B (6, 1) of [theta, eta_1, eta_2, and their speeds], drive in counts."""
+    b = np.array([p["first_share"], p["second_share"]])
+    w = np.array([p["first_mode_rad_s"], p["second_mode_rad_s"]])
+    zeta = np.array([p["first_damping"], p["second_damping"]])
+    mass = np.eye(3)
+    mass[0, 1:] = mass[1:, 0] = b
+    inverse = np.linalg.inv(mass)
+    stiffness = np.diag([0.0, *w**2])
+    damping = np.diag([p["damping_1_s"], *(2 * zeta * w)])
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-inverse @ stiffness, -inverse @ damping]])
+    return A, np.concatenate([np.zeros(3), p["gain_1_s2"] * inverse[:, 0]])[:, None]
+
+
+@njit  # type: ignore[misc]
+def _run(
+    reference: Real,
+    A: Real,
+    B: Real,
+    coulomb: float,
+    static: float,
+    stribeck_velocity: float,
+    offset: float,
+    angle_offset: float,
+    delay: float,
+    lag: float,
+    dead_zone: float,
+    limit: float,
+    quadratic: float,
+    cubic: float,
+) -> Real:
+    """Dry friction as the drive that it takes off, so that the hub truly sticks."""
+    T = reference.size
+    h = DT_S / SUBSTEPS
+    theta, command = np.zeros(T), np.zeros(T)
+    x, y = np.zeros(6), np.zeros(6)
+    whole = int(delay / DT_S)
+    part = delay / DT_S - whole
+    pull = 0.0
+    for k in range(T):
+        theta[k] = x[0] + angle_offset
+        command[k] = min(max(reference[k] - theta[k], -limit), limit)
+        late = (1 - part) * command[max(k - whole, 0)] + part * command[max(k - whole - 1, 0)]
+        late = np.sign(late) * max(abs(late) - dead_zone, 0.0)
+        for _ in range(SUBSTEPS):
+            pull = late if lag <= 0.0 else late + (pull - late) * np.exp(-h / lag)
+            drive = pull + offset - quadratic * x[3] * abs(x[3]) * 1e-2 - cubic * (x[0] / 10) ** 3
+            free = B[3] * drive
+            for c in range(6):
+                free += A[3, c] * x[c]
+            level = coulomb + (static - coulomb) * np.exp(-abs(x[3]) / stribeck_velocity)
+            drive -= min(max(free / B[3], -level), level)
+            for r in range(6):
+                y[r] = B[r] * drive
+                for c in range(6):
+                    y[r] += A[r, c] * x[c]
+            x[:] = y
+        if not abs(x[0]) < RUNAWAY_COUNTS:
+            theta[k:] = RUNAWAY_COUNTS
+            break
+    return theta
+
+
+def record(folder: Path, amplitude: int, repeat: int) -> Real:
+    """(T, 2): reference and theta in counts."""
+    path = folder / "slfr_krauss_2009" / f"swept_sine_amp{amplitude}_rep{repeat}.csv"
+    return np.asarray(np.loadtxt(path, delimiter=",", skiprows=1, usecols=(1, 3)) * COUNTS_PER_RAD)
+
+
+def linear_fit(data: Real) -> dict[str, float]:
+    """Least squares of the linear plant on one record, logarithms of all values free."""
+    start = np.log(list(GUESS.values()))
+
+    def residual(logs: Real) -> Real:
+        parameters = dict(zip(GUESS, np.exp(np.clip(logs, start - 4, start + 4)), strict=True))
+        error = simulate(parameters, {}, data[:, :1])[:, 0] - data[:, 1]
+        return np.asarray(np.nan_to_num(error, nan=1e3, posinf=1e3, neginf=-1e3).clip(-1e3, 1e3))
+
+    found = least_squares(residual, start, x_scale=0.1, max_nfev=80)
+    return dict(zip(GUESS, map(float, np.exp(found.x)), strict=True))
+
+
+def case(
+    folder: Path,
+    fitted: tuple[int, ...] = (50, 75),
+    judged: tuple[int, ...] = (50, 75),
+    *,
+    model_error: float = MODEL_ERROR,
+    correlation_samples: float = 1.0,
+) -> PlantCase:
+    """Stated: linear fit of the third repeat at amplitude 50. Fitted: first repeats. Judged: second repeats.
+
+    Noise is the scatter between repeats, of which there are three at each amplitude.
+    """
+    repeats = {amplitude: [record(folder, amplitude, r) for r in (1, 2, 3)] for amplitude in (50, 75)}
+    variances = [np.var([r[:, 1] for r in three], axis=0, ddof=1) for three in repeats.values()]
+    noise = float(np.sqrt(np.mean(variances)))
+    level = float(np.std(np.concatenate([repeats[a][0][:, 1] for a in fitted])))
+    stated = linear_fit(repeats[50][2])
+    plant = Plant(
+        simulate,
+        stated,
+        dict.fromkeys(stated, 0.1),
+        ("theta_counts",),
+        np.array([noise]),
+        effects(),
+        model_error=model_error * level / noise,
+        correlation_samples=correlation_samples,
+    )
+    experiments = [
+        PlantExperiment(f"amplitude {a}, repeat 1", "estimation", repeats[a][0][:, :1], repeats[a][0][:, 1:])
+        for a in fitted
+    ]
+    experiments += [
+        PlantExperiment(f"amplitude {a}, repeat 2", "held_out", repeats[a][1][:, :1], repeats[a][1][:, 1:])
+        for a in judged
+    ]
+    return PlantCase("SLFR, swept sines", plant, tuple(experiments))
