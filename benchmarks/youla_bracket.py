@@ -16,7 +16,11 @@ from control_design.example_plants import flexible_link, flexible_link_specifica
 from control_design.youla import BracketProblem, YoulaOptions, youla_bracket
 
 PUBLISHED = {"A": (0.912, 0.931, 0.945), "B": (0.916, 1.065, 1.205), "C": (0.916, 1.268, 1.705)}
-OURS_BY_ORDER = {"A": (0.9368, 0.9307), "B": (1.0851, 1.0819), "C": (1.3346, 1.2771)}
+OURS_BY_ORDER = {
+    "A": (0.9369, 0.9308),
+    "B": (1.0850, 1.0818),
+    "C": (1.3346, 1.2872),
+}  # benchmarks.ellipse_link
 
 
 def main() -> None:
