@@ -185,6 +185,16 @@ def _run(
     return out
 
 
+def standing(folder: Path, stage: int) -> Real:
+    """Mean commanded current [A] of every 0.3 s in which the joint stands within 0.1 mrad, (W,)."""
+    data = np.loadtxt(folder / "quanser_2dsfl" / "lqr_run.csv", delimiter=",", skiprows=1)
+    at, n = 1 if stage == 1 else 6, 150
+    theta = np.lib.stride_tricks.sliding_window_view(data[:, at + 3], n)[::n]
+    current = np.lib.stride_tricks.sliding_window_view(data[:, at], n)[::n].mean(axis=1)
+    still = np.ptp(theta, axis=1) < 1e-4
+    return np.asarray(current[still])
+
+
 def case(
     folder: Path, stage: int, *, model_error: float = MODEL_ERROR, correlation_samples: float = 1.0
 ) -> PlantCase:
