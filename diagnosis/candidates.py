@@ -169,7 +169,7 @@ def _speed(angle_rad: Real, samples: int = 10) -> float:
 
 
 def candidates(case: Case) -> tuple[Candidate, ...]:
-    """Every effect of the registry; signed ones twice, above and below."""
+    """Every effect of the registry but quantisation (see `diagnosis.lattice`); signed ones twice."""
     s = Scales.of(case)
     tau, k, J = s.torque_Nm, s.link_stiffness_Nm_rad, s.hub_inertia_kg_m2
     found = [
@@ -266,11 +266,6 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
             "sensor_lag",
             [_log("time_constant_s", 2e-4 * s.dt_s, 200 * s.dt_s)],
             [_geom(0.02 * s.dt_s, 40 * s.dt_s, 10)],
-        ),
-        _grid(
-            "quantisation",
-            [_log("step_m", 0.3 * s.tip_noise_m, 100 * s.tip_noise_m, 1e-3)],
-            [_geom(0.5 * s.tip_noise_m, 30 * s.tip_noise_m, 24)],
         ),
     ]
     for sign in (1, -1):

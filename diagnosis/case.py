@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from diagnosis.flexible_arm import FlexibleArm
+from diagnosis.lattice import lattice_step
 from plant.rig import Rig
 
 Real = npt.NDArray[np.float64]
@@ -104,6 +106,16 @@ class Case:
     def noise(self) -> Real:
         """(2,) noise standard deviations of hub_angle_rad and tip_m."""
         return self.machine.noise
+
+    @cached_property
+    def steps(self) -> Real:
+        """(2,) steps of the lattice that all records of an output lie on, 0 where they lie on none."""
+        return np.array(
+            [
+                lattice_step([e.output[:, k] for e in self.experiments], float(sigma))
+                for k, sigma in enumerate(self.noise)
+            ]
+        )
 
     @property
     def machine(self) -> FlexibleArm:

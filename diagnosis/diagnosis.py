@@ -17,6 +17,7 @@ from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.model_error import at_its_own_level
 from diagnosis.residual import ResidualModel, pooled_rms
 from diagnosis.rivals import rivals_of
+from diagnosis.rounding import Rounding, leads_over, rounding_effect
 from diagnosis.search import Progress, search
 
 Verdict = Literal["none", "effect", "unknown"]
@@ -79,8 +80,8 @@ class Diagnosis:
         Pooled RMS of (measured - model)/noise over the held-out experiments: rig as stated, stated values
         moved within their tolerances, accepted effects added.
     gap_closed, gap_closed_interval : float, (low, high)
-        1 - (R_after - 1)/(R_refit - 1) with R the held-out mean squares (design 6.2) and its 95 % bootstrap
-        interval over blocks of samples; nan without a gap to close.
+        1 - (R_after - F)/(R_refit - F) with R, F the held-out mean squares and the noise floor's (design 6.2)
+        and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
     deviations : key -> tolerances
         How far the stated values are off, with the accepted effects in the model.
     rig, repair
@@ -143,34 +144,40 @@ def diagnose(
     found = search(case, progress)
     model = ResidualModel(case)
     weighed = probabilities(found.hypotheses, temperature=temperature)
-    answer = weighed.answer
-    verdict: Verdict = "none" if answer == "none" else "unknown" if answer == "unknown" else "effect"
-    accepted = _accepted(found.hypotheses, answer)
+    accepted = _accepted(found.hypotheses, weighed.answer)
     last = _polished(model, accepted.fit)
     before = model.by_experiment(np.zeros(model.nominal.count), ())
     refit = model.by_experiment(found.base.deviations, ())
     after = model.by_experiment(last.deviations, last.effects)
+    rounding = rounding_effect(case)
+    if rounding is not None:
+        leads = leads_over(case, rounding, refit, after)
+        weighed = weighed.beside(rounding.name, leads=leads)
+    floor = NOISE_FLOOR if rounding is None else rounding.floor
+    answer = weighed.answer
+    verdict: Verdict = "none" if answer == "none" else "unknown" if answer == "unknown" else "effect"
+    together = accepted.names if rounding is None else rounding.joined(accepted.names, leads=leads)
     gap_before, gap_refit, gap_after = (_held_out(case, r) for r in (before, refit, after))
-    closed, interval = _closed(case, refit, after, rng)
-    ambiguous_with = _rivals(weighed, found.hypotheses, accepted, answer)
+    closed, interval = _closed(case, refit, after, rng, floor)
+    ambiguous_with = _rivals(weighed, found.hypotheses, accepted, together, answer)
     return Diagnosis(
         case=case,
         verdict=verdict,
         detail_verdict=_detail(verdict, weighed, ambiguous_with, last),
         probabilities=weighed.cause,
         sets=weighed.sets,
-        effects=_named(model, found.hypotheses, weighed, accepted, last, rng),
-        combination=accepted.names if verdict == "effect" else (),
+        effects=_named(model, found.hypotheses, weighed, together, last, rounding, rng),
+        combination=together if verdict == "effect" else (),
         ambiguous_with=ambiguous_with,
         gap_before=gap_before,
         gap_refit=gap_refit,
         gap_after=gap_after,
-        noise_floor=NOISE_FLOOR,
+        noise_floor=floor,
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(model.nominal.keys, map(float, last.deviations), strict=True)),
         rig=model.nominal.at(last.deviations).description,
-        repair=last.effects,
+        repair=last.effects if rounding is None else (*last.effects, rounding.effect),
         residuals_before=before,
         residuals_refit=refit,
         residuals_after=after,
@@ -204,21 +211,25 @@ def _detail(verdict: Verdict, weighed: Probabilities, rivals: Sequence[str], las
 
 
 def _rivals(
-    weighed: Probabilities, hypotheses: Sequence[Hypothesis], accepted: Hypothesis, answer: str
+    weighed: Probabilities,
+    hypotheses: Sequence[Hypothesis],
+    accepted: Hypothesis,
+    together: Sequence[str],
+    answer: str,
 ) -> tuple[str, ...]:
     """Other answers that keep more than a few per cent, most probable first, then effects that fit as well.
 
     An effect that contains the accepted one (Stribeck friction beside Coulomb's) is improbable for its
     needless parameters, yet the records do not rule it out.
     """
-    share = {name: p for name, p in weighed.presence.items() if name not in accepted.names}
+    share = {name: p for name, p in weighed.presence.items() if name not in together}
     share |= {name: weighed.cause[name] for name in ("none", "unknown")}
     share.pop(answer, None)
     likely = [name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _RIVAL]
-    if accepted.names and answer not in ("none", "unknown"):
+    if accepted.names and answer != "unknown":
         for h in sorted(hypotheses, key=lambda h: h.fit.cost):
             if len(h.names) == len(accepted.names) and h.fit.cost <= accepted.fit.cost + _AS_GOOD:
-                likely += [name for name in h.names if name not in (*accepted.names, *likely)]
+                likely += [name for name in h.names if name not in (*together, *likely)]
     return tuple(likely)
 
 
@@ -226,8 +237,9 @@ def _named(
     model: ResidualModel,
     hypotheses: Sequence[Hypothesis],
     weighed: Probabilities,
-    accepted: Hypothesis,
+    together: Sequence[str],
     last: Fit,
+    rounding: Rounding | None,
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
     entries = []
@@ -241,13 +253,15 @@ def _named(
             k = end.names.index(name)
             parameters = end.candidates[k].parameters(end.coordinates[k])
             intervals = _intervals(end, k, rng)
-            held_out = model.of(end.deviations, end.effects, model.case.held_out)
-            gap = pooled_rms(held_out) * model.scale
+            gap = pooled_rms(model.whitened(end.deviations, end.effects, model.case.held_out))
+        elif rounding is not None and name == rounding.name:
+            parameters, intervals = rounding.effect.parameters(), rounding.intervals
+            gap = pooled_rms(model.whitened(last.deviations, last.effects, model.case.held_out))
         entries.append(
             NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
         )
     answer = weighed.answer
-    order = {name: k for k, name in enumerate(accepted.names)}
+    order = {name: k for k, name in enumerate(together)}
     entries.sort(key=lambda e: (order.get(e.name, len(order)), -e.presence, -e.probability))
     others = [
         NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
@@ -291,7 +305,11 @@ def _held_out(case: CaseOfMachine, residuals: dict[str, Real]) -> float:
 
 
 def _closed(
-    case: CaseOfMachine, before: dict[str, Real], after: dict[str, Real], rng: np.random.Generator
+    case: CaseOfMachine,
+    before: dict[str, Real],
+    after: dict[str, Real],
+    rng: np.random.Generator,
+    floor: float,
 ) -> tuple[float, tuple[float, float]]:
     """Share of the explainable held-out energy that is gone, with a block bootstrap."""
     pairs = []
@@ -305,14 +323,14 @@ def _closed(
     drawn = sums[rng.integers(0, len(sums), (_BLOCKS, len(sums)))].sum(axis=1)
 
     def share(total: Real) -> Real:
-        explainable = total[..., 0] / total[..., 2] - NOISE_FLOOR**2
-        left = total[..., 1] / total[..., 2] - NOISE_FLOOR**2
+        explainable = total[..., 0] / total[..., 2] - floor**2
+        left = total[..., 1] / total[..., 2] - floor**2
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(explainable > 0, 1 - left / explainable, np.nan))
 
     # A gap that the noise of so many samples could make is none to close.
     count = sums[:, 2].sum()
-    if sums[:, 0].sum() / count - NOISE_FLOOR**2 < 3 * np.sqrt(2 / count):
+    if sums[:, 0].sum() / count - floor**2 < 3 * floor**2 * np.sqrt(2 / count):
         return float("nan"), (float("nan"), float("nan"))
     low, high = np.nanquantile(share(drawn), [0.025, 0.975])
     return float(share(sums.sum(axis=0))), (float(low), float(high))

@@ -100,6 +100,21 @@ class Probabilities:
     sets: dict[tuple[str, ...], float]
     presence: dict[str, float]
 
+    def beside(self, name: str, *, leads: bool) -> Probabilities:
+        """The same answers with one more effect that is certain, in every set but unknown.
+
+        leads: it explains more than whatever else there is.
+        """
+        certain = 1.0 - self.sets[_UNKNOWN]
+        cause = dict(self.cause)
+        if leads:
+            cause = {**dict.fromkeys(cause, 0.0), "unknown": cause["unknown"], name: certain}
+        else:
+            cause[name] += cause["none"]
+            cause["none"] = 0.0
+        sets = {key if key == _UNKNOWN else tuple(sorted((*key, name))): p for key, p in self.sets.items()}
+        return Probabilities(cause, sets, {**self.presence, name: certain})
+
     @property
     def answer(self) -> str:
         """The most probable cause."""

@@ -124,3 +124,7 @@ class CaseOfMachine(Protocol):
 
     @property
     def noise(self) -> Real: ...
+
+    @property
+    def steps(self) -> Real:
+        """(Y,) steps of outputs whose values lie on a lattice, 0 for all others."""

@@ -324,6 +324,11 @@ class PlantCase:
         return self.plant.noise
 
     @property
+    def steps(self) -> Real:
+        """(Y,) zeros: quantisation is an effect of one's own plant like any other."""
+        return np.zeros(len(self.plant.output_names))
+
+    @property
     def estimation(self) -> tuple[PlantExperiment, ...]:
         return tuple(e for e in self.experiments if e.role == "estimation")
 

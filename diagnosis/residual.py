@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from diagnosis.lattice import cell_residual
 from diagnosis.machine_protocol import CaseOfMachine, Machine, Real, RecordOfMachine
 from diagnosis.nominal import NominalParameters
 
@@ -21,6 +22,7 @@ class ResidualModel:
         self.case = case
         self.nominal = NominalParameters(case.machine)
         self.simulations = 0
+        self.steps = case.steps
         self.scale = case.machine.weighing.scale
 
     def of(
@@ -28,19 +30,34 @@ class ResidualModel:
     ) -> Real:
         """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs.
 
-        Over `scale`, so that stated values and records weigh what they should beside a model error.
+        Over `scale`, so that stated values and records weigh what they should beside a model error. Rounded
+        outputs enter by the chance of their cells (`diagnosis.lattice`).
         """
         experiments = self.case.estimation if experiments is None else experiments
         machine = self.nominal.at(deviations)
         whole = np.concatenate(
-            [self._one(machine, effects, experiment).ravel() for experiment in experiments]
+            [self._weighed(machine, effects, experiment).ravel() for experiment in experiments]
         )
         return whole if self.scale == 1.0 else whole / self.scale
+
+    def whitened(
+        self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine]
+    ) -> Real:
+        """(measured - model)/noise (N,) of the given experiments, whatever they weigh in a fit."""
+        machine = self.nominal.at(deviations)
+        return np.concatenate([self._one(machine, effects, e).ravel() for e in experiments])
 
     def by_experiment(self, deviations: Real, effects: Sequence[Any]) -> dict[str, Real]:
         """Residuals (T, Y) of every experiment."""
         machine = self.nominal.at(deviations)
         return {e.name: self._one(machine, effects, e) for e in self.case.experiments}
+
+    def _weighed(self, machine: Machine, effects: Sequence[Any], experiment: RecordOfMachine) -> Real:
+        e = self._one(machine, effects, experiment)
+        for k in np.flatnonzero(self.steps):
+            noise = float(self.case.noise[k])
+            e[:, k] = cell_residual(e[:, k] * noise, np.zeros(len(e)), float(self.steps[k]), noise)
+        return e
 
     def _one(self, machine: Machine, effects: Sequence[Any], experiment: RecordOfMachine) -> Real:
         self.simulations += 1
