@@ -6,7 +6,7 @@ Benchmarks, Eindhoven 2019: force = M a + Fv v + Fc sign(v) + offset with M 95.1
 
 Two simulations. "forces": measured motion in, the force it takes out, as in the report. "loop": the feedback
 closed, reference in, force of the motor out; the law of the record is V = 243.45 (160.18 (q_ref - q) -
-(q[k] - q[k-2])/(2 dt)), which reproduces its voltage from its positions to 4 mV.
+(q[k] - q[k-2])/(2 dt)), which reproduces its voltage from its positions (tests/diagnosis/test_emps.py).
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def simulate(
     return np.asarray(force[_RUN_IN:, None])
 
 
-@njit  # type: ignore[misc]
+@njit
 def _run(
     reference: Real,
     mass: float,

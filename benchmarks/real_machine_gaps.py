@@ -159,6 +159,14 @@ def quanser(out: Print, folder: Path) -> None:
     out("")
     out("Quanser serial flexible link, LQR run: manufacturer's model of each stage in the closed loop;")
     out("first 10 s to fit, the same reference again to judge")
+    for stage in (1, 2):
+        errors = [
+            f"{1e3 * serial_link_stage.law_error(folder, stage, w):.1f} mA at {w}"
+            for w in (50, 100, 150, 200, 500)
+        ]
+        out(
+            f"  stage {stage}, logged command minus control law, by speed filter [rad/s]: {', '.join(errors)}"
+        )
     windows = {1: (150, 1400), 2: (1450, 2650)}
     for stage, window in windows.items():
         found, length = settled(

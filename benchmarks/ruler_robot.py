@@ -55,8 +55,8 @@ def effects() -> tuple[PlantEffect, ...]:
         PlantEffect(
             "actuator_saturation", (P("limit_counts", 10.0, 200.0),), grows=False, dependence="continuous"
         ),
-        PlantEffect("quadratic_friction", (P("per_count", 1e-6, 0.1),), signed=True),
-        PlantEffect("hardening_spring", (P("cubic", 1e-6, 1.0),), signed=True),
+        PlantEffect("quadratic_friction", (P("counts_at_10_counts_s", 1e-6, 0.1),), signed=True),
+        PlantEffect("hardening_spring", (P("counts_at_10_counts", 1e-6, 1.0),), signed=True),
     )
 
 
@@ -85,8 +85,8 @@ def simulate(
         value("actuator_lag", "time_constant_s"),
         value("actuator_dead_zone", "width_counts"),
         value("actuator_saturation", "limit_counts", np.inf),
-        value("quadratic_friction", "per_count"),
-        value("hardening_spring", "cubic"),
+        value("quadratic_friction", "counts_at_10_counts_s"),
+        value("hardening_spring", "counts_at_10_counts"),
     )
     return np.asarray(theta[:, None])
 
@@ -105,7 +105,7 @@ def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
     return A, np.concatenate([np.zeros(3), p["gain_1_s2"] * inverse[:, 0]])[:, None]
 
 
-@njit  # type: ignore[misc]
+@njit
 def _run(
     reference: Real,
     A: Real,
@@ -137,7 +137,7 @@ def _run(
         late = np.sign(late) * max(abs(late) - dead_zone, 0.0)
         for _ in range(SUBSTEPS):
             pull = late if lag <= 0.0 else late + (pull - late) * np.exp(-h / lag)
-            drive = pull + offset - quadratic * x[3] * abs(x[3]) * 1e-2 - cubic * (x[0] / 10) ** 3
+            drive = pull + offset - quadratic * x[3] * abs(x[3]) / 100 - cubic * (x[0] / 10) ** 3
             free = B[3] * drive
             for c in range(6):
                 free += A[3, c] * x[c]

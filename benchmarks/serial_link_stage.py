@@ -1,9 +1,9 @@
 """One stage of the Quanser 2-DOF serial flexible link as a plant of one's own: its manufacturer's model.
 
 State [theta, alpha, d theta/dt, d alpha/dt], tip angle theta + alpha, input current; stages are uncoupled.
-The loop is closed as in the record: i = K (x_ref - x), speeds from a first-order filter of 150 rad/s (the
-regression of the logged current on the logged angles leaves least there), current limited to 0.94 A. The
-reference repeats after 10 s: one pass to fit, one to judge; the scatter between them is the noise.
+The loop is closed as in the record: i = K (x_ref - x), speeds from a first-order filter of 150 rad/s (see
+`law_error`), current limited to 0.94 A. The reference repeats after 10 s: one pass to fit, one to judge; the
+scatter between them is the noise.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 
@@ -129,7 +130,7 @@ def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
     return A, np.array([[0, 0], [0, 0], [drive, 0], [-drive, 1.0]])
 
 
-@njit  # type: ignore[misc]
+@njit
 def _run(
     reference: Real,
     outside: Real,
@@ -183,6 +184,18 @@ def _run(
                     y[r] += A[r, c] * x[c]
             x[:] = y
     return out
+
+
+def law_error(folder: Path, stage: int, filter_rad_s: float) -> float:
+    """RMS [A] of the logged command minus the law with the manufacturer's gains, after the first second."""
+    quanser = folder / "quanser_2dsfl"
+    data = np.loadtxt(quanser / "lqr_run.csv", delimiter=",", skiprows=1)
+    gains = np.loadtxt(quanser / f"nominal_stage{stage}_K.csv", delimiter=",", skiprows=1)
+    command, _, reference, theta, alpha = data[:, 5 * stage - 4 : 5 * stage + 1].T
+    keep = np.exp(-filter_rad_s * DT_S)
+    speeds = [lfilter([1 - keep, keep - 1], [DT_S, -keep * DT_S], x - x[0]) for x in (theta, alpha)]
+    law = gains @ np.array([reference - theta, -alpha, -speeds[0], -speeds[1]])
+    return float(np.sqrt(np.mean((command - law)[500:] ** 2)))
 
 
 def standing(folder: Path, stage: int) -> Real:

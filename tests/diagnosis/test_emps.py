@@ -73,6 +73,15 @@ def test_published_values_reproduce_the_record_in_both_simulations(flexlink_data
     assert error(emps_axis.forces(refit, {}, data[:, 1:4])) == pytest.approx(0.171, abs=0.01)
 
 
+def test_the_control_law_reproduces_the_logged_force(flexlink_data):
+    table = np.loadtxt(flexlink_data / "emps" / "emps_train.csv", delimiter=",", skiprows=1)
+    reference, q, volts = table[2:, 1], table[:, 2], table[2:, 3]
+    speed = (q[2:] - q[:-2]) / (2 * emps_axis.DT_S)
+    law = emps_axis.VELOCITY_GAIN * (emps_axis.POSITION_GAIN * (reference - q[2:]) - speed)
+    # 4 mV of 1.5 V, the digits of the stated gains.
+    assert np.sqrt(np.mean((law - volts) ** 2)) < 6e-3
+
+
 @pytest.mark.parametrize("effect", emps_axis.effects(loop=True, refined=True), ids=lambda e: e.name)
 def test_every_listed_effect_changes_the_simulated_axis_and_vanishes_with_its_size(effect):
     reference = 0.02 * np.sin(2 * np.pi * np.arange(2000) / 1000)[:, None]

@@ -1,0 +1,52 @@
+"""Measured arms as plants of one's own: what stands whatever the details, and what the records show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks import ruler_robot, serial_link_stage
+from diagnosis import diagnose, pooled_rms
+
+
+def test_the_joints_of_the_serial_link_stand_under_currents_of_both_signs(flexlink_data):
+    for stage in (1, 2):
+        current = serial_link_stage.standing(flexlink_data, stage)
+        assert current.min() < -0.02
+        assert current.max() > 0.05
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_stage_model_is_the_manufacturers(flexlink_data, stage):
+    A, B = serial_link_stage.state_space(serial_link_stage.MANUFACTURER[stage])
+    folder = flexlink_data / "quanser_2dsfl"
+    stated = np.loadtxt(folder / f"nominal_stage{stage}_A.csv", delimiter=",", skiprows=1)
+    # The constants are printed to three or four digits; the link damping of stage 1 is none.
+    np.testing.assert_allclose(A[2:, :3], stated[2:, :3], rtol=2e-3)
+    np.testing.assert_allclose(A[2:, 3], stated[2:, 3], rtol=2e-3, atol=0.03)
+    drive = np.loadtxt(folder / f"nominal_stage{stage}_B.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(B[:, 0], drive, rtol=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", [1, 2])
+def test_each_stage_of_the_serial_link_feels_the_other(flexlink_data, stage):
+    found = diagnose(serial_link_stage.case(flexlink_data, stage, correlation_samples=150.0))
+    by_name = {effect.name: effect for effect in found.effects}
+    assert found.combination[0] == "other_stage"
+    assert by_name["other_stage"].presence > 0.95
+    # The repaired model is still far from the noise: no word about what else is missing.
+    assert found.gap_after > 50
+
+
+@pytest.mark.slow
+def test_ruler_robot_friction_and_offset_found_at_one_amplitude_hold_at_the_other(flexlink_data):
+    found = diagnose(ruler_robot.case(flexlink_data, (50,), (75,), correlation_samples=100.0))
+    assert "drive_offset" in found.combination
+    assert {"coulomb_friction", "stribeck_friction"} & set(found.combination)
+    before, after = (
+        pooled_rms(np.concatenate([residuals[e.name].ravel() for e in found.case.held_out]))
+        for residuals in (found.residuals_refit, found.residuals_after)
+    )
+    # An amplitude no fit has seen: half of the explainable energy is gone at least.
+    assert after**2 - 1 < 0.5 * (before**2 - 1)
