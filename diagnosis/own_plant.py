@@ -29,6 +29,8 @@ Role = Literal["estimation", "held_out"]
 
 _STEPS = {"smooth": 1e-5, "continuous": 1e-3, "jagged": 5e-3}
 _SHORTEST = 20
+# In noise deviations: beyond any record, and its square is still a number.
+_RUNAWAY = 1e12
 
 
 @dataclass(frozen=True)
@@ -234,9 +236,11 @@ class Plant:
         return replace(self, parameters=moved)
 
     def simulate(self, effects: Sequence[Change], inputs: Real) -> Real:
-        """Inputs (T, U) -> outputs (T, Y)."""
+        """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
         given = {effect.id: effect.values for effect in effects}
-        return self.simulation(self.parameters, given, inputs)
+        outputs = np.asarray(self.simulation(self.parameters, given, inputs))
+        far = _RUNAWAY * self.noise
+        return np.clip(np.where(np.isnan(outputs), far, outputs), -far, far)
 
     def candidates(self, case: PlantCase) -> tuple[Candidate, ...]:
         return tuple(candidate for effect in self.effects for candidate in effect.candidates())
@@ -308,7 +312,7 @@ class PlantCase:
                         f"experiment {e.name}: {output} is {column[0]:.6g} throughout: is the sensor dead?"
                     )
         first = self.experiments[0]
-        found = np.asarray(self.plant.simulate((), first.input))
+        found = np.asarray(self.plant.simulation(self.plant.parameters, {}, first.input))
         if found.shape != first.output.shape or not np.all(np.isfinite(found)):
             raise ValueError(
                 f"case {self.name}: the simulation must give finite outputs {first.output.shape} for "

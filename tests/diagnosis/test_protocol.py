@@ -109,6 +109,17 @@ def test_the_example_runs_and_finds_what_it_lacks(capsys):
     assert by_name["constant_force"]["force_N"] == pytest.approx(-0.5, rel=0.01)
 
 
+def test_a_simulation_that_runs_away_ends_somewhere_finite():
+    def simulation(parameters, effects, inputs):
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.exp(1e3 * parameters["k"] * inputs) * np.array([[1.0]]) - np.inf * (len(effects) > 0)
+
+    plant = replace(PLANT, simulation=simulation)
+    (candidate, _) = plant.effects[0].candidates()
+    for effects in ((), (candidate.effect_at(np.zeros(1)),)):
+        assert np.all(np.isfinite(plant.simulate(effects, GOOD.input) ** 2))
+
+
 def test_the_flexible_arm_answers_by_the_same_protocol():
     case = made(white(np.random.default_rng(1)))
     voltage = case.experiments[0].voltage_V
