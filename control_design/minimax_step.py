@@ -57,7 +57,10 @@ def minimax_step(
         gap = float(slack @ z) / count
         if gap * count < _ACCURACY and np.abs(dual).max() < _STATIONARY and np.abs(primal).max() < _ACCURACY:
             break
-        ratio = z / slack
+        with np.errstate(over="ignore"):
+            ratio = z / slack
+        if not np.all(np.isfinite(ratio)):
+            break  # a slack has run to its bound: no step from here
         normal = hessian + (matrix * ratio[:, None]).T @ matrix
         normal.flat[:: n + 2] += 1e-12 * (1.0 + np.diag(normal))
         factor, failed = dpotrf(normal)

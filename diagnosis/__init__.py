@@ -5,12 +5,11 @@ from diagnosis.diagnosis import Diagnosis, NamedEffect, diagnose
 from diagnosis.discrimination import Rival
 from diagnosis.experiment_choices import Limits
 from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
-from diagnosis.next_experiment import NextExperiment, next_experiment
+from diagnosis.next_experiment import NextExperiment
 from diagnosis.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.residual import ResidualModel, pooled_rms
 from diagnosis.rivals import rivals_of
 from diagnosis.search import Search, search
-from diagnosis.where import subsystem_mass, where
 from diagnosis.where_records import Where
 
 __all__ = [
@@ -32,11 +31,8 @@ __all__ = [
     "Search",
     "Where",
     "diagnose",
-    "next_experiment",
     "pooled_rms",
     "probabilities",
     "rivals_of",
     "search",
-    "subsystem_mass",
-    "where",
 ]

@@ -183,9 +183,13 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
                 Axis("coulomb_torque_Nm", "linear", 0.0, 0.98, 2e-3),  # share of the static level
                 # A fall over less than a hundredth of the largest speed is over before it shows: dry friction
                 # of the Coulomb kind by another name.
-                _log("stribeck_velocity_rad_s", 0.01 * s.speed_rad_s, 5.0, 2e-3),
+                _log("stribeck_velocity_rad_s", 0.01 * s.speed_rad_s, 2.0 * s.speed_rad_s, 2e-3),
             ],
-            [_geom(3e-4 * tau, 0.6 * tau, 8), [0.5, 0.8], [0.02, 0.1, 0.5]],
+            [
+                _geom(3e-4 * tau, 0.6 * tau, 8),
+                [0.5, 0.8],
+                _geom(0.012 * s.speed_rad_s, 0.3 * s.speed_rad_s, 3),
+            ],
         ),
         _grid(
             "viscous_friction",

@@ -207,7 +207,9 @@ def _detail(verdict: Verdict, weighed: Probabilities, rivals: Sequence[str], las
     far = bool(last.deviations.size) and float(np.max(np.abs(last.deviations))) > FAR_OFF
     if verdict == "none":
         return "parametric" if far else "none"
-    return "ambiguous" if weighed.cause[weighed.answer] < _SURE or rivals else "effect"
+    shares = {**weighed.presence, **{name: weighed.cause[name] for name in ("none", "unknown")}}
+    likely = any(shares[name] >= _RIVAL for name in rivals)
+    return "ambiguous" if weighed.cause[weighed.answer] < _SURE or likely else "effect"
 
 
 def _rivals(

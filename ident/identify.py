@@ -38,7 +38,7 @@ from ident.search_trace import PolishedMinimum, SearchTrace
 from ident.structured_fit import structured_fit, structured_optimality
 
 # Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
-_MISLED = 2.0
+_MISLED = 1.2
 
 __all__ = ["Identification", "identify"]
 

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, start_flexlink
@@ -166,7 +167,7 @@ base = "{fast_run[0]}"
 "closed_loop.conditions" = false
 [[axes]]
 key = "channels[0].uncertainty.level"
-values = [0.9, 0.95]
+values = [0.6, 0.95]
 [[axes]]
 key = "closed_loop.draws"
 values = [1, 2]
@@ -176,7 +177,15 @@ values = [1, 2]
     rows = rows_of(out)
     assert len(list((out / "plants").iterdir())) == 2
     gammas = [float(row["worst_gamma"]) for row in rows]
-    assert gammas[0] == gammas[1] < gammas[2] == gammas[3]  # larger ellipses, larger worst case
+    assert gammas[0] == gammas[1]
+    assert gammas[2] == gammas[3]
+    radii = []
+    for row in rows:
+        document = RunDirectory(out / "points" / row["name"]).load_stage("uncertainty").document
+        radii.append([band["median_radius_percent"] for band in document["channels"][0]["bands"]])
+    np.testing.assert_array_equal(radii[0], radii[1])
+    # chi-square of two degrees of freedom: the squared radius is -2 log(1 - level).
+    np.testing.assert_allclose(np.array(radii[2]) / radii[0], np.sqrt(np.log(0.05) / np.log(0.4)), rtol=1e-6)
 
 
 def test_contradictions_between_axes_are_points_without_a_run(tmp_path):

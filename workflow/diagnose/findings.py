@@ -24,6 +24,8 @@ NOTABLE_TOLERANCES = 2.0
 _NOISE_SHARE = 1.03
 # Below this probability of the answer the headline says "may".
 _SURE = 0.66
+# A rival less probable than this is named further down.
+_WORTH_A_HEADLINE = 0.05
 
 
 def headline(found: Diagnosis) -> str:
@@ -39,7 +41,11 @@ def headline(found: Diagnosis) -> str:
         return "There is a gap, and nothing on the list explains it"
     names = listing([effect_words(name) for name in found.combination])
     text = f"The gap {'comes' if answer_probability(found) >= _SURE else 'may come'} from {names}"
-    others = [effect_words(name) for name in found.ambiguous_with if name != "none"]
+    others = [
+        effect_words(name)
+        for name in found.ambiguous_with
+        if name != "none" and presence_of(found, name) >= _WORTH_A_HEADLINE
+    ]
     return text + (f", or from {listing(others)}" if others else "")
 
 

@@ -73,11 +73,13 @@ def following(found: Diagnosis) -> Following:
 
 
 def _left(found: Diagnosis) -> tuple[Rival, ...]:
-    """The rivals by name; a second one only where it is thinkable at all."""
+    """The rivals by name; a second one only where it is thinkable at all or fits as well."""
     return tuple(
         replace(rival, name=_words(tuple(type(effect).id for effect in rival.effects)))
         for k, rival in enumerate(found.rivals)
-        if k == 0 or rival.probability >= _THINKABLE
+        if k == 0
+        or rival.probability >= _THINKABLE
+        or any(type(effect).id in found.ambiguous_with for effect in rival.effects)
     )
 
 
