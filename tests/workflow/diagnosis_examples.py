@@ -91,7 +91,7 @@ class KnownAnswer(Engine):
         effects = parse_effects(self.effects)
         before, after = model.by_experiment(still, ()), model.by_experiment(still, effects)
         names = [effect.id for effect in effects]
-        sure = 0.96 if self.verdict == "effect" else 0.98
+        sure = 0.9 if self.ambiguous else 0.96 if self.verdict == "effect" else 0.98
         total = {"none": 0.0, **dict.fromkeys(EFFECTS, 0.0), "unknown": 0.0}
         for name in names or [self.verdict]:
             total[name] += sure if name == (names or [self.verdict])[0] else 0.0
