@@ -40,7 +40,7 @@ def test_one_effect_is_named_sized_and_closes_the_gap(gap_cases, name, rig):
     oracle = truth["pooled_gap"]["held_out_gap_after_oracle"]
     assert found.gap_after <= oracle + 3 / np.sqrt(2 * 5200)
     assert found.gap_before > 2 * found.gap_after
-    # Stiffness out of its tolerance can also be had by stated values moved far: then nothing is left to close.
+    # Stiffness out of tolerance can also be had by stated values moved far: nothing is left to close then.
     if found.gap_refit > 1.1 * found.gap_after:
         low, high = found.gap_closed_interval
         assert 0.9 < low <= found.gap_closed <= high <= 1.05
