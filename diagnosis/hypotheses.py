@@ -64,7 +64,7 @@ class Hypothesis:
         return cls(
             fit,
             evidence + disagreement_gain(fit, rest) + prior - allowed,
-            evidence + rest.log_gain_some + prior + _UNKNOWN_BESIDE,
+            evidence + rest.log_gain_some + prior - allowed + _UNKNOWN_BESIDE,
         )
 
 
