@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from diagnosis.flexible_arm import FlexibleArm
 from diagnosis.lattice import lattice_step
+from diagnosis.machine_protocol import RecordOfMachine
 from plant.rig import Rig
 
 Real = npt.NDArray[np.float64]
@@ -75,6 +77,17 @@ class Experiment:
         return self.voltage_V[:, None]
 
 
+def check_names_and_roles(case: str, experiments: Sequence[RecordOfMachine]) -> None:
+    """Every name once, both roles there; ValueError otherwise."""
+    names = [experiment.name for experiment in experiments]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"case {case}: experiment {name} is given twice")
+    for role in ("estimation", "held_out"):
+        if not any(experiment.role == role for experiment in experiments):
+            raise ValueError(f"case {case}: no experiment has the role {role}")
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """A rig as its makers know it, and what it did.
@@ -92,13 +105,7 @@ class Case:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "experiments", tuple(self.experiments))
-        names = [experiment.name for experiment in self.experiments]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"case {self.name}: experiment {name} is given twice")
-        for role in ("estimation", "held_out"):
-            if not any(experiment.role == role for experiment in self.experiments):
-                raise ValueError(f"case {self.name}: no experiment has the role {role}")
+        check_names_and_roles(self.name, self.experiments)
         if not np.all(self.noise > 0):
             raise ValueError(f"case {self.name}: sensors need a noise level above zero to judge a gap by")
 

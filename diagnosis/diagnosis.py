@@ -24,7 +24,7 @@ Verdict = Literal["none", "effect", "unknown"]
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
 
 NOISE_FLOOR = 1.0
-# Calibrated on generated cases (benchmarks.diagnosis_calibration): the evidence alone is a little too sure.
+# The evidence as it is; not calibrated on many cases of known answer.
 TEMPERATURE = 1.0
 # A stated value that has to be off by more tolerances than this is a finding of its own.
 FAR_OFF = 3.0

@@ -1,7 +1,7 @@
 """Is anything left in the residuals that white noise would not leave, and how much?
 
 Residuals of a true model are white with variance one. Here their variance may be 1 + s_b in every band b of
-frequency of every output, most s_b being zero: a gap of a tenth of the noise is plain where it fills one
+frequency of every output, most s_b being zero: a gap of a quarter of the noise is plain where it fills one
 octave of many, long before the energy of all samples together shows it.
 """
 

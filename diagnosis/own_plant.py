@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from diagnosis.candidates import Axis, Candidate
+from diagnosis.case import check_names_and_roles
 from diagnosis.machine_protocol import Dependence, Real, Weighing
 
 Simulate = Callable[[Mapping[str, float], Mapping[str, Mapping[str, float]], Real], Real]
@@ -293,13 +294,7 @@ class PlantCase:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "experiments", tuple(self.experiments))
-        names = [experiment.name for experiment in self.experiments]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"case {self.name}: experiment {name} is given twice")
-        for role in ("estimation", "held_out"):
-            if not any(experiment.role == role for experiment in self.experiments):
-                raise ValueError(f"case {self.name}: no experiment has the role {role}")
+        check_names_and_roles(self.name, self.experiments)
         for e in self.experiments:
             if e.output.shape[1] != len(self.plant.output_names):
                 raise ValueError(

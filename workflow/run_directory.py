@@ -17,8 +17,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
@@ -180,20 +180,9 @@ class RunDirectory:
                     f"{self.path}: cannot resume, the input file {name} changed since the run began"
                 )
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the directory against a second writer; the system lets go of the lock when the process
-        dies."""
-        import fcntl
-
-        with open(self.path / "lock", "w") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise InputError(f"{self.path}: another process is writing this run") from error
-            for directory in (self.path, self.stages_path, self.figures_path):
-                storage.remove_leftovers(directory)
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the directory against a second writer."""
+        return storage.locked(self.path, "run", self.stages_path, self.figures_path)
 
     def discard(self) -> None:
         """Delete what flexlink wrote here, and the directory itself if nothing else is in it."""

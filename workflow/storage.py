@@ -15,7 +15,8 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,24 @@ def remove_leftovers(directory: Path) -> None:
     lock)."""
     for leftover in directory.glob(f".*{TEMPORARY_SUFFIX}"):
         leftover.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
+    """Hold a directory against a second writer; the system lets go of the lock when the process dies.
+
+    Leftovers of killed writers are deleted in it and in the directories `below`; `what` is being written.
+    """
+    import fcntl
+
+    with open(directory / "lock", "w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{directory}: another process is writing this {what}") from error
+        for place in (directory, *below):
+            remove_leftovers(place)
+        yield
 
 
 def _flush_directory(directory: Path) -> None:

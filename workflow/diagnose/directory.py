@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -86,18 +86,9 @@ class DiagnosisDirectory:
             place.write(MANIFEST, (json.dumps(document, indent=1) + "\n").encode())
         return place
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the directory against a second writer; the system lets go when the process dies."""
-        import fcntl
-
-        with open(self.path / "lock", "w") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise InputError(f"{self.path}: another process is writing this diagnosis") from error
-            storage.remove_leftovers(self.path)
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the diagnosis against a second writer."""
+        return storage.locked(self.path, "diagnosis")
 
     def write(self, name: str, content: bytes) -> None:
         storage.write_bytes(self.path / name, content)

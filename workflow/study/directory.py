@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,18 +139,9 @@ class StudyDirectory:
     def page_path(self) -> Path:
         return self.path / "study.html"
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the study against a second writer; the system lets go when the process dies."""
-        import fcntl
-
-        with open(self.path / "lock", "w") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise InputError(f"{self.path}: another process is writing this study") from error
-            storage.remove_leftovers(self.path)
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the study against a second writer."""
+        return storage.locked(self.path, "study")
 
     def plant(self, point: Point) -> RunDirectory:
         """The run directory of the plant that a point shares."""
