@@ -24,6 +24,8 @@ Scale = Literal["log", "linear", "angle"]
 
 # A parametric effect smaller than this many tolerances of the parameter it multiplies is no finding.
 _TOLERANCES = 3.0
+# The same for friction that is added to a stated value: that may be stated too large by as many.
+_VISCOUS_TOLERANCES = 2.0
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,7 @@ class Scales:
     voltage_V: float
     torque_Nm: float
     angle_rad: float
+    swing_rad: float
     speed_rad_s: float
     duration_s: float
     dt_s: float
@@ -141,6 +144,7 @@ class Scales:
     hub_inertia_kg_m2: float
     link_stiffness_Nm_rad: float
     damping_Nms: float
+    viscous_tolerance_Nms: float
     tip_noise_m: float
 
     @classmethod
@@ -152,6 +156,7 @@ class Scales:
             voltage_V=voltage,
             torque_Nm=rig.motor.torque_per_volt_Nm_V * voltage,
             angle_rad=max(float(np.max(np.abs(e.output[:, 0]))) for e in case.experiments),
+            swing_rad=max(float(np.ptp(e.output[:, 0])) for e in case.experiments),
             speed_rad_s=max(_speed(e.output[:, 0]) for e in case.experiments) / rig.sampling.dt_s,
             duration_s=max(e.voltage_V.size for e in case.experiments) * rig.sampling.dt_s,
             dt_s=rig.sampling.dt_s,
@@ -159,6 +164,9 @@ class Scales:
             hub_inertia_kg_m2=rig.hub.inertia_kg_m2,
             link_stiffness_Nm_rad=3 * link.bending_stiffness_Nm2 / link.length_m,
             damping_Nms=rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms,
+            viscous_tolerance_Nms=_VISCOUS_TOLERANCES
+            * rig.tolerances.get("hub.viscous_friction_Nms", 0.0)
+            * rig.hub.viscous_friction_Nms,
             tip_noise_m=rig.sensors.tip_noise_m,
         )
 
@@ -166,6 +174,18 @@ class Scales:
 def _speed(angle_rad: Real, samples: int = 10) -> float:
     """Largest mean speed over so many samples, per sample."""
     return float(np.max(np.abs(angle_rad[samples:] - angle_rad[:-samples]))) / samples
+
+
+def without_fall(candidate: Candidate, x: Real, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
+    """Coulomb friction in place of Stribeck's, halfway between its levels; None for every other effect."""
+    if candidate.effect != "stribeck_friction":
+        return None
+    for simple in listed:
+        if simple.effect == "coulomb_friction" and [a.parameter for a in simple.axes] == ["torque_Nm"]:
+            levels = candidate.parameters(x)
+            torque = 0.5 * (levels["static_torque_Nm"] + levels["coulomb_torque_Nm"])
+            return simple, np.clip([simple.axes[0].coordinate(torque)], *simple.box)
+    return None
 
 
 def candidates(case: Case) -> tuple[Candidate, ...]:
@@ -193,8 +213,8 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
         ),
         _grid(
             "viscous_friction",
-            [_log("coefficient_Nms", 1e-5 * s.damping_Nms, 30 * s.damping_Nms)],
-            [_geom(1e-4 * s.damping_Nms, 3 * s.damping_Nms, 8)],
+            [_log("coefficient_Nms", max(1e-5 * s.damping_Nms, s.viscous_tolerance_Nms), 30 * s.damping_Nms)],
+            [_geom(max(1e-4 * s.damping_Nms, 1.2 * s.viscous_tolerance_Nms), 3 * s.damping_Nms, 8)],
         ),
         _grid(
             "actuator_saturation",
@@ -226,7 +246,14 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
             "torque_ripple",
             [
                 _log("amplitude_Nm", 1e-6 * tau, tau),
-                Axis("cycles_per_rev", "linear", 0.3, 80.0, 1e-4),
+                # Less than a quarter of a period looks like a spring or a constant torque.
+                Axis(
+                    "cycles_per_rev",
+                    "linear",
+                    float(np.clip(0.5 * np.pi / s.swing_rad, 1.0, 20.0)),
+                    80.0,
+                    1e-4,
+                ),
                 _PHASE,
             ],
             [],

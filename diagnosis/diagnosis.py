@@ -10,9 +10,10 @@ import numpy as np
 
 from diagnosis.candidates import Candidate
 from diagnosis.case import Case
+from diagnosis.confirmation import confronted
 from diagnosis.discrimination import Rival
 from diagnosis.fit import Fit, fit
-from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
+from diagnosis.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.model_error import at_its_own_level
 from diagnosis.residual import ResidualModel, pooled_rms
@@ -30,7 +31,7 @@ TEMPERATURE = 1.0
 FAR_OFF = 3.0
 # Below this probability of the first answer, or with a rival above that one, the answer is called ambiguous.
 _SURE, _RIVAL = 0.8, 0.05
-# Difference of |e|^2 + |d|^2 that the records do not tell apart (chi-square, 95 %, two parameters).
+# Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
 _AS_GOOD = 6.0
 _LAST_ITERATIONS = 30
 _DRAWS, _BLOCKS, _BLOCK = 4000, 2000, 50
@@ -143,8 +144,13 @@ def diagnose(
     rng = np.random.default_rng(0) if rng is None else rng
     found = search(case, progress)
     model = ResidualModel(case)
-    weighed = probabilities(found.hypotheses, temperature=temperature)
-    accepted = _accepted(found.hypotheses, weighed.answer)
+    hypotheses: Sequence[Hypothesis] = found.hypotheses
+    weighed = probabilities(hypotheses, temperature=temperature)
+    accepted = _accepted(hypotheses, weighed.answer)
+    if weighed.answer != "unknown":
+        hypotheses = confronted(model, hypotheses, accepted)
+        weighed = probabilities(hypotheses, temperature=temperature)
+        accepted = _accepted(hypotheses, weighed.answer)
     last = _polished(model, accepted.fit)
     before = model.by_experiment(np.zeros(model.nominal.count), ())
     refit = model.by_experiment(found.base.deviations, ())
@@ -159,14 +165,14 @@ def diagnose(
     together = accepted.names if rounding is None else rounding.joined(accepted.names, leads=leads)
     gap_before, gap_refit, gap_after = (_held_out(case, r) for r in (before, refit, after))
     closed, interval = _closed(case, refit, after, rng, floor)
-    ambiguous_with = _rivals(weighed, found.hypotheses, accepted, together, answer)
+    ambiguous_with = _rivals(weighed, hypotheses, accepted, together, answer)
     return Diagnosis(
         case=case,
         verdict=verdict,
         detail_verdict=_detail(verdict, weighed, ambiguous_with, last),
         probabilities=weighed.cause,
         sets=weighed.sets,
-        effects=_named(model, found.hypotheses, weighed, together, last, rounding, rng),
+        effects=_named(model, hypotheses, weighed, together, last, rounding, rng),
         combination=together if verdict == "effect" else (),
         ambiguous_with=ambiguous_with,
         gap_before=gap_before,
@@ -182,7 +188,7 @@ def diagnose(
         residuals_refit=refit,
         residuals_after=after,
         simulations=found.simulations + model.simulations,
-        rivals=rivals_of(case, found.hypotheses, weighed.sets) if isinstance(case, Case) else (),
+        rivals=rivals_of(case, hypotheses, weighed.sets) if isinstance(case, Case) else (),
     )
 
 
@@ -244,6 +250,7 @@ def _named(
     rounding: Rounding | None,
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
+    samples = float(np.mean([len(record.output) for record in model.case.estimation]))
     entries = []
     for name in model.case.machine.weighing.listed:
         holding = [h for h in hypotheses if name in h.names]
@@ -254,7 +261,7 @@ def _named(
             end = last if name in last.names else max(holding, key=lambda h: h.log_weight).fit
             k = end.names.index(name)
             parameters = end.candidates[k].parameters(end.coordinates[k])
-            intervals = _intervals(end, k, rng)
+            intervals = _intervals(end, k, samples, rng)
             gap = pooled_rms(model.whitened(end.deviations, end.effects, model.case.held_out))
         elif rounding is not None and name == rounding.name:
             parameters, intervals = rounding.effect.parameters(), rounding.intervals
@@ -274,17 +281,22 @@ def _named(
     return (*first, *entries, *(e for e in others if e.name != answer))
 
 
-def _intervals(end: Fit, k: int, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
+def _intervals(
+    end: Fit, k: int, samples_per_record: float, rng: np.random.Generator
+) -> dict[str, tuple[float, float]]:
     """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
 
-    What is left beyond the noise widens them in proportion, its correlation too where the machine states one.
+    What is left beyond the noise widens them in proportion, its correlation too where the machine states one,
+    and so does what solvers may disagree about.
     """
     if end.weighing.model_error > 0:
         end = at_its_own_level(end)
     candidate: Candidate = end.candidates[k]
     at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(at, at + len(candidate.axes))
-    covariance = end.covariance()[rows, rows] * max(1.0, end.rms**2)
+    covariance = (
+        end.covariance()[rows, rows] * max(1.0, end.rms**2) * _solver_variance(end, samples_per_record)
+    )
     x = end.coordinates[k]
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -300,6 +312,19 @@ def _intervals(end: Fit, k: int, rng: np.random.Generator) -> dict[str, tuple[fl
         below, above = np.quantile(spread, [0.025, 0.975])
         found[key] = (float(value + below), float(value + above))
     return found
+
+
+def _solver_variance(end: Fit, samples_per_record: float) -> float:
+    """Variance of fitted values in units of what white noise gives, where contacts switch.
+
+    Two correct solvers of play drift apart once a contact falls differently, and stay apart to the end of a
+    record: an error of their usual disagreement that is correlated over the record.
+    """
+    if not any(c.dependence == "jagged" for c in end.candidates):
+        return 1.0
+    # median of the half-normal prior of the disagreement's size
+    usual = 0.674 * DISAGREEMENT["jagged"]
+    return 1.0 + usual**2 * samples_per_record
 
 
 def _held_out(case: CaseOfMachine, residuals: dict[str, Real]) -> float:

@@ -1,6 +1,6 @@
 """Maximum a posteriori fit of deviations and effect parameters, and the evidence of a set of candidates.
 
-Minimises |e|^2 + |d|^2 over the deviations d of the nominal parameters (standard normal before the data) and
+Minimises |e|^2 + |d|^2 over the deviations d of the nominal parameters (more beyond two tolerances) and
 the coordinates x of the candidates (flat over their boxes), e being the whitened residuals:
 Levenberg-Marquardt with difference quotients, inside the boxes.
 """
@@ -15,12 +15,21 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from diagnosis.candidates import Candidate
-from diagnosis.machine_protocol import Real, Weighing
+from diagnosis.machine_protocol import Real, RecordOfMachine, Weighing
+from diagnosis.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.residual import ResidualModel
 
 # Steps of difference quotients along the deviations. Where contacts switch, a small step measures which way
 # one contact fell; a large one averages over many.
 _DEVIATION_STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
+# Damping of a step: in proportion to the Hessian's diagonal and, so that values the records say little about
+# do not run away along a bent valley, to this (times 1 per tolerance squared, or per unit of a logarithm).
+_UNIT = 1e3
+# Geodesic acceleration: second derivative along the step from a point this far along it, and the largest
+# correction, in steps, that is believed.
+_PROBE, _BEND = 0.1, 0.75
+# Decrease that the quadratic model may still promise where a fit ends.
+_LEFT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +59,10 @@ class Fit:
 
     @property
     def hessian(self) -> Real:
-        """Half the Gauss-Newton Hessian of the cost: J^T J plus the prior's identity."""
+        """Half the Gauss-Newton Hessian of the cost: J^T J plus the prior's curvature."""
         P = self.deviations.size
         H = self.jacobian.T @ self.jacobian
-        H[range(P), range(P)] += 1.0
+        H[range(P), range(P)] += prior_curvature(self.deviations)
         return H
 
     def covariance(self) -> Real:
@@ -86,47 +95,56 @@ def fit(
     d = deviations.copy()
 
     def effects(x: Real) -> tuple[Any, ...]:
-        return (
-            tuple(c.effect_at(part) for c, part in zip(candidates, np.split(x, splits[:-1]), strict=True))
-            if candidates
-            else ()
-        )
+        return _effects(candidates, x)
 
+    exact = nominal_jacobian is None and all(c.dependence == "smooth" for c in candidates)
     e = model.of(d, effects(x))
-    cost = float(e @ e + d @ d)
+    cost = float(e @ e) + prior_cost(d)
     damping, converged = 1e-3, False
     for _ in range(iterations):
         J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
-        step_cost = None
         H = J.T @ J
-        H[range(P), range(P)] += 1.0
+        H[range(P), range(P)] += prior_curvature(d)
         gradient = J.T @ e
-        gradient[:P] += d
+        gradient[:P] += prior_slope(d)
         free = _free(x, gradient[P:], low, high)
         use = np.concatenate([np.arange(P), P + np.flatnonzero(free)]).astype(int)
         if use.size == 0:
             converged = True
             break
-        Hu, gu = H[np.ix_(use, use)], gradient[use]
+        Hu, gu, Ju = H[np.ix_(use, use)], gradient[use], J[:, use]
         size = np.sqrt(np.maximum(np.diag(Hu), 1e-12))
+        reached = None
         for _try in range(9):
+            damped = Hu + damping * np.diag(size**2 + _UNIT)
             step = np.zeros(P + x.size)
-            step[use] = -np.linalg.solve(Hu + damping * np.diag(size**2), gu)
+            step[use] = -np.linalg.solve(damped, gu)
+            if exact:
+                probe = _PROBE * step
+                ahead = model.of(
+                    model.nominal.within(d + probe[:P]), effects(np.clip(x + probe[P:], low, high))
+                )
+                bend = 2 / _PROBE * ((ahead - e) / _PROBE - J @ step)
+                second = -0.5 * np.linalg.solve(damped, Ju.T @ bend)
+                if float(np.linalg.norm(size * second)) < _BEND * float(np.linalg.norm(size * step[use])):
+                    step[use] += second
             trial_d = model.nominal.within(d + step[:P])
             trial_x = np.clip(x + step[P:], low, high)
             trial_e = model.of(trial_d, effects(trial_x))
-            trial_cost = float(trial_e @ trial_e + trial_d @ trial_d)
+            trial_cost = float(trial_e @ trial_e) + prior_cost(trial_d)
             if trial_cost < cost:
-                step_cost = trial_cost
+                reached = trial_cost
                 break
             damping = max(6 * damping, 1e-5)
-        if step_cost is None:
+        if reached is None:
             converged = True
             break
-        gain, cost = cost - step_cost, step_cost
+        gain, cost = cost - reached, reached
         d, x, e = trial_d, trial_x, trial_e
         damping *= 0.2
-        if gain < tolerance / model.scale:
+        # A short step is no end where the valley bends: there more damping is the cause.
+        left = float(gu @ np.linalg.solve(Hu + 1e-10 * np.diag(size**2), gu))
+        if gain < tolerance / model.scale and (not exact or left < _LEFT / model.scale):
             converged = True
             break
     J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
@@ -139,7 +157,27 @@ def cost_at(
 ) -> float:
     """|e|^2 + |d|^2 at a point."""
     e = model.of(deviations, [c.effect_at(x) for c, x in zip(candidates, coordinates, strict=True)])
-    return float(e @ e + deviations @ deviations)
+    return float(e @ e) + prior_cost(deviations)
+
+
+def difference_quotients(
+    model: ResidualModel, end: Fit, e: Real, experiments: Sequence[RecordOfMachine]
+) -> Real:
+    """Derivatives (N, P + A) by (d, x) of the residuals e (N,) that a fit leaves in these experiments."""
+
+    def effects(x: Real) -> tuple[Any, ...]:
+        return _effects(end.candidates, x)
+
+    x = np.concatenate(list(end.coordinates)) if end.candidates else np.zeros(0)
+    high = np.concatenate([c.box[1] for c in end.candidates]) if end.candidates else np.zeros(0)
+    steps = np.array([axis.step for c in end.candidates for axis in c.axes])
+    return _jacobian(model, end.deviations, x, e, effects, steps, high, None, experiments)
+
+
+def _effects(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:
+    """Effects at the coordinates of all candidates in a row (A,)."""
+    splits = np.cumsum([len(c.axes) for c in candidates])[:-1]
+    return tuple(c.effect_at(part) for c, part in zip(candidates, np.split(x, splits), strict=False))
 
 
 def _jacobian(
@@ -151,6 +189,7 @@ def _jacobian(
     steps: Real,
     high: Real,
     nominal_jacobian: Real | None,
+    experiments: Sequence[RecordOfMachine] | None = None,
 ) -> Real:
     P = d.size
     J = np.empty((e.size, P + x.size))
@@ -162,12 +201,12 @@ def _jacobian(
         for i in range(P):
             moved = d.copy()
             moved[i] += step
-            J[:, i] = (model.of(moved, here) - e) / step
+            J[:, i] = (model.of(moved, here, experiments) - e) / step
     for i in range(x.size):
         moved = x.copy()
         step = steps[i] if x[i] + steps[i] <= high[i] else -steps[i]
         moved[i] += step
-        J[:, P + i] = (model.of(d, effects(moved)) - e) / step
+        J[:, P + i] = (model.of(d, effects(moved), experiments) - e) / step
     return J
 
 

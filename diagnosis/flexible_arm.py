@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ from diagnosis.candidates import Candidate, candidates
 from diagnosis.machine_protocol import Real, Weighing
 from plant.effects import Effect
 from plant.rig import Rig
-from plant.simulate import simulate
+from plant.simulate import Simulator
 
 if TYPE_CHECKING:
     from diagnosis.case import Case
@@ -50,8 +50,9 @@ class FlexibleArm:
     def scaled(self, factors: Mapping[str, float]) -> FlexibleArm:
         return FlexibleArm(self.rig.scaled(factors))
 
-    def simulate(self, effects: Sequence[Effect], inputs: Real) -> Real:
-        return simulate(self.rig, inputs[:, 0], effects).output
+    def simulator(self, effects: Sequence[Effect]) -> Callable[[Real], Real]:
+        prepared = Simulator(self.rig, effects)
+        return lambda inputs: prepared.run(inputs[:, 0]).output
 
     def candidates(self, case: Case) -> tuple[Candidate, ...]:
         return candidates(case)

@@ -18,7 +18,7 @@ from diagnosis.model_error import log_evidence_with_model_error
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); with play two correct solvers differ by 0.2.
-_DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "jagged": 0.25}
+DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "jagged": 0.25}
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
 _PRIOR_NONE, _PRIOR_UNKNOWN = 0.25, 0.1
 _PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
@@ -82,7 +82,7 @@ def disagreement_gain(fit: Fit, rest: Leftover) -> float:
 
     Its size has a half-normal prior; what is left over beyond that is no disagreement any more.
     """
-    solvers = [_DISAGREEMENT["smooth"], *(_DISAGREEMENT[c.dependence] for c in fit.candidates)]
+    solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
     return max(0.0, rest.log_gain - 0.5 * (rest.size / max(solvers)) ** 2)
 
 

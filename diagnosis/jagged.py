@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diagnosis.fit import Fit, fit
+from diagnosis.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.residual import ResidualModel
 
 _REACHES = (0.12, 0.04, 0.012)
@@ -34,7 +35,7 @@ def _round(model: ResidualModel, best: Fit, k: int, reach: float) -> Fit:
     others = np.delete(np.arange(best.jacobian.shape[1]), at)
     J = best.jacobian[:, others]
     H = J.T @ J
-    H[range(P), range(P)] += 1.0
+    H[range(P), range(P)] += prior_curvature(best.deviations)
     scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
     low, high = best.candidates[k].box
     trials = []
@@ -44,9 +45,9 @@ def _round(model: ResidualModel, best: Fit, k: int, reach: float) -> Fit:
         effects = tuple(c.effect_at(part) for c, part in zip(best.candidates, x, strict=True))
         e = model.of(best.deviations, effects)
         gradient = J.T @ e
-        gradient[:P] += best.deviations
+        gradient[:P] += prior_slope(best.deviations)
         step = -np.linalg.solve(H + 1e-6 * np.diag(scale**2), gradient)
-        cost = float(e @ e + best.deviations @ best.deviations + gradient @ step)
+        cost = float(e @ e + gradient @ step) + prior_cost(best.deviations)
         trials.append((cost, x, best.deviations + np.clip(step[:P], -1.5, 1.5)))
     cost, x, d = min(trials, key=lambda trial: trial[0])
     if not cost < best.cost:

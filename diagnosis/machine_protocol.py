@@ -6,7 +6,7 @@ brings. The engine (residual, nominal, screening, fit, hypotheses, search, diagn
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
@@ -79,7 +79,7 @@ class Machine(StatedValues, Protocol):
     def description(self) -> Any:
         """What a user gets back as the repaired machine."""
 
-    def simulate(self, effects: Sequence[Any], inputs: Real) -> Real:
+    def simulator(self, effects: Sequence[Any]) -> Callable[[Real], Real]:
         """Inputs (T, U) -> outputs (T, Y) without noise; effects as its own candidates make them."""
 
     def candidates(self, case: Any) -> tuple[Candidate, ...]:

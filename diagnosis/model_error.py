@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 
 from diagnosis.fit import Fit, log_evidence
 from diagnosis.machine_protocol import Real
+from diagnosis.nominal import prior_cost
 
 # An unknown cause leaves from one to this many times what the machine's simulation may leave.
 _UNKNOWN_REACH = 100.0
@@ -61,7 +62,7 @@ def _weighed(fit: Fit, delta: float) -> Fit:
     """The fit with the residuals' variance c (1 + delta^2)."""
     scale = np.sqrt((1 + delta**2) / (1 + fit.weighing.model_error**2))
     e = fit.residuals / scale
-    cost = float(e @ e + fit.deviations @ fit.deviations)
+    cost = float(e @ e) + prior_cost(fit.deviations)
     return replace(fit, residuals=e, jacobian=fit.jacobian / scale, cost=cost)
 
 

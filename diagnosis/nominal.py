@@ -11,11 +11,31 @@ from diagnosis.machine_protocol import Real, Stated
 
 # Where a stated value would have to be more wrong than this many tolerances nothing is believed any more.
 LARGEST_DEVIATION = 8.0
+# Up to so many tolerances the prior is Gaussian. Beyond them it falls faster: a value that far off gets
+# noticed before it gets stated.
+_EDGE, _STIFFNESS = 2.0, 15.0
+
+
+def prior_cost(deviations: Real) -> float:
+    """-2 log of the prior density of the deviations (P,), up to a constant: |d|^2 within two tolerances."""
+    beyond = np.maximum(np.abs(deviations) - _EDGE, 0.0)
+    return float(deviations @ deviations + _STIFFNESS * (beyond @ beyond))
+
+
+def prior_slope(deviations: Real) -> Real:
+    """Half the gradient of `prior_cost` (P,)."""
+    beyond = np.maximum(np.abs(deviations) - _EDGE, 0.0)
+    return np.asarray(deviations + _STIFFNESS * np.copysign(beyond, deviations))
+
+
+def prior_curvature(deviations: Real) -> Real:
+    """Half the second derivatives of `prior_cost` (P,)."""
+    return np.where(np.abs(deviations) > _EDGE, 1.0 + _STIFFNESS, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class NominalParameters(Generic[Stated]):
-    """Deviations d (P,) of the stated values in units of their tolerances; d ~ N(0, I) before any record.
+    """Deviations d (P,) of the stated values in units of their tolerances; `prior_cost` before any record.
 
     A rig or machine with tolerances t states values that are wrong by draws of that size: stated =
     true (1 + t d), so the true value is stated / (1 + t d).

@@ -236,12 +236,16 @@ class Plant:
         moved = {key: value * factors.get(key, 1.0) for key, value in self.parameters.items()}
         return replace(self, parameters=moved)
 
-    def simulate(self, effects: Sequence[Change], inputs: Real) -> Real:
+    def simulator(self, effects: Sequence[Change]) -> Callable[[Real], Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
         given = {effect.id: effect.values for effect in effects}
-        outputs = np.asarray(self.simulation(self.parameters, given, inputs))
         far = _RUNAWAY * self.noise
-        return np.clip(np.where(np.isnan(outputs), far, outputs), -far, far)
+
+        def outputs(inputs: Real) -> Real:
+            found = np.asarray(self.simulation(self.parameters, given, inputs))
+            return np.clip(np.where(np.isnan(found), far, found), -far, far)
+
+        return outputs
 
     def candidates(self, case: PlantCase) -> tuple[Candidate, ...]:
         return tuple(candidate for effect in self.effects for candidate in effect.candidates())

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from diagnosis.lattice import cell_residual
-from diagnosis.machine_protocol import CaseOfMachine, Machine, Real, RecordOfMachine
+from diagnosis.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.nominal import NominalParameters
+
+Simulator = Callable[[Real], Real]
 
 
 class ResidualModel:
@@ -34,34 +36,32 @@ class ResidualModel:
         outputs enter by the chance of their cells (`diagnosis.lattice`).
         """
         experiments = self.case.estimation if experiments is None else experiments
-        machine = self.nominal.at(deviations)
-        whole = np.concatenate(
-            [self._weighed(machine, effects, experiment).ravel() for experiment in experiments]
-        )
+        simulator = self.nominal.at(deviations).simulator(effects)
+        whole = np.concatenate([self._weighed(simulator, experiment).ravel() for experiment in experiments])
         return whole if self.scale == 1.0 else whole / self.scale
 
     def whitened(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine]
     ) -> Real:
         """(measured - model)/noise (N,) of the given experiments, whatever they weigh in a fit."""
-        machine = self.nominal.at(deviations)
-        return np.concatenate([self._one(machine, effects, e).ravel() for e in experiments])
+        simulator = self.nominal.at(deviations).simulator(effects)
+        return np.concatenate([self._one(simulator, e).ravel() for e in experiments])
 
     def by_experiment(self, deviations: Real, effects: Sequence[Any]) -> dict[str, Real]:
         """Residuals (T, Y) of every experiment."""
-        machine = self.nominal.at(deviations)
-        return {e.name: self._one(machine, effects, e) for e in self.case.experiments}
+        simulator = self.nominal.at(deviations).simulator(effects)
+        return {e.name: self._one(simulator, e) for e in self.case.experiments}
 
-    def _weighed(self, machine: Machine, effects: Sequence[Any], experiment: RecordOfMachine) -> Real:
-        e = self._one(machine, effects, experiment)
+    def _weighed(self, simulator: Simulator, experiment: RecordOfMachine) -> Real:
+        e = self._one(simulator, experiment)
         for k in np.flatnonzero(self.steps):
             noise = float(self.case.noise[k])
             e[:, k] = cell_residual(e[:, k] * noise, np.zeros(len(e)), float(self.steps[k]), noise)
         return e
 
-    def _one(self, machine: Machine, effects: Sequence[Any], experiment: RecordOfMachine) -> Real:
+    def _one(self, simulator: Simulator, experiment: RecordOfMachine) -> Real:
         self.simulations += 1
-        model = machine.simulate(effects, experiment.input)
+        model = simulator(experiment.input)
         return np.asarray((experiment.output - model) / self.case.noise)
 
 

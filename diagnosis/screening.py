@@ -6,19 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import fftconvolve
+from scipy.fft import next_fast_len
+from scipy.linalg import cho_factor, cho_solve
 
 from diagnosis.candidates import Candidate
 from diagnosis.fit import Fit
 from diagnosis.flexible_arm import FlexibleArm
 from diagnosis.machine_protocol import Real
+from diagnosis.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.residual import ResidualModel
 from plant.rig import Rig
 from plant.simulate import simulate
 
 # Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
 # of the inverse of the largest angle for the other.
-_CYCLES = np.concatenate([np.arange(0.5, 12, 0.25), np.arange(12, 80.5, 1.0)])
+_CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
 
 _HARMONIC = ("torque_ripple", "periodic_disturbance")
 
@@ -46,7 +48,7 @@ class Screening:
         self.around = around
         P = around.deviations.size
         self._Jn = around.jacobian[:, :P]
-        self._A = self._Jn.T @ self._Jn + np.eye(P)
+        self._A = self._Jn.T @ self._Jn + np.diag(prior_curvature(around.deviations))
         self._parts = np.cumsum([e.output.size for e in model.case.estimation])[:-1]
 
     def starts(self, candidate: Candidate) -> list[Start]:
@@ -66,19 +68,19 @@ class Screening:
         No simulation: a second effect large enough for superposition to fail shows all the same. The nominal
         parameters and the sizes of the lead follow along its Jacobian.
         """
-        P = lead.deviations.size
-        A = lead.hessian
-        scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
-        A = A + 1e-8 * np.diag(scale**2)
+        around = _Around(lead)
+        found = [around.start(start, lead.residuals + start.change) for start in starts]
+        return sorted(found, key=lambda start: start.cost)
+
+    def simulated_beside(self, lead: Fit, candidate: Candidate, starts: list[Start]) -> list[Start]:
+        """As `beside`, from simulations of both together: for one that acts through the other."""
+        around = _Around(lead)
         found = []
         for start in starts:
-            e = lead.residuals + start.change
-            gradient = lead.jacobian.T @ e
-            gradient[:P] += lead.deviations
-            step = -np.linalg.solve(A, gradient)
-            cost = float(e @ e + lead.deviations @ lead.deviations + gradient @ step)
-            d = lead.deviations + np.clip(step[:P], -1.5, 1.5)
-            found.append(replace(start, cost=cost, deviations=d))
+            effects = (*lead.effects, candidate.effect_at(start.coordinates))
+            e = self.model.of(lead.deviations, effects)
+            if np.all(np.isfinite(e)):
+                found.append(around.start(start, e))
         return sorted(found, key=lambda start: start.cost)
 
     def zoomed(self, candidate: Candidate, starts: list[Start]) -> list[Start]:
@@ -108,11 +110,11 @@ class Screening:
         d = self.around.deviations
         if not d.size:
             return float(e @ e), np.zeros(0)
-        gradient = self._Jn.T @ e + d
+        gradient = self._Jn.T @ e + prior_slope(d)
         step = -np.linalg.solve(self._A, gradient)
         # Never trust the linearisation beyond a tolerance or so.
         step = np.clip(step, -1.5, 1.5)
-        return float(e @ e + d @ d + 2 * gradient @ step + step @ self._A @ step), step
+        return float(e @ e + 2 * gradient @ step + step @ self._A @ step) + prior_cost(d), step
 
     def _size(self, change: Real) -> float:
         parts, outputs = np.split(change, self._parts), self.model.case.noise.size
@@ -133,26 +135,27 @@ class Screening:
         if periodic:
             lines = np.arange(candidate.axes[1].low, min(60.0, 0.45 / dt), 0.4 / (longest * dt))
         else:
-            lines = _CYCLES
+            lines = _CYCLES[np.greater_equal(_CYCLES, candidate.axes[1].low)]
+        # Circular convolution over twice the longest record: no response reaches around.
+        size = next_fast_len(2 * longest, real=True)
+        transfer = np.fft.rfft(response, size, axis=0)
         found = []
         for line in lines:
-            columns = []
-            for shift in (0.0, np.pi / 2):
-                parts = []
-                for e in model.case.estimation:
-                    time = (np.arange(len(e.input)) + 0.5) * dt
-                    angle = 2 * np.pi * line * time if periodic else line * e.output[:, 0]
-                    torque = np.sin(angle + shift)
-                    n = torque.size
-                    parts.append(
-                        np.column_stack([fftconvolve(torque, response[:n, q])[:n] for q in range(2)]).ravel()
-                    )
-                columns.append(-np.concatenate(parts))
-            M = np.column_stack([self._Jn, *columns])
-            H = M.T @ M
-            H[range(P), range(P)] += 1.0
-            gradient = M.T @ around.residuals
-            gradient[:P] += around.deviations
+            parts = []
+            for e in model.case.estimation:
+                time = (np.arange(len(e.input)) + 0.5) * dt
+                angle = 2 * np.pi * line * time if periodic else line * e.output[:, 0]
+                torque = np.stack([np.sin(angle), np.cos(angle)])
+                moved = np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)
+                parts.append(moved[:, : angle.size].reshape(2, -1))
+            columns = -np.concatenate(parts, axis=1)
+            H = np.empty((P + 2, P + 2))
+            H[:P, :P] = self._A
+            H[P:, :P] = columns @ self._Jn
+            H[:P, P:] = H[P:, :P].T
+            H[P:, P:] = columns @ columns.T
+            gradient = np.concatenate([self._Jn.T @ around.residuals, columns @ around.residuals])
+            gradient[:P] += prior_slope(around.deviations)
             step = -np.linalg.solve(H, gradient)
             a, b = step[P:]
             amplitude = float(np.hypot(a, b))
@@ -163,6 +166,26 @@ class Screening:
             d = around.deviations + np.clip(step[:P], -1.5, 1.5)
             found.append(Start(cost, x, d, self._size(change), change.astype(np.float32)))
         return found
+
+
+class _Around:
+    """Linearisation of everything a fit holds, in which it follows a further effect."""
+
+    def __init__(self, lead: Fit) -> None:
+        self.lead = lead
+        A = lead.hessian
+        scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
+        self._factor = cho_factor(A + 1e-8 * np.diag(scale**2))
+
+    def start(self, start: Start, e: Real) -> Start:
+        """The start with cost and deviations that go with the residuals e (N,) before anything follows."""
+        lead = self.lead
+        P = lead.deviations.size
+        gradient = lead.jacobian.T @ e
+        gradient[:P] += prior_slope(lead.deviations)
+        step = -cho_solve(self._factor, gradient)
+        cost = float(e @ e + gradient @ step) + prior_cost(lead.deviations)
+        return replace(start, cost=cost, deviations=lead.deviations + np.clip(step[:P], -1.5, 1.5))
 
 
 def smallest_size(candidate: Candidate, starts: list[Start], ratio: float) -> float | None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.candidates import Candidate
+from diagnosis.candidates import Candidate, without_fall
 from diagnosis.fit import Fit, cost_at, fit
-from diagnosis.hypotheses import Hypothesis
+from diagnosis.hypotheses import DISAGREEMENT, Hypothesis
 from diagnosis.jagged import refined
 from diagnosis.leftover import leftover
 from diagnosis.machine_protocol import CaseOfMachine, Real
@@ -19,7 +19,7 @@ from diagnosis.screening import Screening, Start, smallest_size
 Progress = Callable[[float, str], None]
 
 # An effect that changes no record by more than this many noise deviations (RMS) is not looked for.
-SMALLEST_SIZE_RATIO = 0.2
+SMALLEST_SIZE_RATIO = 0.06
 # Fits whose cost is within this much of the best are finished with exact derivatives.
 _CLOSE = 60.0
 # A further effect has a smaller prior (7 in log weight, 15 in cost): what gains less roughly is not finished.
@@ -32,6 +32,12 @@ _HOPELESS = 0.1
 _SETS_TO_REDUCE = 3
 # Further effects that are fitted beside the best hypothesis, by the cost their screening promises.
 _BESIDE = 6
+# Starts of a further effect that are simulated beside a lead; fewer where a record takes ten times as long.
+_STARTS_TO_SIMULATE, _JAGGED_TO_SIMULATE = 40, 8
+# Sets that are extended where none explains everything.
+_BEAM = 3
+# Sizes of jagged effects are refined where no more than this share of the gap is left, or this much energy.
+_NEAR, _NEAR_FLOOR = 0.25, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +59,7 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     model = ResidualModel(case)
     base = fit(model, (), (), np.zeros(model.nominal.count))
     screening = Screening(model, base)
+    N = base.residuals.size
     listed: list[tuple[Candidate, list[Start]]] = []
     spaces = case.machine.candidates(case)
     for k, candidate in enumerate(spaces):
@@ -60,33 +67,98 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
         starts = screening.starts(candidate)
         least = smallest_size(candidate, starts, SMALLEST_SIZE_RATIO) if starts else None
         if least is not None:
-            if candidate.dependence == "jagged":
+            if candidate.dependence == "jagged" and starts[0].cost - N < 0.5 * (base.cost - N):
                 starts = screening.zoomed(candidate, starts)
             listed.append((candidate.from_size(least), starts))
     found = [_weighed(model, base)]
-    found += _fitted(model, base, listed, _part(report, 0.35, 0.35))
-    found.sort(key=lambda h: -h.log_weight)
-    while found[0].names and len(found[0].names) < _MOST_EFFECTS:
-        lead = found[0]
-        if len(lead.names) > 1 and _beyond_noise(lead.fit) > _HOPELESS * _beyond_noise(base):
-            break
-        further = [
-            (candidate, screening.beside(lead.fit, starts))
-            for candidate, starts in listed
-            if candidate.effect not in lead.names
-        ]
-        further.sort(key=lambda item: item[1][0].cost)
-        found += _fitted(model, lead.fit, further[:_BESIDE], _part(report, 0.7 + 0.1 * len(lead.names), 0.1))
-        found += _without_one(model, found)
+    first = [_Trial(base, candidate, starts) for candidate, starts in listed]
+    found += _fitted(model, base, first, _part(report, 0.35, 0.35))
+    for count in range(1, _MOST_EFFECTS):
         found.sort(key=lambda h: -h.log_weight)
-        if len(found[0].names) <= len(lead.names):
+        best, leads = found[0], _leads(found, count)
+        if not leads or len(best.names) < (count if _explained(found) else 1):
             break
+        if count > 1 and (_hopeless(leads[0], base) or _as_solvers_differ(leads[0])):
+            break
+        further = _further(screening, leads, listed)
+        found += _fitted(model, base, further, _part(report, 0.6 + 0.1 * count, 0.1))
+        found += _reduced(model, base, found, [candidate for candidate, _ in listed])
+    found.sort(key=lambda h: -h.log_weight)
     report(1.0, "done")
     return Search(base, tuple(found), model.simulations)
 
 
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """One effect more than a fit holds."""
+
+    around: Fit
+    candidate: Candidate
+    starts: list[Start]
+
+    @property
+    def effects(self) -> frozenset[str]:
+        return frozenset((*self.around.names, self.candidate.effect))
+
+
+def _explained(found: Sequence[Hypothesis]) -> bool:
+    """Whether the best set leaves nothing over, by its own evidence against that of an unknown rest."""
+    return max(h.log_weight for h in found) >= max(h.unknown_weight for h in found)
+
+
+def _leads(found: Sequence[Hypothesis], count: int) -> list[Fit]:
+    """Sets of so many effects to which one more is added, best first.
+
+    The best one as soon as a set explains everything. Before, what is left over says little about which
+    member of the true set has been found: the three that would leave the most probable unknown rest.
+    """
+    if _explained(found):
+        best = max(found, key=lambda h: h.log_weight)
+        return [best.fit] if len(best.names) == count else []
+    leads: dict[frozenset[str], Fit] = {}
+    for h in sorted(found, key=lambda h: -h.unknown_weight):
+        if len(h.names) == count:
+            leads.setdefault(frozenset(h.names), h.fit)
+    return list(leads.values())[:_BEAM]
+
+
+def _further(
+    screening: Screening, leads: Sequence[Fit], listed: Sequence[tuple[Candidate, list[Start]]]
+) -> list[_Trial]:
+    """The most promising effects beside the leads, every set and side of an effect once."""
+    trials = [
+        _Trial(lead, candidate, screening.beside(lead, starts))
+        for lead in leads
+        for candidate, starts in listed
+        if candidate.effect not in lead.names
+    ]
+    chosen: dict[tuple[frozenset[str], int], _Trial] = {}
+    for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
+        chosen.setdefault((trial.effects, trial.candidate.sign), trial)
+    promising = list(chosen.values())[: _BESIDE + 2 * (len(leads) - 1)]
+    return [_simulated(screening, trial) for trial in promising]
+
+
+def _simulated(screening: Screening, trial: _Trial) -> _Trial:
+    """The trial with its best starts judged by simulation."""
+    jagged = trial.candidate.dependence == "jagged"
+    best = trial.starts[: _JAGGED_TO_SIMULATE if jagged else _STARTS_TO_SIMULATE]
+    starts = screening.simulated_beside(trial.around, trial.candidate, best)
+    return replace(trial, starts=starts) if starts else trial
+
+
 def _beyond_noise(end: Fit) -> float:
     return max(end.rms**2 - 1.0, 0.0)
+
+
+def _hopeless(end: Fit, base: Fit) -> bool:
+    return _beyond_noise(end) > _HOPELESS * _beyond_noise(base)
+
+
+def _as_solvers_differ(end: Fit) -> bool:
+    """Whether play is in the set and what is left is no more than correct solvers of it may differ by."""
+    jagged = any(c.dependence == "jagged" for c in end.candidates)
+    return jagged and _beyond_noise(end) < DISAGREEMENT["jagged"] ** 2
 
 
 def _weighed(model: ResidualModel, end: Fit) -> Hypothesis:
@@ -98,44 +170,60 @@ def _part(report: Progress, begin: float, share: float) -> Progress:
     return lambda fraction, message: report(begin + share * fraction, message)
 
 
-def _fitted(
-    model: ResidualModel, around: Fit, listed: Sequence[tuple[Candidate, list[Start]]], report: Progress
-) -> list[Hypothesis]:
-    """Hypotheses with one effect more than `around`: rough fits of all, the best finished."""
-    nominal = around.jacobian[:, : around.deviations.size]
-    rough = []
-    for k, (candidate, starts) in enumerate(listed):
-        report(0.6 * k / len(listed), f"fitting {candidate.effect}")
+def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: Progress) -> list[Hypothesis]:
+    """Hypotheses with one effect more: rough fits of all, the best finished."""
+    rough: list[tuple[Fit, Fit]] = []
+    for k, trial in enumerate(trials):
+        around, candidate = trial.around, trial.candidate
+        report(0.6 * k / len(trials), f"fitting {candidate.effect}")
         ends = [
             fit(
                 model,
                 (*around.candidates, candidate),
                 (*around.coordinates, start.coordinates),
                 model.nominal.within(start.deviations),
-                nominal_jacobian=nominal,
+                nominal_jacobian=around.jacobian[:, : around.deviations.size],
                 iterations=_ROUGH_ITERATIONS,
                 tolerance=0.5,
             )
-            for start in _apart(starts, around.cost)
+            for start in _apart(trial.starts, around.cost)
         ]
-        rough.append(min(ends, key=lambda end: end.cost))
-    rough.sort(key=lambda end: end.cost)
+        rough.append((min(ends, key=lambda end: end.cost), around))
+    rough.sort(key=lambda pair: pair[0].cost)
     finished = []
-    for k, item in enumerate(rough):
+    for k, (item, around) in enumerate(rough):
         report(0.6 + 0.4 * k / len(rough), f"finishing {item.names[-1]}")
-        promising = item.cost < min(rough[0].cost + _CLOSE, around.cost - _LEAST_GAIN)
-        if k < (1 if around.candidates else 3) or promising:
+        close = item.cost < rough[0][0].cost + _CLOSE
+        # What is quick to finish is finished: among faint effects a few units of cost decide, and stated
+        # values that a gap has pulled far off need more than rough steps to come back.
+        quick = all(c.dependence == "smooth" for c in item.candidates)
+        promising = close and (quick or item.cost < around.cost - _LEAST_GAIN)
+        promising = promising or (quick and not around.candidates)
+        # An imitation of something else by play takes as long as everything besides.
+        costly = any(c.dependence == "jagged" for c in item.candidates) and not _near(item, base)
+        if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
-            item = refined(model, fine if fine.cost <= item.cost else item)
+            item = _refined(model, fine if fine.cost <= item.cost else item, base)
         finished.append(_weighed(model, item))
     return finished
 
 
-def _without_one(model: ResidualModel, found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best sets of effects with one of their members left out, fitted from where the set has ended.
+def _refined(model: ResidualModel, end: Fit, base: Fit) -> Fit:
+    """`refined` where play or the like may be the answer; beside much of a gap jags are no matter."""
+    return refined(model, end) if _near(end, base) else end
+
+
+def _near(end: Fit, base: Fit) -> bool:
+    return _beyond_noise(end) < max(_NEAR * _beyond_noise(base), _NEAR_FLOOR)
+
+
+def _reduced(
+    model: ResidualModel, base: Fit, found: Sequence[Hypothesis], listed: Sequence[Candidate]
+) -> list[Hypothesis]:
+    """The best sets of effects made simpler, fitted from where the set has ended.
 
     A set often finds its way where a member alone has stuck; what it found there is no merit of the further
-    effect, so the smaller set is given the same start.
+    effect, so the simpler set is given the same start.
     """
     known: dict[tuple[str, ...], Fit] = {}
     for hypothesis in found:
@@ -145,19 +233,35 @@ def _without_one(model: ResidualModel, found: Sequence[Hypothesis]) -> list[Hypo
     tried: list[Hypothesis] = []
     for hypothesis in sorted(found, key=lambda h: -h.log_weight)[:_SETS_TO_REDUCE]:
         whole = hypothesis.fit
-        for k in range(len(whole.candidates)) if len(whole.candidates) > 1 else ():
-            rest = tuple(c for i, c in enumerate(whole.candidates) if i != k)
+        if not _near(whole, base):
+            continue
+        for rest, x in _simpler(whole, listed) if len(whole.candidates) > 1 else ():
             before = known.get(tuple(sorted(c.effect for c in rest)))
-            x = tuple(part for i, part in enumerate(whole.coordinates) if i != k)
             start = cost_at(model, rest, x, whole.deviations)
             # From one contact sequence to the next the cost jumps: there a bad start says nothing.
             jagged = any(c.dependence == "jagged" for c in rest)
             if before is not None and start > before.cost + _CLOSE and not jagged:
                 continue
-            end = refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS))
+            end = _refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS), base)
             if before is None or end.cost < before.cost:
                 tried.append(_weighed(model, end))
     return tried
+
+
+def _simpler(
+    whole: Fit, listed: Sequence[Candidate]
+) -> Iterator[tuple[tuple[Candidate, ...], tuple[Real, ...]]]:
+    """Candidates and coordinates with one member left out, or with Coulomb friction for Stribeck's."""
+    for k, (candidate, x) in enumerate(zip(whole.candidates, whole.coordinates, strict=True)):
+        before, after = slice(None, k), slice(k + 1, None)
+        others = whole.candidates[before] + whole.candidates[after]
+        yield others, whole.coordinates[before] + whole.coordinates[after]
+        simple = without_fall(candidate, x, listed)
+        if simple is not None and simple[0] not in others:
+            yield (
+                (*whole.candidates[before], simple[0], *whole.candidates[after]),
+                (*whole.coordinates[before], simple[1], *whole.coordinates[after]),
+            )
 
 
 def _apart(starts: list[Start], without: float) -> list[Start]:

@@ -84,6 +84,7 @@ class BeamModes:
         )
 
 
+@lru_cache(maxsize=256)
 def clamped_free_modes(
     bending_stiffness_Nm2: float,
     mass_per_length_kg_m: float,
@@ -123,7 +124,7 @@ def clamped_free_modes(
     # Twice by parts: int m (r + x) phi dx + mp (r + L) phi(L) = (m / beta^4) (phi''(0) - r phi'''(0)).
     moment = 2 * m * scale / beta**2
     force = 2 * m * scale * _sigma(lam) / beta
-    return BeamModes(
+    modes = BeamModes(
         wave_number_rad_m=beta,
         omega_rad_s=beta**2 * np.sqrt(bending_stiffness_Nm2 / m),
         tip=scale * end,
@@ -132,6 +133,9 @@ def clamped_free_modes(
         length_m=length,
         scale=scale,
     )
+    for array in (beta, modes.omega_rad_s, modes.tip, modes.coupling, modes.first_moment, scale):
+        array.setflags(write=False)  # one object serves every caller
+    return modes
 
 
 def _sigma(lam: Real) -> Real:

@@ -102,10 +102,11 @@ def default_n_modes(rig: Rig) -> int:
     added.
     """
     nyquist = np.pi / rig.sampling.dt_s
-    n = 1
+    n = 4
     while n < 40 and link_modes(rig, n).omega_rad_s[-1] < nyquist:
         n += 1
-    return max(n - 1, 3)
+    below = link_modes(rig, n).omega_rad_s < nyquist
+    return min(max(int(np.sum(below)), 3), 39)
 
 
 def link_modes(rig: Rig, n_modes: int) -> BeamModes:

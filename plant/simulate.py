@@ -101,33 +101,61 @@ def simulate(
     ValueError
         One line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect given twice.
     """
-    machine = make_machine(rig, effects)
-    dt = _sampling_period(rig, dt_s)
-    plan = make_plan(machine, dt, _mode_count(n_modes), _positive("substep_s", substep_s))
-    voltage = _signal("voltage_V", voltage_V, None)
-    n_samples = voltage.size
-    acting = np.zeros(plan.delay_samples + 1 + n_samples)
-    acting[plan.delay_samples + 1 :] = _static(machine, voltage)
-    inputs = np.zeros((n_samples, 4))
-    late, early = acting[:n_samples], acting[1 : n_samples + 1]
-    inputs[:, 0], inputs[:, 1] = (late, early) if plan.substeps.size == 2 else (early, early)
-    if hub_torque_Nm is not None:
-        inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
-    if tip_force_N is not None:
-        inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
-    observed = np.empty((n_samples, 3))
-    plan.advance(inputs, observed, plan.at_rest())
-    hub, tip, tip_behind = observed.T
-    time = np.arange(n_samples, dtype=np.float64) * dt
-    noise = _noise(machine, rng, n_samples)
-    return Trajectory(
-        time_s=time,
-        voltage_V=voltage,
-        hub_angle_rad=hub + noise[:, 0],
-        tip_m=_tip_reading(machine.sensor, tip_behind, time, noise[:, 1]),
-        hub_angle_true_rad=hub,
-        tip_true_m=tip,
-    )
+    simulator = Simulator(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
+    return simulator.run(voltage_V, rng=rng, hub_torque_Nm=hub_torque_Nm, tip_force_N=tip_force_N)
+
+
+class Simulator:
+    """A machine prepared once for many records from rest; see `simulate` for arguments and errors."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        effects: Sequence[Effect] = (),
+        *,
+        dt_s: float | None = None,
+        n_modes: int | None = None,
+        substep_s: float = SUBSTEP_S,
+    ) -> None:
+        self._machine = make_machine(rig, effects)
+        self._dt_s = _sampling_period(rig, dt_s)
+        substep = _positive("substep_s", substep_s)
+        self._plan = make_plan(self._machine, self._dt_s, _mode_count(n_modes), substep)
+
+    def run(
+        self,
+        voltage_V: npt.ArrayLike,
+        *,
+        rng: np.random.Generator | None = None,
+        hub_torque_Nm: npt.ArrayLike | None = None,
+        tip_force_N: npt.ArrayLike | None = None,
+    ) -> Trajectory:
+        """One record from rest."""
+        machine, plan = self._machine, self._plan
+        voltage = _signal("voltage_V", voltage_V, None)
+        n_samples = voltage.size
+        acting = np.zeros(plan.delay_samples + 1 + n_samples)
+        acting[plan.delay_samples + 1 :] = _static(machine, voltage)
+        inputs = np.zeros((n_samples, 4))
+        late, early = acting[:n_samples], acting[1 : n_samples + 1]
+        inputs[:, 0], inputs[:, 1] = (late, early) if plan.substeps.size == 2 else (early, early)
+        if hub_torque_Nm is not None:
+            inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
+        if tip_force_N is not None:
+            inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
+        observed = np.empty((n_samples, 3))
+        plan.advance(inputs, observed, plan.at_rest())
+        hub, tip, tip_behind = observed.T
+        time = np.arange(n_samples, dtype=np.float64) * self._dt_s
+        noise = _noise(machine, rng, n_samples)
+        return Trajectory(
+            time_s=time,
+            voltage_V=voltage,
+            hub_angle_rad=hub + noise[:, 0],
+            tip_m=_tip_reading(machine.sensor, tip_behind, time, noise[:, 1]),
+            hub_angle_true_rad=hub,
+            tip_true_m=tip,
+        )
 
 
 class SampledArm:

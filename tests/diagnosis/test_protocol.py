@@ -117,14 +117,14 @@ def test_a_simulation_that_runs_away_ends_somewhere_finite():
     plant = replace(PLANT, simulation=simulation)
     (candidate, _) = plant.effects[0].candidates()
     for effects in ((), (candidate.effect_at(np.zeros(1)),)):
-        assert np.all(np.isfinite(plant.simulate(effects, GOOD.input) ** 2))
+        assert np.all(np.isfinite(plant.simulator(effects)(GOOD.input) ** 2))
 
 
 def test_the_flexible_arm_answers_by_the_same_protocol():
     case = made(white(np.random.default_rng(1)))
     voltage = case.experiments[0].voltage_V
     np.testing.assert_array_equal(
-        case.machine.simulate((), case.experiments[0].input), simulate(case.rig, voltage, ()).output
+        case.machine.simulator(())(case.experiments[0].input), simulate(case.rig, voltage, ()).output
     )
     assert case.machine.description is case.rig
     assert case.machine.weighing == Weighing()

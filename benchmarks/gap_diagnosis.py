@@ -1,0 +1,91 @@
+"""Scores of `flexlink diagnose` on cases whose answers lie beside them.
+
+    FLEXLINK_GAP=/path/to/gap OMP_NUM_THREADS=1 python -m benchmarks.gap_diagnosis
+
+diagnoses the 15 labelled cases twice, with the exact and with the uncertain rig file. Cases of one's own:
+
+    python -m workflow.blind.generate --cases 120 --seed 501 --out CASES --open
+    python -m benchmarks.gap_diagnosis --cases CASES --name gap_diagnosis_own
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.results_file import ResultsFile
+from workflow.blind.report import scores_text
+from workflow.blind.score import score
+from workflow.storage import read_json
+
+LABELLED = Path(os.environ.get("FLEXLINK_GAP", Path(__file__).parents[2] / "shared" / "gap")) / "labelled"
+
+
+def diagnose(cases: Sequence[Path], rig: str, out: Path, jobs: int) -> None:
+    """The command as a user gives it."""
+    command = ["flexlink", "diagnose", *map(str, cases), "--out", str(out), "--rig", rig, "--jobs", str(jobs)]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    done = subprocess.run(
+        [*command, "--no-controller"],
+        env={**os.environ, "PATH": path},
+        stdout=subprocess.DEVNULL,
+        check=False,
+    )
+    # 1: finished, and some answer is not certain.
+    if done.returncode not in (0, 1):
+        raise SystemExit(f"flexlink diagnose ended with {done.returncode}")
+
+
+def tell(out: ResultsFile, diagnosis: Path, cases: Path) -> None:
+    """A line a case, then the scores."""
+    timings = read_json(diagnosis / "timings.json")
+    for path in sorted(diagnosis.glob("*.json")):
+        found = read_json(path)
+        if "verdict" not in found:
+            continue
+        said = " + ".join(found["combination"]) or found["verdict"]
+        first = found["effects"][0]["probability"]
+        out(
+            f"  {path.stem:34s} {said:42s} p {first:.3f}  {found['detail_verdict']:10s} gap "
+            f"{found['gap_before']:7.3f} -> {found['gap_after']:6.3f}  "
+            f"CPU {timings.get(path.stem, {}).get('cpu_s', float('nan')):5.1f} s"
+        )
+    scored, missing = score(diagnosis, cases)
+    if missing:
+        raise SystemExit(f"no diagnosis of {', '.join(missing)}")
+    out()
+    for line in scores_text(scored).splitlines():
+        out(line)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument(
+        "--cases", type=Path, default=LABELLED, help="folder of case folders with answer.toml"
+    )
+    parser.add_argument("--name", default="gap_diagnosis", help="results file")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="keep documents and pages here")
+    given = parser.parse_args()
+    folders = sorted(path for path in given.cases.iterdir() if (path / "answer.toml").is_file())
+    if not folders:
+        parser.exit(2, f"{given.cases}: no case folders with answer.toml\n")
+    rigs = (
+        ["rig.toml", "rig_uncertain.toml"] if (folders[0] / "rig_uncertain.toml").is_file() else ["rig.toml"]
+    )
+    with tempfile.TemporaryDirectory() as room, ResultsFile(given.name, seeds="of the cases") as out:
+        for rig in rigs:
+            where = (given.keep or Path(room)) / rig.removesuffix(".toml")
+            diagnose(folders, rig, where, given.jobs)
+            out()
+            out(f"rig file: {rig}")
+            tell(out, where, given.cases)
+
+
+if __name__ == "__main__":
+    main()
