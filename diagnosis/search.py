@@ -18,8 +18,9 @@ from diagnosis.screening import Screening, Start, smallest_size
 
 Progress = Callable[[float, str], None]
 
-# An effect that changes no record by more than this many noise deviations (RMS) is not looked for.
-SMALLEST_SIZE_RATIO = 0.06
+# An effect that changes no record by more than this many noise deviations (RMS) is not looked for: alone, and
+# beside others, where two dozen further effects have as many chances to follow noise and solver errors.
+SMALLEST_SIZE_RATIO, SMALLEST_SIZE_BESIDE = 0.06, 0.2
 # Fits whose cost is within this much of the best are finished with exact derivatives.
 _CLOSE = 60.0
 # A further effect has a smaller prior (7 in log weight, 15 in cost): what gains less roughly is not finished.
@@ -60,18 +61,21 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     base = fit(model, (), (), np.zeros(model.nominal.count))
     screening = Screening(model, base)
     N = base.residuals.size
+    first: list[_Trial] = []
     listed: list[tuple[Candidate, list[Start]]] = []
     spaces = case.machine.candidates(case)
     for k, candidate in enumerate(spaces):
         report(0.05 + 0.3 * k / len(spaces), f"looking at {candidate.effect}")
         starts = screening.starts(candidate)
-        least = smallest_size(candidate, starts, SMALLEST_SIZE_RATIO) if starts else None
-        if least is not None:
-            if candidate.dependence == "jagged" and starts[0].cost - N < 0.5 * (base.cost - N):
-                starts = screening.zoomed(candidate, starts)
-            listed.append((candidate.from_size(least), starts))
+        alone = smallest_size(candidate, starts, SMALLEST_SIZE_RATIO) if starts else None
+        beside = smallest_size(candidate, starts, SMALLEST_SIZE_BESIDE) if starts else None
+        if alone is None or beside is None:
+            continue
+        if candidate.dependence == "jagged" and starts[0].cost - N < 0.5 * (base.cost - N):
+            starts = screening.zoomed(candidate, starts)
+        first.append(_Trial(base, candidate.from_size(alone), starts))
+        listed.append((candidate.from_size(beside), starts))
     found = [_weighed(model, base)]
-    first = [_Trial(base, candidate, starts) for candidate, starts in listed]
     found += _fitted(model, base, first, _part(report, 0.35, 0.35))
     for count in range(1, _MOST_EFFECTS):
         found.sort(key=lambda h: -h.log_weight)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -236,3 +238,23 @@ def test_the_same_effect_twice_is_refused():
         simulate(RIG, VOLTAGE, [effect, effect])
     with pytest.raises(ValueError, match=r"^expected effects"):
         simulate(RIG, VOLTAGE, ["coulomb_friction"])
+
+
+def test_play_at_rest_costs_no_more_than_play_in_motion():
+    """Contacts at rest must not be followed in the smallest steps (a hundred times as many)."""
+    rig = paper_link()
+    moving = prbs(8, 6, 2.0, 1200)
+    pushed_once = np.zeros(1200)
+    pushed_once[10:40], pushed_once[40:70] = 2.0, -2.0
+    effect = parse_effect({"name": "backlash", "gap_rad": 0.01})
+    simulate(rig, moving[:20], (effect,))
+
+    def seconds(voltage):
+        times = []
+        for _ in range(3):
+            start = time.perf_counter()
+            simulate(rig, voltage, (effect,))
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    assert seconds(pushed_once) < 5 * seconds(moving)
