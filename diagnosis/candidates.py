@@ -32,7 +32,8 @@ _VISCOUS_TOLERANCES = 2.0
 class Axis:
     """One coordinate of a search: parameter, scale, range, and a step for difference quotients.
 
-    `low` and `high` are in the parameter's unit; the coordinate is its logarithm on a "log" axis.
+    `low` and `high` are in the parameter's unit; the coordinate is its logarithm on a "log" axis. edge: at
+    the lower end the records no longer show what makes the effect this one (a period never completed).
     """
 
     parameter: str
@@ -40,6 +41,11 @@ class Axis:
     low: float
     high: float
     step: float
+    edge: bool = False
+
+    def at_edge(self, coordinate: float) -> bool:
+        """Whether the effect has turned into something else that happens to look like it (see `edge`)."""
+        return self.edge and self.value(coordinate) < 1.01 * self.low
 
     def coordinate(self, value: float) -> float:
         return float(np.log(value)) if self.scale == "log" else float(value)
@@ -97,6 +103,10 @@ class Candidate:
         elif "phase_rad" in values:
             values["phase_rad"] = float(np.mod(values["phase_rad"], 2 * np.pi))
         return values
+
+    def at_edge(self, x: Real) -> bool:
+        """Whether a coordinate of x (A,) is where the effect cannot be told from others any more."""
+        return any(axis.at_edge(v) for axis, v in zip(self.axes, x, strict=True))
 
     @property
     def dependence(self) -> Dependence:
@@ -253,6 +263,7 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
                     float(np.clip(0.5 * np.pi / s.swing_rad, 1.0, 20.0)),
                     80.0,
                     1e-4,
+                    edge=True,
                 ),
                 _PHASE,
             ],
@@ -262,7 +273,7 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
             "periodic_disturbance",
             [
                 _log("amplitude_Nm", 1e-6 * tau, tau),
-                Axis("frequency_Hz", "linear", 0.3 / s.duration_s, 0.5 / s.dt_s, 1e-5),
+                Axis("frequency_Hz", "linear", 0.3 / s.duration_s, 0.5 / s.dt_s, 1e-5, edge=True),
                 _PHASE,
             ],
             [],

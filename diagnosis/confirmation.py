@@ -26,19 +26,19 @@ _STILL_POSSIBLE = 20.0
 
 def confronted(
     model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis
-) -> list[Hypothesis]:
-    """The hypotheses as held-out records leave them: unchanged if they confirm the accepted one.
+) -> list[Hypothesis] | None:
+    """The hypotheses as held-out records leave them; None if these confirm the accepted one.
 
-    Else the log density with which each possible answer predicts them is added to its weights, and to those
-    of an unknown rest besides what such a rest gains by them. Where a machine states a model error of its
+    The log density with which each possible answer predicts them is added to its weights, and to those of an
+    unknown rest besides what such a rest gains by them. Where a machine states a model error of its
     own nothing changes: what held-out records leave over is what that error allows.
     """
     case = model.case
     if accepted.fit.weighing.model_error > 0 or not case.held_out:
-        return list(hypotheses)
+        return None
     first = _prediction(model, accepted.fit)
     if first.unknown_gain < _CONFIRMED:
-        return list(hypotheses)
+        return None
     best = max(max(h.log_weight, h.unknown_weight) for h in hypotheses)
     seen = {
         k: first if h is accepted else _prediction(model, h.fit)

@@ -92,6 +92,9 @@ class Diagnosis:
         Whitened, every experiment; (T, Y) in the machine's order of outputs.
     simulations : int
         Number of simulated records.
+    held_out_decided : bool
+        The held-out records did not confirm what the others said, and chose among the answers (none was
+        fitted to them).
     rivals : tuple of Rival
         Fitted explanations that contradict each other, most probable first, for `next_experiment`; only for a
         flexible link.
@@ -118,6 +121,7 @@ class Diagnosis:
     residuals_refit: dict[str, Real]
     residuals_after: dict[str, Real]
     simulations: int
+    held_out_decided: bool = False
     rivals: tuple[Rival, ...] = ()
 
 
@@ -147,8 +151,9 @@ def diagnose(
     hypotheses: Sequence[Hypothesis] = found.hypotheses
     weighed = probabilities(hypotheses, temperature=temperature)
     accepted = _accepted(hypotheses, weighed.answer)
-    if weighed.answer != "unknown":
-        hypotheses = confronted(model, hypotheses, accepted)
+    seen = confronted(model, hypotheses, accepted) if weighed.answer != "unknown" else None
+    if seen is not None:
+        hypotheses = seen
         weighed = probabilities(hypotheses, temperature=temperature)
         accepted = _accepted(hypotheses, weighed.answer)
     last = _polished(model, accepted.fit)
@@ -188,6 +193,7 @@ def diagnose(
         residuals_refit=refit,
         residuals_after=after,
         simulations=found.simulations + model.simulations,
+        held_out_decided=seen is not None,
         rivals=rivals_of(case, hypotheses, weighed.sets) if isinstance(case, Case) else (),
     )
 

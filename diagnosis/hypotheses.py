@@ -28,6 +28,8 @@ _UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
 # Where contacts switch, what two correct solvers disagree about is not white: further effects beside a jagged
 # one can follow some of it, so they have to gain more (in log weight) to be believed.
 _BESIDE_JAGGED = 20.0
+# An effect whose period the records never complete is that effect only by name.
+_AT_EDGE = 10.0
 # What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
 # records determine: an effect that contains another (Stribeck and Coulomb friction) costs nothing where it
 # imitates it, and the simpler name is the better one then.
@@ -61,11 +63,12 @@ class Hypothesis:
             exactly, besides = log_evidence_with_model_error(fit)
             return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
         evidence = log_evidence(fit)
-        return cls(
-            fit,
-            evidence + disagreement_gain(fit, rest) + prior - allowed,
-            evidence + rest.log_gain_some + prior - allowed + _UNKNOWN_BESIDE,
-        )
+        exactly = evidence + disagreement_gain(fit, rest) + prior - allowed
+        besides = evidence + rest.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
+        if any(c.at_edge(x) for c, x in zip(fit.candidates, fit.coordinates, strict=True)):
+            # Something is described well, but not by what the effect is.
+            return cls(fit, exactly - _AT_EDGE, max(besides, exactly + _UNKNOWN_BESIDE))
+        return cls(fit, exactly, besides)
 
 
 def log_prior(names: Sequence[str], n: int = len(EFFECTS)) -> float:

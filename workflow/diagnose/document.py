@@ -63,6 +63,7 @@ def document_of(
         "gap_refit": found.gap_refit,
         "gap_after": found.gap_after,
         "noise_floor": found.noise_floor,
+        "held_out_decided": found.held_out_decided,
         "gap_closed": found.gap_closed,
         "gap_closed_interval": list(found.gap_closed_interval),
         "gap_by_experiment": gaps_by_experiment(found),

@@ -92,6 +92,11 @@ def which_sentences(found: Diagnosis) -> list[str]:
             f"({probability_words(p['unknown'])}): no effect, and no set of a few effects, brings the "
             "residuals down to the noise."
         )
+    if found.held_out_decided:
+        words.append(
+            "The held-out records did not confirm what the records of estimation said alone; how well each "
+            "answer predicts them has been counted too, so they are no independent check of this choice."
+        )
     if found.ambiguous_with:
         others = [
             f"{effect_words(n)} ({probability_words(presence_of(found, n))})" for n in found.ambiguous_with

@@ -1,0 +1,68 @@
+"""Descents in bent and flat valleys; records by an independent simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diagnosis import Case, Experiment
+from diagnosis.candidates import candidates
+from diagnosis.fit import fit
+from diagnosis.residual import ResidualModel
+from diagnosis.screening import Screening
+from plant import Rig, prbs
+from workflow.blind.rigs import draw_rig, draw_tolerances, rig_toml, stated
+from workflow.blind.truth import Truth
+
+
+@pytest.fixture(scope="module")
+def compliant(tmp_path_factory):
+    """A joint that gives, on a rig whose stated values are off by draws of their tolerances."""
+    rng = np.random.default_rng(21)
+    table = draw_rig(rng)
+    tolerances = draw_tolerances(rng)
+    file = tmp_path_factory.mktemp("rig") / "rig.toml"
+    file.write_text(rig_toml(stated(table, tolerances, rng), tolerances), encoding="utf-8")
+    link = table["link"]
+    spring = link["youngs_modulus_Pa"] * link["width_m"] * link["thickness_m"] ** 3 / 4 / link["length_m"]
+    effect = {"name": "joint_compliance", "stiffness_Nm_rad": 30 * spring, "damping_Nms": 0.03 * spring}
+    experiments = []
+    for k, hold in enumerate((6, 12, 25)):
+        machine = Truth(table, [effect])
+        voltage = prbs(8, hold, 0.8, 900, rng)
+        measured = machine.record(voltage).measured(rng.standard_normal((900, 2)) * machine.noise)
+        experiments.append(
+            Experiment(f"{k}", "held_out" if k == 2 else "estimation", voltage, measured, "prbs")
+        )
+    return Case("compliant", Rig.from_toml(file), tuple(experiments)), effect
+
+
+@pytest.fixture(scope="module")
+def ends(compliant):
+    """Where the best starts of the screening end, as in a search."""
+    case, _ = compliant
+    model = ResidualModel(case)
+    base = fit(model, (), (), np.zeros(model.nominal.count))
+    (space,) = [c for c in candidates(case) if c.effect == "joint_compliance"]
+    starts = Screening(model, base).starts(space)[:12]
+    return [
+        fit(model, (space,), (s.coordinates,), model.nominal.within(s.deviations), iterations=40)
+        for s in starts
+    ]
+
+
+def test_most_starts_end_in_one_minimum_although_it_lies_in_a_flat_valley(ends):
+    best = min(ends, key=lambda end: end.cost)
+    # A descent ends where less than half a unit of the cost is to be gained.
+    assert sum(end.cost < best.cost + 1.0 for end in ends) >= len(ends) / 2
+    scale = np.sqrt(np.diag(best.hessian))
+    values = np.linalg.eigvalsh(best.hessian / np.outer(scale, scale))
+    assert values[0] < 1e-3 * values[-1]
+
+
+def test_the_minimum_is_white_noise_and_no_worse_than_the_truth(compliant, ends):
+    best = min(ends, key=lambda end: end.cost)
+    n = best.residuals.size
+    assert best.converged
+    # White noise leaves n +- sqrt(2 n), three of them; ten fitted values take ten.
+    assert abs(best.cost - (n - 10)) < 3 * np.sqrt(2 * n) + 10
