@@ -64,6 +64,13 @@ def following(found: Diagnosis) -> Following:
             )
         )
     rivals = _left(found)
+    if len(rivals) < 2 and "unknown" in found.ambiguous_with:
+        return Following(
+            (
+                "No other effect of the list is left, only a cause outside it. Repeat the experiments: what "
+                "two runs have in common beyond noise, once the answer is in the model, would be that cause.",
+            )
+        )
     if len(rivals) < 2:
         return Following(("No further experiment is needed: every other answer is ruled out.",))
     names = listing([f"{rival.name} ({probability_words(rival.probability)})" for rival in rivals])
