@@ -324,6 +324,16 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
     return tuple(found)
 
 
+def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
+    """The effect that multiplies a stated value by this factor, where it is large enough to be one."""
+    for candidate in listed:
+        if _RATIOS.get(candidate.effect) == key and [a.parameter for a in candidate.axes] == ["ratio"]:
+            low, high = candidate.box
+            if low[0] <= np.log(factor) <= high[0]:
+                return candidate, np.array([np.log(factor)])
+    return None
+
+
 _PHASE = Axis("phase_rad", "angle", 0.0, 2 * np.pi, 1e-4)
 # Effects that multiply a parameter, with the tolerance that may explain them as well.
 _RATIOS: Mapping[str, str | None] = {

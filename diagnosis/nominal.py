@@ -55,12 +55,15 @@ class NominalParameters(Generic[Stated]):
         """The rig or machine whose stated values are off by these deviations (P,)."""
         if not self.count:
             return self.stated
-        factors = {
+        return self.stated.scaled(self.factors(deviations))
+
+    def factors(self, deviations: Real) -> dict[str, float]:
+        """Key -> true value over stated value."""
+        return {
             # A tolerance of 30 % and a deviation of -3 leave a tenth of the value: no lower than 5 %.
             key: 1.0 / max(1.0 + tolerance * float(d), 0.05)
             for (key, tolerance), d in zip(self.stated.tolerances.items(), deviations, strict=True)
         }
-        return self.stated.scaled(factors)
 
     def within(self, deviations: Real) -> Real:
         return np.clip(deviations, -LARGEST_DEVIATION, LARGEST_DEVIATION)

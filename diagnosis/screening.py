@@ -22,7 +22,7 @@ from plant.simulate import simulate
 # of the inverse of the largest angle for the other.
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
 
-_HARMONIC = ("torque_ripple", "periodic_disturbance")
+HARMONIC = ("torque_ripple", "periodic_disturbance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Screening:
     def starts(self, candidate: Candidate) -> list[Start]:
         """Every start of the candidate, best first."""
         machine = self.model.nominal.at(self.around.deviations)
-        if candidate.effect in _HARMONIC and isinstance(machine, FlexibleArm):
+        if candidate.effect in HARMONIC and isinstance(machine, FlexibleArm):
             found = self._harmonic(candidate, machine.rig)
         else:
             found = [

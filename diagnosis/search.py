@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.candidates import Candidate, without_fall
+from diagnosis.candidates import Candidate, in_place_of, without_fall
 from diagnosis.fit import Fit, cost_at, fit
 from diagnosis.hypotheses import DISAGREEMENT, Hypothesis
 from diagnosis.jagged import refined
 from diagnosis.leftover import leftover
 from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.residual import ResidualModel
-from diagnosis.screening import Screening, Start, smallest_size
+from diagnosis.screening import HARMONIC, Screening, Start, smallest_size
 
 Progress = Callable[[float, str], None]
 
@@ -35,6 +35,8 @@ _SETS_TO_REDUCE = 3
 _BESIDE = 6
 # Starts of a further effect that are simulated beside a lead; fewer where a record takes ten times as long.
 _STARTS_TO_SIMULATE, _JAGGED_TO_SIMULATE = 40, 8
+# A stated value pulled this far (tolerances) may stand for an effect.
+_BEYOND_BELIEF = 2.0
 # Sets that are extended where none explains everything.
 _BEAM = 3
 # Sizes of jagged effects are refined where no more than this share of the gap is left, or this much energy.
@@ -75,6 +77,7 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
             starts = screening.zoomed(candidate, starts)
         first.append(_Trial(base, candidate.from_size(alone), starts))
         listed.append((candidate.from_size(beside), starts))
+    first += _pulled(model, base, [trial.candidate for trial in first])
     found = [_weighed(model, base)]
     found += _fitted(model, base, first, _part(report, 0.35, 0.35))
     for count in range(1, _MOST_EFFECTS):
@@ -130,21 +133,45 @@ def _further(
     screening: Screening, leads: Sequence[Fit], listed: Sequence[tuple[Candidate, list[Start]]]
 ) -> list[_Trial]:
     """The most promising effects beside the leads, every set and side of an effect once."""
+    model = screening.model
     trials = [
         _Trial(lead, candidate, screening.beside(lead, starts))
         for lead in leads
         for candidate, starts in listed
-        if candidate.effect not in lead.names
+        if candidate.effect not in lead.names and candidate.effect not in HARMONIC
+    ]
+    trials += [
+        _Trial(lead, candidate, Screening(model, lead).starts(candidate))
+        for lead in leads
+        for candidate, _ in listed
+        if candidate.effect not in lead.names and candidate.effect in HARMONIC
     ]
     chosen: dict[tuple[frozenset[str], int], _Trial] = {}
     for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
         chosen.setdefault((trial.effects, trial.candidate.sign), trial)
     promising = list(chosen.values())[: _BESIDE + 2 * (len(leads) - 1)]
-    return [_simulated(screening, trial) for trial in promising]
+    pulled = [p for lead in leads for p in _pulled(model, lead, [candidate for candidate, _ in listed])]
+    return [_simulated(screening, trial) for trial in promising] + pulled
+
+
+def _pulled(model: ResidualModel, lead: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
+    """Effects that multiply a stated value, in place of that value pulled beyond belief."""
+    trials = []
+    factors = model.nominal.factors(lead.deviations)
+    for k, key in enumerate(model.nominal.keys):
+        found = in_place_of(key, factors[key], listed) if abs(lead.deviations[k]) > _BEYOND_BELIEF else None
+        if found is None or found[0].effect in lead.names:
+            continue
+        d = lead.deviations.copy()
+        d[k] = 0.0
+        trials.append(_Trial(lead, found[0], [Start(lead.cost, found[1], d, 1.0, np.zeros(1, np.float32))]))
+    return trials
 
 
 def _simulated(screening: Screening, trial: _Trial) -> _Trial:
     """The trial with its best starts judged by simulation."""
+    if trial.candidate.effect in HARMONIC:
+        return trial
     jagged = trial.candidate.dependence == "jagged"
     best = trial.starts[: _JAGGED_TO_SIMULATE if jagged else _STARTS_TO_SIMULATE]
     starts = screening.simulated_beside(trial.around, trial.candidate, best)
@@ -190,7 +217,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
                 iterations=_ROUGH_ITERATIONS,
                 tolerance=0.5,
             )
-            for start in _apart(trial.starts, around.cost)
+            for start in _apart(trial.starts, around.cost, most=4 if candidate.dependence == "smooth" else 2)
         ]
         rough.append((min(ends, key=lambda end: end.cost), around))
     rough.sort(key=lambda pair: pair[0].cost)
@@ -261,21 +288,24 @@ def _simpler(
         others = whole.candidates[before] + whole.candidates[after]
         yield others, whole.coordinates[before] + whole.coordinates[after]
         simple = without_fall(candidate, x, listed)
-        if simple is not None and simple[0] not in others:
+        if simple is not None and simple[0].effect not in {c.effect for c in others}:
             yield (
                 (*whole.candidates[before], simple[0], *whole.candidates[after]),
                 (*whole.coordinates[before], simple[1], *whole.coordinates[after]),
             )
 
 
-def _apart(starts: list[Start], without: float) -> list[Start]:
-    """The best start, and a second one that is elsewhere and not much worse."""
+def _apart(starts: list[Start], without: float, *, most: int) -> list[Start]:
+    """The best start, and others that are elsewhere and not much worse."""
     best = starts[0]
     enough = best.cost + 0.5 * abs(without - best.cost) + 20
+    chosen = [best]
     for start in starts[1:]:
-        if start.cost < enough and _distance(start.coordinates, best.coordinates) > 0.3:
-            return [best, start]
-    return [best]
+        if len(chosen) == most or start.cost > enough:
+            break
+        if all(_distance(start.coordinates, other.coordinates) > 0.3 for other in chosen):
+            chosen.append(start)
+    return chosen
 
 
 def _distance(a: Real, b: Real) -> float:
