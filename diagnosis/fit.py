@@ -225,13 +225,15 @@ def log_evidence(fit: Fit) -> float:
     P = fit.deviations.size
     H = fit.hessian
     scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
-    _, logdet = np.linalg.slogdet(H / np.outer(scale, scale) + 1e-10 * np.eye(scale.size))
+    scaled = H / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
+    _, logdet = np.linalg.slogdet(scaled)
     logdet += 2 * float(np.sum(np.log(scale)))
     A = H.shape[0] - P
     value = -0.5 * fit.cost - 0.5 * logdet + 0.5 * A * np.log(2 * np.pi)
     if not A:
         return float(value)
-    spread = np.sqrt(np.maximum(np.diag(fit.covariance())[P:], 1e-300))
+    # Of the same matrix as the determinant: a coordinate that nothing depends on integrates to its range.
+    spread = (np.sqrt(np.diag(np.linalg.inv(scaled))) / scale)[P:]
     gradient = (fit.jacobian.T @ fit.residuals)[P:]
     at = 0
     for candidate, x in zip(fit.candidates, fit.coordinates, strict=True):

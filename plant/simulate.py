@@ -117,10 +117,10 @@ class Simulator:
         n_modes: int | None = None,
         substep_s: float = SUBSTEP_S,
     ) -> None:
-        self._machine = make_machine(rig, effects)
-        self._dt_s = _sampling_period(rig, dt_s)
+        self.machine = make_machine(rig, effects)
+        self.dt_s = _sampling_period(rig, dt_s)
         substep = _positive("substep_s", substep_s)
-        self._plan = make_plan(self._machine, self._dt_s, _mode_count(n_modes), substep)
+        self.plan = make_plan(self.machine, self.dt_s, _mode_count(n_modes), substep)
 
     def run(
         self,
@@ -131,7 +131,7 @@ class Simulator:
         tip_force_N: npt.ArrayLike | None = None,
     ) -> Trajectory:
         """One record from rest."""
-        machine, plan = self._machine, self._plan
+        machine, plan = self.machine, self.plan
         voltage = _signal("voltage_V", voltage_V, None)
         n_samples = voltage.size
         acting = np.zeros(plan.delay_samples + 1 + n_samples)
@@ -146,7 +146,7 @@ class Simulator:
         observed = np.empty((n_samples, 3))
         plan.advance(inputs, observed, plan.at_rest())
         hub, tip, tip_behind = observed.T
-        time = np.arange(n_samples, dtype=np.float64) * self._dt_s
+        time = np.arange(n_samples, dtype=np.float64) * self.dt_s
         noise = _noise(machine, rng, n_samples)
         return Trajectory(
             time_s=time,
@@ -177,11 +177,8 @@ class SampledArm:
         n_modes: int | None = None,
         substep_s: float = SUBSTEP_S,
     ) -> None:
-        self._machine = make_machine(rig, effects)
-        self._dt_s = _sampling_period(rig, dt_s)
-        self._plan = make_plan(
-            self._machine, self._dt_s, _mode_count(n_modes), _positive("substep_s", substep_s)
-        )
+        prepared = Simulator(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
+        self._machine, self._dt_s, self._plan = prepared.machine, prepared.dt_s, prepared.plan
         self._rng = rng
         self._inputs = np.zeros((1, 4))
         self._unused = np.empty((1, 3))

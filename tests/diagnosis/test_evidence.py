@@ -48,6 +48,15 @@ def test_evidence_of_a_linear_model_is_its_integral(optimum, low, high):
     assert log_evidence(fit) == pytest.approx(np.log(integral), abs=1e-6)
 
 
+@pytest.mark.parametrize("at", [0.0, 0.3, 1.0])
+def test_a_coordinate_that_nothing_depends_on_neither_adds_nor_takes(at):
+    e = np.array([1.2, 0.5, 0.0, 0.0])
+    fit = Fit(
+        (_candidate(0.0, 1.0),), np.zeros(0), (np.array([at]),), e, np.zeros((4, 1)), float(e @ e), True
+    )
+    assert log_evidence(fit) == pytest.approx(-0.5 * float(e @ e), abs=1e-6)
+
+
 def test_evidence_integrates_the_deviations_of_the_nominal():
     rng = np.random.default_rng(3)
     J, e0 = rng.standard_normal((12, 2)), rng.standard_normal(12)

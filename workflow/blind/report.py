@@ -138,7 +138,8 @@ def confusion_figure(scored: Mapping[str, Any]) -> bytes:
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1.3, aspect="auto")
         for (i, j), n in np.ndenumerate(shown):
             if n:
-                axes.text(j, i, f"{n:.0f}", ha="center", va="center")
+                colour = "white" if share[i, j] > 0.6 else "black"
+                axes.text(j, i, f"{n:.0f}", ha="center", va="center", color=colour)
         axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90)
         axes.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows])
         axes.set_xlabel("first answer")
