@@ -142,11 +142,12 @@ def fit(
         gain, cost = cost - reached, reached
         d, x, e = trial_d, trial_x, trial_e
         damping *= 0.2
-        # A short step is no end where the valley bends: there more damping is the cause.
-        left = float(gu @ np.linalg.solve(Hu + 1e-10 * np.diag(size**2), gu))
-        if gain < tolerance / model.scale and (not exact or left < _LEFT / model.scale):
-            converged = True
-            break
+        if gain < tolerance / model.scale:
+            # A short step is no end where the valley bends: there it is damping that shortens it.
+            left = float(gu @ np.linalg.solve(Hu + 1e-10 * np.diag(size**2), gu)) if exact else 0.0
+            if left < _LEFT / model.scale:
+                converged = True
+                break
     J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
     parts = tuple(np.split(x, splits[:-1])) if candidates else ()
     return Fit(tuple(candidates), d, parts, e, J, cost, converged, model.case.machine.weighing)

@@ -134,18 +134,15 @@ def _further(
 ) -> list[_Trial]:
     """The most promising effects beside the leads, every set and side of an effect once."""
     model = screening.model
-    trials = [
-        _Trial(lead, candidate, screening.beside(lead, starts))
-        for lead in leads
-        for candidate, starts in listed
-        if candidate.effect not in lead.names and candidate.effect not in HARMONIC
-    ]
-    trials += [
-        _Trial(lead, candidate, Screening(model, lead).starts(candidate))
-        for lead in leads
-        for candidate, _ in listed
-        if candidate.effect not in lead.names and candidate.effect in HARMONIC
-    ]
+    trials = []
+    for lead in leads:
+        anew = Screening(model, lead)
+        for candidate, starts in listed:
+            if candidate.effect not in lead.names:
+                # Phases and amplitudes found without the lead are of no use beside it.
+                harmonic = candidate.effect in HARMONIC
+                beside = anew.starts(candidate) if harmonic else screening.beside(lead, starts)
+                trials.append(_Trial(lead, candidate, beside))
     chosen: dict[tuple[frozenset[str], int], _Trial] = {}
     for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
         chosen.setdefault((trial.effects, trial.candidate.sign), trial)
