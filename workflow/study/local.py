@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -120,9 +121,22 @@ class LocalProcesses:
         if at_once and leash is not None:
             leash.close()
         if pool is not None:
+            if at_once:
+                _stop_feeding(pool)
             pool.shutdown(wait=True, cancel_futures=True)
         if leash is not None:
             leash.close()
+
+
+def _stop_feeding(pool: ProcessPoolExecutor) -> None:
+    """Before Python 3.11.5 a pool whose process died while a task was on its way to it waits forever.
+
+    CPython issue 94777: what is still being written needs to find that nobody reads it. Later versions close
+    the same end in a thread of their own, and two that close it at once fail.
+    """
+    queue = getattr(pool, "_call_queue", None)
+    if queue is not None and sys.version_info < (3, 11, 5):
+        queue._reader.close()
 
 
 def _begin_worker(leash: Connection) -> None:
