@@ -79,6 +79,7 @@ class JointPath:
     ripple: tuple[Ripple, ...] = ()
     disturbance: tuple[Disturbance, ...] = ()
     cubic_spring_Nm_rad3: float = 0.0
+    ground_spring_Nm_rad: float = 0.0
     compliance: TorsionSpring | None = None
     base: TorsionSpring | None = None
     backlash_gap_rad: float | None = None

@@ -47,8 +47,8 @@ class Equations:
     mass, damping, stiffness : (N, N)
     shaft : (N,)
         Motor shaft angle relative to its housing: motor torque, back-EMF, friction and ripple act here.
-    hub : (N,)
-        Absolute hub angle.
+    hub, motor : (N,)
+        Absolute angles of the hub and of its motor side; the same but for a backlash.
     encoder : (N,)
         Measured hub angle (hub minus base).
     root : (N,)
@@ -67,6 +67,7 @@ class Equations:
     stiffness: Real
     shaft: Real
     hub: Real
+    motor: Real
     encoder: Real
     root: Real
     tip: Real
@@ -122,7 +123,7 @@ def link_modes(rig: Rig, n_modes: int) -> BeamModes:
 
 
 def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
-    """Linear equations of the machine: rig, joint compliance, base compliance, the two sides of a backlash.
+    """Linear equations of the machine: rig, springs at joint, base and hub, the two sides of a backlash.
 
     Torques that are not linear in the state (friction, contact, ripple, cubic spring, gravity) are not in it.
     """
@@ -163,6 +164,7 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         if spring is not None:
             stiffness += spring.stiffness_Nm_rad * np.outer(twist, twist)
             damping += spring.damping_Nms * np.outer(twist, twist)
+    stiffness += joint.ground_spring_Nm_rad * np.outer(motor, motor)
     if joint.base is not None:
         mass += joint.base.inertia_kg_m2 * np.outer(base, base)
     return Equations(
@@ -171,6 +173,7 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         stiffness=stiffness,
         shaft=shaft,
         hub=hub,
+        motor=motor,
         encoder=hub - base,
         root=root,
         tip=(rig.hub.radius_m + rig.link.length_m) * root + modes.tip @ deflection,
@@ -187,6 +190,12 @@ def link_inertia_kg_m2(rig: Rig) -> float:
         rig.link.mass_per_length_kg_m * ((r + length) ** 3 - r**3) / 3.0
         + rig.payload.mass_kg * (r + length) ** 2
     )
+
+
+def static_moment_kg_m(rig: Rig) -> float:
+    """Mass times distance from the hub axis of the straight link and payload: what gravity pulls at."""
+    r, length = rig.hub.radius_m, rig.link.length_m
+    return rig.link.mass_per_length_kg_m * length * (r + length / 2) + rig.payload.mass_kg * (r + length)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,13 @@ from scipy.linalg import expm
 
 from plant.kernel import CONTACT, CUBIC, FRICTION, GRAVITY, SINE, STRIBECK, run
 from plant.machine import Machine
-from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion
+from plant.modal import (
+    MOTOR_SIDE_SHARE,
+    Equations,
+    default_n_modes,
+    equations_of_motion,
+    static_moment_kg_m,
+)
 
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]
@@ -282,12 +288,9 @@ class _Builder:
             add(SINE, values, self._position(eq.shaft), self._column(eq.shaft))
         if machine.joint.cubic_spring_Nm_rad3 != 0:
             values = machine.joint.cubic_spring_Nm_rad3, 0.0, 0.0
-            add(CUBIC, values, self._position(eq.hub), self._column(eq.hub))
+            add(CUBIC, values, self._position(eq.motor), self._column(eq.motor))
         if machine.gravity_m_s2 != 0:
-            rig = machine.rig
-            r, length, m = rig.hub.radius_m, rig.link.length_m, rig.link.mass_per_length_kg_m
-            moment = m * length * (r + length / 2) + rig.payload.mass_kg * (r + length)
-            values = machine.gravity_m_s2, moment, 0.0
+            values = machine.gravity_m_s2, static_moment_kg_m(machine.rig), 0.0
             add(GRAVITY, values, self._position(eq.root), self._column(eq.root))
             for direction in np.eye(eq.mass.shape[0])[eq.first_mode :]:
                 add(GRAVITY, values, self._position(direction), self._column(direction))

@@ -121,7 +121,7 @@ class PeriodicDisturbance(Effect):
 
 
 class HardeningSpring(Effect):
-    """Cubic spring from hub to ground, torque -k3 theta^3, without a linear part."""
+    """Cubic spring from hub (motor side, with backlash) to ground, torque -k3 theta^3, no linear part."""
 
     id = "hardening_spring"
     group = "joint"
@@ -132,6 +132,23 @@ class HardeningSpring(Effect):
     def modify(self, machine: Machine) -> Machine:
         total = machine.joint.cubic_spring_Nm_rad3 + self.cubic_Nm_rad3
         return with_joint(machine, cubic_spring_Nm_rad3=total)
+
+
+class GroundSpring(Effect):
+    """Linear spring from hub (motor side, with backlash) to ground, torque -k theta.
+
+    Not in `EFFECTS`: no answer of a diagnosis, which needs it to tell gravity from what looks like it.
+    """
+
+    id = "ground_spring"
+    group = "joint"
+    neutral = MappingProxyType({"stiffness_Nm_rad": 0.0})
+
+    stiffness_Nm_rad: NotNegative = Field(description="stiffness k")
+
+    def modify(self, machine: Machine) -> Machine:
+        total = machine.joint.ground_spring_Nm_rad + self.stiffness_Nm_rad
+        return with_joint(machine, ground_spring_Nm_rad=total)
 
 
 class JointCompliance(Effect):
