@@ -325,12 +325,12 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
 
 
 def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
-    """The effect that multiplies a stated value by this factor, where it is large enough to be one."""
+    """The effect that multiplies a stated value by this factor, or by the nearest one worth a name."""
+    sign = 1 if factor > 1 else -1
     for candidate in listed:
-        if _RATIOS.get(candidate.effect) == key and [a.parameter for a in candidate.axes] == ["ratio"]:
-            low, high = candidate.box
-            if low[0] <= np.log(factor) <= high[0]:
-                return candidate, np.array([np.log(factor)])
+        ratio = [a.parameter for a in candidate.axes] == ["ratio"] and candidate.sign == sign
+        if ratio and _RATIOS.get(candidate.effect) == key:
+            return candidate, np.clip([np.log(factor)], *candidate.box)
     return None
 
 

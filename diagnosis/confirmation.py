@@ -17,6 +17,7 @@ from diagnosis.hypotheses import Hypothesis, disagreement_gain
 from diagnosis.leftover import Leftover, leftover
 from diagnosis.machine_protocol import Real
 from diagnosis.residual import ResidualModel
+from diagnosis.solver_spread import solver_spread, without_drift
 
 # Log odds for an unknown rest that held-out records may add before the answer counts as not confirmed.
 _CONFIRMED = 2.0
@@ -52,7 +53,9 @@ def confronted(
 
 def _with(hypothesis: Hypothesis, seen: _Prediction) -> Hypothesis:
     known = hypothesis.log_weight + seen.log_density + seen.allowed_gain
-    unknown = hypothesis.unknown_weight + seen.log_density + seen.allowed_gain + seen.unknown_gain
+    unknown = hypothesis.unknown_weight + seen.log_density + seen.allowed_gain
+    if hypothesis.is_answer:
+        unknown += seen.unknown_gain
     return replace(hypothesis, log_weight=known, unknown_weight=unknown)
 
 
@@ -73,11 +76,12 @@ class _Prediction:
 def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
     case = model.case
     outputs = case.noise.size
+    fitted, _ = without_drift(end.residuals, solver_spread(model, end))
     e, log_density = _unpredicted(model, end)
     segments = [len(record.output) for record in case.estimation]
     both = [*segments, *(len(record.output) for record in case.held_out)]
-    before = leftover(end.residuals, segments, outputs)
-    after = leftover(np.concatenate([end.residuals, e]), both, outputs)
+    before = leftover(fitted, segments, outputs)
+    after = leftover(np.concatenate([fitted, e]), both, outputs)
     allowed = disagreement_gain(end, after) - disagreement_gain(end, before)
     return _Prediction(log_density, allowed, _odds(end, after) - _odds(end, before))
 
@@ -89,13 +93,19 @@ def _odds(end: Fit, rest: Leftover) -> float:
 def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     """Held-out residuals (N,) without what the fitted values' uncertainty may do to them; log density.
 
-    The most probable shift of the values given both kinds of records, linearised at the fit.
+    The most probable shift of the values given both kinds of records, linearised at the fit. Where contacts
+    switch the noise includes what correct solvers disagree about.
     """
     case = model.case
     e = model.of(end.deviations, end.effects, case.held_out)
     if not end.jacobian.shape[1]:
         return e, -0.5 * float(e @ e)
     J = difference_quotients(model, end, e, case.held_out)
+    spread = solver_spread(model, end, case.held_out)
+    narrow, drift = without_drift(e, spread)
+    density = drift.log_gain + 0.5 * float(narrow @ narrow - e @ e)
+    if drift.size > 0:
+        e, J = narrow, J / np.sqrt(1.0 + spread)[:, None]
     H = end.hessian
     scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
     H = H + 1e-8 * np.diag(scale**2)
@@ -109,7 +119,7 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     determinants = (
         np.linalg.slogdet(A / np.outer(scale, scale))[1] - (np.linalg.slogdet(H / np.outer(scale, scale))[1])
     )
-    return np.asarray(e + J @ step), -0.5 * (cost + float(determinants))
+    return np.asarray(e + J @ step), density - 0.5 * (cost + float(determinants))
 
 
 def _inside(end: Fit, step: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -14,10 +14,11 @@ from diagnosis.confirmation import confronted
 from diagnosis.discrimination import Rival
 from diagnosis.fit import Fit, fit
 from diagnosis.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
+from diagnosis.imitation import IMITATED, imitations
 from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.model_error import at_its_own_level
 from diagnosis.residual import ResidualModel, pooled_rms
-from diagnosis.rivals import rivals_of
+from diagnosis.rivals import rival_of_fit, rivals_of
 from diagnosis.rounding import Rounding, leads_over, rounding_effect
 from diagnosis.search import Progress, search
 
@@ -31,6 +32,8 @@ TEMPERATURE = 1.0
 FAR_OFF = 3.0
 # Below this probability of the first answer, or with a rival above that one, the answer is called ambiguous.
 _SURE, _RIVAL = 0.8, 0.05
+# At most so many explanations are told apart by the next experiment.
+_RIVALS = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
 _AS_GOOD = 6.0
 _LAST_ITERATIONS = 30
@@ -95,6 +98,9 @@ class Diagnosis:
     held_out_decided : bool
         The held-out records did not confirm what the others said, and chose among the answers (none was
         fitted to them).
+    unlisted : tuple of effects
+        What explains the records where the answer is unknown and yet can be named: a cause beyond the list
+        that looks like one of it, with whatever it acts beside.
     rivals : tuple of Rival
         Fitted explanations that contradict each other, most probable first, for `next_experiment`; only for a
         flexible link.
@@ -122,6 +128,7 @@ class Diagnosis:
     residuals_after: dict[str, Real]
     simulations: int
     held_out_decided: bool = False
+    unlisted: tuple[Any, ...] = ()
     rivals: tuple[Rival, ...] = ()
 
 
@@ -148,14 +155,18 @@ def diagnose(
     rng = np.random.default_rng(0) if rng is None else rng
     found = search(case, progress)
     model = ResidualModel(case)
-    hypotheses: Sequence[Hypothesis] = found.hypotheses
-    weighed = probabilities(hypotheses, temperature=temperature)
-    accepted = _accepted(hypotheses, weighed.answer)
-    seen = confronted(model, hypotheses, accepted) if weighed.answer != "unknown" else None
+    every: Sequence[Hypothesis]
+    every = (*found.hypotheses, *imitations(model, found.hypotheses, found.base))
+    weighed = probabilities(every, temperature=temperature)
+    accepted = _accepted(every, weighed.answer)
+    seen = confronted(model, every, accepted) if weighed.answer != "unknown" else None
     if seen is not None:
-        hypotheses = seen
-        weighed = probabilities(hypotheses, temperature=temperature)
-        accepted = _accepted(hypotheses, weighed.answer)
+        every = seen
+        weighed = probabilities(every, temperature=temperature)
+        accepted = _accepted(every, weighed.answer)
+    hypotheses = [h for h in every if h.is_answer]
+    imitated = [h for h in every if not h.is_answer]
+    likeliest = max(every, key=lambda h: h.unknown_weight)
     last = _polished(model, accepted.fit)
     before = model.by_experiment(np.zeros(model.nominal.count), ())
     refit = model.by_experiment(found.base.deviations, ())
@@ -194,8 +205,24 @@ def diagnose(
         residuals_after=after,
         simulations=found.simulations + model.simulations,
         held_out_decided=seen is not None,
-        rivals=rivals_of(case, hypotheses, weighed.sets) if isinstance(case, Case) else (),
+        unlisted=likeliest.fit.effects if verdict == "unknown" and not likeliest.is_answer else (),
+        rivals=_to_part(case, hypotheses, weighed, imitated) if isinstance(case, Case) else (),
     )
+
+
+def _to_part(
+    case: Case,
+    hypotheses: Sequence[Hypothesis],
+    weighed: Probabilities,
+    imitated: Sequence[Hypothesis],
+) -> tuple[Rival, ...]:
+    """Rivals of the next experiment; what is unknown is one where it has a name, as the double of gravity."""
+    rivals = rivals_of(case, hypotheses, weighed.sets)
+    if not imitated or min(weighed.presence[IMITATED], weighed.cause["unknown"]) < _RIVAL:
+        return rivals
+    likeliest = max(imitated, key=lambda h: h.unknown_weight)
+    double = rival_of_fit(case, likeliest.fit, weighed.cause["unknown"])
+    return tuple(sorted((*rivals, double), key=lambda rival: -rival.probability))[:_RIVALS]
 
 
 def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:

@@ -22,6 +22,8 @@ from diagnosis.residual import ResidualModel
 # Steps of difference quotients along the deviations. Where contacts switch, a small step measures which way
 # one contact fell; a large one averages over many.
 _DEVIATION_STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
+# The same for coordinates of effects beside a jagged one, which have small steps of their own.
+_STEP_BESIDE_JAGGED = {"log": 4e-2, "angle": 4e-2, "linear": 5e-3}
 # Damping of a step: in proportion to the Hessian's diagonal and, so that values the records say little about
 # do not run away along a bent valley, to this (times 1 per tolerance squared, or per unit of a logarithm).
 _UNIT = 1e3
@@ -90,7 +92,7 @@ def fit(
     splits = np.cumsum([len(c.axes) for c in candidates])
     low = np.concatenate([c.box[0] for c in candidates]) if candidates else np.zeros(0)
     high = np.concatenate([c.box[1] for c in candidates]) if candidates else np.zeros(0)
-    steps = np.array([axis.step for c in candidates for axis in c.axes])
+    steps = _steps(candidates)
     x = np.clip(np.concatenate(list(coordinates)) if candidates else np.zeros(0), low, high)
     d = deviations.copy()
 
@@ -171,8 +173,22 @@ def difference_quotients(
 
     x = np.concatenate(list(end.coordinates)) if end.candidates else np.zeros(0)
     high = np.concatenate([c.box[1] for c in end.candidates]) if end.candidates else np.zeros(0)
-    steps = np.array([axis.step for c in end.candidates for axis in c.axes])
+    steps = _steps(end.candidates)
     return _jacobian(model, end.deviations, x, e, effects, steps, high, None, experiments)
+
+
+def _steps(candidates: Sequence[Candidate]) -> Real:
+    """Of difference quotients along all coordinates (A,)."""
+    jagged = any(c.dependence == "jagged" for c in candidates)
+    return np.array(
+        [
+            max(axis.step, _STEP_BESIDE_JAGGED[axis.scale])
+            if jagged and c.dependence != "jagged"
+            else axis.step
+            for c in candidates
+            for axis in c.axes
+        ]
+    )
 
 
 def _effects(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:

@@ -15,6 +15,7 @@ import numpy as np
 from diagnosis.fit import Fit, log_evidence
 from diagnosis.leftover import Leftover
 from diagnosis.model_error import log_evidence_with_model_error
+from diagnosis.solver_spread import NO_DRIFT, Drift
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); with play two correct solvers differ by 0.2.
@@ -27,9 +28,14 @@ _UNKNOWN = ("unknown",)
 _UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
 # Where contacts switch, what two correct solvers disagree about is not white: further effects beside a jagged
 # one can follow some of it, so they have to gain more (in log weight) to be believed.
-_BESIDE_JAGGED = 20.0
+BESIDE_JAGGED = 20.0
+# log prior density lost per squared deviation beyond three: no evidence pays for that.
+_CUT = 1e3
+# Something unknown may have any size over four decades; what solvers of play disagree about has one known to
+# a factor of three: the log of the ratio of these ranges (in their logarithms).
+_KNOWN_SIZE = 2.0
 # An effect whose period the records never complete is that effect only by name.
-_AT_EDGE = 10.0
+_AT_EDGE = 2.0
 # What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
 # records determine: an effect that contains another (Stribeck and Coulomb friction) costs nothing where it
 # imitates it, and the simpler name is the better one then.
@@ -40,7 +46,8 @@ _PER_PARAMETER = 1.0
 class Hypothesis:
     """A fit, what it leaves over, and logs of (prior probability times evidence), comparable within a case.
 
-    log_weight : exactly these effects, with the disagreement their solvers are allowed.
+    log_weight : exactly these effects, with the disagreement their solvers are allowed; -inf for a cause
+        beyond the list, which is no answer by itself but part of what is unknown.
     unknown_weight : these effects, none of them perhaps, and something else that no effect describes.
     """
 
@@ -52,17 +59,22 @@ class Hypothesis:
     def names(self) -> tuple[str, ...]:
         return self.fit.names
 
+    @property
+    def is_answer(self) -> bool:
+        return self.log_weight > -np.inf
+
     @classmethod
-    def of(cls, fit: Fit, rest: Leftover) -> Hypothesis:
+    def of(cls, fit: Fit, rest: Leftover, drift: Drift = NO_DRIFT) -> Hypothesis:
+        """rest: what the fit leaves over, of residuals without the drift of correct solvers."""
         beside = len(fit.names) - 1
         jagged = any(candidate.dependence == "jagged" for candidate in fit.candidates)
-        allowed = _BESIDE_JAGGED * beside if jagged else 0.0
+        allowed = BESIDE_JAGGED * beside if jagged else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
         prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
         if fit.weighing.model_error > 0:
             exactly, besides = log_evidence_with_model_error(fit)
             return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
-        evidence = log_evidence(fit)
+        evidence = log_evidence(fit) + drift.log_gain
         exactly = evidence + disagreement_gain(fit, rest) + prior - allowed
         besides = evidence + rest.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
         if any(c.at_edge(x) for c, x in zip(fit.candidates, fit.coordinates, strict=True)):
@@ -80,13 +92,20 @@ def log_prior(names: Sequence[str], n: int = len(EFFECTS)) -> float:
     return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
 
 
+def log_prior_unknown() -> float:
+    """log prior probability of a cause that is not listed, alone."""
+    return float(np.log(_PRIOR_UNKNOWN))
+
+
 def disagreement_gain(fit: Fit, rest: Leftover) -> float:
     """log evidence gained by the disagreement that two correct solvers of these effects may have.
 
-    Its size has a half-normal prior; what is left over beyond that is no disagreement any more.
+    Its size has a half-normal prior, cut off beyond three deviations: more than that is no disagreement.
     """
     solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
-    return max(0.0, rest.log_gain - 0.5 * (rest.size / max(solvers)) ** 2)
+    z = rest.size / max(solvers)
+    expected = _KNOWN_SIZE if any(c.dependence == "jagged" for c in fit.candidates) else 0.0
+    return max(0.0, rest.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +158,7 @@ def probabilities(hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0)
     if not temperature > 0:
         raise ValueError(f"temperature must be above zero; got {temperature}")
     best: dict[tuple[str, ...], Hypothesis] = {}
-    for hypothesis in hypotheses:
+    for hypothesis in (h for h in hypotheses if h.is_answer):
         key = tuple(sorted(hypothesis.names))
         if key not in best or hypothesis.log_weight > best[key].log_weight:
             best[key] = hypothesis

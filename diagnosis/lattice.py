@@ -18,6 +18,8 @@ from diagnosis.machine_protocol import Real
 _DIGITS = 6
 # A lattice is believed when its step is this much coarser than what the file resolves.
 _COARSER = 20.0
+# Few values are a lattice only where each of them is read again and again.
+_MANY, _READINGS = 10, 20
 # And when it widens the noise: step / sqrt(12) against this share of it.
 _NOTICEABLE = 0.1
 
@@ -34,11 +36,11 @@ def lattice_step(signals: Sequence[Real], noise: float) -> float:
         raise ValueError(f"the noise level must be above zero; got {noise}")
     values = np.unique(np.concatenate(list(signals)))
     values = values[values != 0]
-    if values.size < 10:
+    if values.size == 0 or (values.size < _MANY and sum(map(len, signals)) < _READINGS * values.size):
         return 0.0
     written = 0.5 * 10.0 ** (np.floor(np.log10(np.abs(values))) + 1 - _DIGITS)
     coarse = float(np.max(written))
-    gaps = np.diff(values)
+    gaps = np.diff(np.union1d(values, 0.0))
     gaps = gaps[gaps > 4 * coarse]
     if gaps.size == 0 or np.min(gaps) < _COARSER * coarse:
         # Values nearer than any believable step: only a lattice finer than the file resolves could hold them.

@@ -9,12 +9,13 @@ import numpy as np
 
 from diagnosis.candidates import Candidate, in_place_of, without_fall
 from diagnosis.fit import Fit, cost_at, fit
-from diagnosis.hypotheses import DISAGREEMENT, Hypothesis
+from diagnosis.hypotheses import BESIDE_JAGGED, DISAGREEMENT, Hypothesis
 from diagnosis.jagged import refined
 from diagnosis.leftover import leftover
 from diagnosis.machine_protocol import CaseOfMachine, Real
 from diagnosis.residual import ResidualModel
 from diagnosis.screening import HARMONIC, Screening, Start, smallest_size
+from diagnosis.solver_spread import NO_DRIFT, solver_spread, without_drift
 
 Progress = Callable[[float, str], None]
 
@@ -25,6 +26,8 @@ SMALLEST_SIZE_RATIO, SMALLEST_SIZE_BESIDE = 0.06, 0.2
 _CLOSE = 60.0
 # A further effect has a smaller prior (7 in log weight, 15 in cost): what gains less roughly is not finished.
 _LEAST_GAIN = 10.0
+# The same before a fit, by its linear estimate, which is a little low.
+_PROMISE = 5.0
 _ROUGH_ITERATIONS, _FINE_ITERATIONS = 8, 15
 _MOST_EFFECTS = 3
 # Where two effects leave more than this share of the gap, a third would only imitate something unknown.
@@ -37,8 +40,8 @@ _BESIDE = 6
 _STARTS_TO_SIMULATE, _JAGGED_TO_SIMULATE = 40, 8
 # A stated value pulled this far (tolerances) may stand for an effect.
 _BEYOND_BELIEF = 2.0
-# Sets that are extended where none explains everything.
-_BEAM = 3
+# Single effects, and pairs, that are extended where no set explains everything.
+_BEAM = {1: 3, 2: 1}
 # Sizes of jagged effects are refined where no more than this share of the gap is left, or this much energy.
 _NEAR, _NEAR_FLOOR = 0.25, 0.3
 
@@ -78,16 +81,16 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
         first.append(_Trial(base, candidate.from_size(alone), starts))
         listed.append((candidate.from_size(beside), starts))
     first += _pulled(model, base, [trial.candidate for trial in first])
-    found = [_weighed(model, base)]
+    found = [weighed(model, base, base)]
     found += _fitted(model, base, first, _part(report, 0.35, 0.35))
     for count in range(1, _MOST_EFFECTS):
         found.sort(key=lambda h: -h.log_weight)
         best, leads = found[0], _leads(found, count)
         if not leads or len(best.names) < (count if _explained(found) else 1):
             break
-        if count > 1 and (_hopeless(leads[0], base) or _as_solvers_differ(leads[0])):
+        if count > 1 and (_hopeless(leads[0], base) or _as_solvers_differ(model, leads[0])):
             break
-        further = _further(screening, leads, listed)
+        further = _further(screening, leads, listed, explained=_explained(found))
         found += _fitted(model, base, further, _part(report, 0.6 + 0.1 * count, 0.1))
         found += _reduced(model, base, found, [candidate for candidate, _ in listed])
     found.sort(key=lambda h: -h.log_weight)
@@ -117,7 +120,8 @@ def _leads(found: Sequence[Hypothesis], count: int) -> list[Fit]:
     """Sets of so many effects to which one more is added, best first.
 
     The best one as soon as a set explains everything. Before, what is left over says little about which
-    member of the true set has been found: the three that would leave the most probable unknown rest.
+    member of the true set has been found: of single effects the three that would leave the most probable
+    unknown rest.
     """
     if _explained(found):
         best = max(found, key=lambda h: h.log_weight)
@@ -126,11 +130,15 @@ def _leads(found: Sequence[Hypothesis], count: int) -> list[Fit]:
     for h in sorted(found, key=lambda h: -h.unknown_weight):
         if len(h.names) == count:
             leads.setdefault(frozenset(h.names), h.fit)
-    return list(leads.values())[:_BEAM]
+    return list(leads.values())[: _BEAM[count]]
 
 
 def _further(
-    screening: Screening, leads: Sequence[Fit], listed: Sequence[tuple[Candidate, list[Start]]]
+    screening: Screening,
+    leads: Sequence[Fit],
+    listed: Sequence[tuple[Candidate, list[Start]]],
+    *,
+    explained: bool,
 ) -> list[_Trial]:
     """The most promising effects beside the leads, every set and side of an effect once."""
     model = screening.model
@@ -147,8 +155,16 @@ def _further(
     for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
         chosen.setdefault((trial.effects, trial.candidate.sign), trial)
     promising = list(chosen.values())[: _BESIDE + 2 * (len(leads) - 1)]
+    if explained:
+        # Nothing is left over; what linear estimates do not even promise is not fitted.
+        promising = [t for t in promising if t.around.cost - t.starts[0].cost > _least_promise(t.around)]
     pulled = [p for lead in leads for p in _pulled(model, lead, [candidate for candidate, _ in listed])]
     return [_simulated(screening, trial) for trial in promising] + pulled
+
+
+def _least_promise(lead: Fit) -> float:
+    """Beside play a further effect has to gain more (in log weight; half of that in linear estimates)."""
+    return _PROMISE + (BESIDE_JAGGED if any(c.dependence == "jagged" for c in lead.candidates) else 0.0)
 
 
 def _pulled(model: ResidualModel, lead: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
@@ -183,15 +199,21 @@ def _hopeless(end: Fit, base: Fit) -> bool:
     return _beyond_noise(end) > _HOPELESS * _beyond_noise(base)
 
 
-def _as_solvers_differ(end: Fit) -> bool:
+def _as_solvers_differ(model: ResidualModel, end: Fit) -> bool:
     """Whether play is in the set and what is left is no more than correct solvers of it may differ by."""
-    jagged = any(c.dependence == "jagged" for c in end.candidates)
-    return jagged and _beyond_noise(end) < DISAGREEMENT["jagged"] ** 2
+    if not any(c.dependence == "jagged" for c in end.candidates):
+        return False
+    e, drift = without_drift(end.residuals, solver_spread(model, end))
+    return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["jagged"], drift.size) ** 2
 
 
-def _weighed(model: ResidualModel, end: Fit) -> Hypothesis:
+def weighed(model: ResidualModel, end: Fit, base: Fit) -> Hypothesis:
+    """A fit with its log weights; base: the fit without any effect."""
     segments = [len(experiment.output) for experiment in model.case.estimation]
-    return Hypothesis.of(end, leftover(end.residuals, segments, model.case.noise.size))
+    e, drift = end.residuals, NO_DRIFT
+    if _near(end, base):
+        e, drift = without_drift(e, solver_spread(model, end))
+    return Hypothesis.of(end, leftover(e, segments, model.case.noise.size), drift)
 
 
 def _part(report: Progress, begin: float, share: float) -> Progress:
@@ -232,7 +254,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
         if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
             item = _refined(model, fine if fine.cost <= item.cost else item, base)
-        finished.append(_weighed(model, item))
+        finished.append(weighed(model, item, base))
     return finished
 
 
@@ -272,7 +294,7 @@ def _reduced(
                 continue
             end = _refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS), base)
             if before is None or end.cost < before.cost:
-                tried.append(_weighed(model, end))
+                tried.append(weighed(model, end, base))
     return tried
 
 

@@ -33,6 +33,15 @@ def test_step_of_rounded_records(step):
     assert lattice_step(_records(np.random.default_rng(0), step), NOISE) == pytest.approx(step, rel=1e-6)
 
 
+@pytest.mark.parametrize("reach", [0.6, 1.4, 3.4])
+def test_step_of_a_sensor_that_moves_by_a_few_steps_only(reach):
+    rng = np.random.default_rng(2)
+    step = 0.0707
+    records = [np.round(reach * step * np.sin(rng.uniform(0, 7, 800)) / step) * step for _ in range(2)]
+    assert np.unique(np.concatenate(records)).size == 2 * round(reach) + 1
+    assert lattice_step(records, NOISE) == pytest.approx(step, rel=1e-6)
+
+
 def test_no_step_where_there_is_none_or_none_that_matters():
     rng = np.random.default_rng(1)
     assert lattice_step(_records(rng, 0.0), NOISE) == 0

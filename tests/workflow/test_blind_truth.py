@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import workflow.blind
-from plant.effects import EFFECTS, parse_effects
+from plant.effects import EFFECTS, GroundSpring, parse_effects
 from plant.rig import Rig
 from plant.simulate import simulate
 from workflow.blind.beam import link_basis
@@ -108,6 +108,18 @@ def test_every_effect_agrees_with_the_plants_to_a_small_part_of_the_noise(name):
     assert np.all(_noise_deviations(Truth(RIG, effects), effects, _voltage()) < 0.05)
 
 
+def test_a_spring_to_ground_agrees_with_the_plants():
+    # Beyond the list, but the diagnosis has to know it: gravity looks like it.
+    voltage = _voltage()
+    ours = Truth(RIG, [{"name": "ground_spring", "stiffness_Nm_rad": 0.5}])
+    record = ours.record(voltage).measured(np.zeros((voltage.size, 2)))
+    rig = Rig.model_validate(RIG)
+    plant = simulate(rig, voltage, [GroundSpring(stiffness_Nm_rad=0.5)]).output
+    nothing = simulate(rig, voltage).output
+    assert np.all(np.std(record - nothing, axis=0) > 5 * ours.noise)
+    assert np.all(np.sqrt(np.mean((record - plant) ** 2, axis=0)) < 0.05 * ours.noise)
+
+
 def test_no_effect_agrees_with_the_plant():
     assert np.all(_noise_deviations(Truth(RIG), [], _voltage()) < 0.05)
 
@@ -119,11 +131,14 @@ def test_quantisation_agrees_but_for_values_at_an_edge():
     assert np.mean(np.abs(ours - plant) > 1e-9) < 0.02
 
 
-def test_backlash_agrees_while_the_sequence_of_contacts_is_the_same():
+@pytest.mark.parametrize(
+    "further", [[], [{"name": "hardening_spring", "cubic_Nm_rad3": 20.0}]], ids=["alone", "spring"]
+)
+def test_backlash_agrees_while_the_sequence_of_contacts_is_the_same(further):
     # Contact sequences are sensitive (0.2 noise deviations between correct solvers): a single pulse is not.
     voltage = np.zeros(300)
     voltage[5:60] = 1.0
-    effects = [{"name": "backlash", "gap_rad": 0.01}]
+    effects = [{"name": "backlash", "gap_rad": 0.01}, *further]
     assert np.all(_noise_deviations(Truth(RIG, effects), effects, voltage) < 0.1)
 
 

@@ -64,6 +64,7 @@ def document_of(
         "gap_after": found.gap_after,
         "noise_floor": found.noise_floor,
         "held_out_decided": found.held_out_decided,
+        "unlisted": [effect.to_dict() for effect in found.unlisted],
         "gap_closed": found.gap_closed,
         "gap_closed_interval": list(found.gap_closed_interval),
         "gap_by_experiment": gaps_by_experiment(found),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
+from diagnosis.imitation import IMITATED
 from workflow.diagnose.words import (
     effect_words,
     key_words,
@@ -86,6 +87,11 @@ def which_sentences(found: Diagnosis) -> list[str]:
         words += parameter_sentences(found, found.combination)
     elif found.verdict == "none":
         words.append(f"That nothing is missing is {sureness(p['none'])} ({probability_words(p['none'])}).")
+    elif found.verdict == "unknown" and found.unlisted:
+        words.append(
+            f"That the cause is outside the list is {sureness(p['unknown'])} "
+            f"({probability_words(p['unknown'])}): what explains the records best is {unlisted_words(found)}."
+        )
     elif found.verdict == "unknown":
         words.append(
             f"That the cause is outside the list is {sureness(p['unknown'])} "
@@ -102,6 +108,11 @@ def which_sentences(found: Diagnosis) -> list[str]:
             f"{effect_words(n)} ({probability_words(presence_of(found, n))})" for n in found.ambiguous_with
         ]
         words.append(f"It could also be {listing(others)}: these records do not rule that out.")
+        if IMITATED in found.combination and "unknown" in found.ambiguous_with:
+            words.append(
+                "A linear spring from hub to ground (a cable, a hose) is not on the list and pulls as "
+                "gravity does while angles are small; larger swings would tell them apart."
+            )
     elif found.verdict == "effect":
         value, name = max(
             (presence_of(found, n), n) for n in found.probabilities if n not in found.combination
@@ -112,6 +123,15 @@ def which_sentences(found: Diagnosis) -> list[str]:
             else "No other answer is likelier than one in a thousand."
         )
     return words
+
+
+def unlisted_words(found: Diagnosis) -> str:
+    """A cause beyond the list, and what it acts beside, with their sizes."""
+    parts = []
+    for effect in found.unlisted:
+        sizes = listing([parameter_words(key, value, None) for key, value in effect.parameters().items()])
+        parts.append(f"{effect_words(type(effect).id)} ({sizes})")
+    return listing(parts)
 
 
 def parameter_sentences(found: Diagnosis, names: Sequence[str]) -> list[str]:

@@ -10,8 +10,10 @@ import numpy as np
 from diagnosis.diagnosis import Diagnosis
 from diagnosis.discrimination import Rival
 from diagnosis.experiment_choices import Limits
+from diagnosis.imitation import IMITATED
 from diagnosis.next_experiment import NextExperiment, next_experiment
 from plant.simulate import simulate
+from workflow.diagnose.findings import unlisted_words
 from workflow.diagnose.words import effect_words, probability_words
 from workflow.report.words import listing
 
@@ -53,7 +55,11 @@ class Following:
 
 def following(found: Diagnosis) -> Following:
     """As long as the longest record, within the largest voltage, angle and deflection of all of them."""
-    if found.verdict == "unknown":
+    if found.verdict == "unknown" and IMITATED not in found.ambiguous_with:
+        if found.unlisted:
+            return Following(
+                (f"Look at the machine for {unlisted_words(found)}: one run without it would confirm it.",)
+            )
         left = {name: float(np.mean(e**2)) for name, e in found.residuals_after.items()}
         worst = max(left, key=left.__getitem__)
         return Following(

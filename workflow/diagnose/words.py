@@ -33,7 +33,11 @@ _EFFECTS: Mapping[str, str] = {
     "gravity": "gravity in a tilted plane",
     "sensor_lag": "a lag of the tip sensor",
 }
-_OTHERS: Mapping[str, str] = {"none": "no effect at all", "unknown": "a cause outside the list"}
+_OTHERS: Mapping[str, str] = {
+    "none": "no effect at all",
+    "unknown": "a cause outside the list",
+    "ground_spring": "a linear spring from hub to ground",
+}
 
 GROUPS: Mapping[str, str] = {
     "actuator": "actuator",

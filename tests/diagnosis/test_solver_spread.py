@@ -1,0 +1,85 @@
+"""Drifting apart where contacts switch, against a simulator that shares no code with the diagnosed model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diagnosis import Case, Experiment
+from diagnosis.candidates import candidates
+from diagnosis.fit import Fit
+from diagnosis.hypotheses import disagreement_gain
+from diagnosis.leftover import Leftover
+from diagnosis.residual import ResidualModel
+from diagnosis.solver_spread import NO_DRIFT, solver_spread, without_drift
+from plant import Rig, prbs
+from workflow.blind.rigs import draw_rig, rig_toml
+from workflow.blind.truth import Truth
+
+
+def _near_the_truth(folder, effect, values, *, seed, off=1.0):
+    """A fit that knows the machine, but for parameters that are off by a factor; two records."""
+    table = draw_rig(np.random.default_rng(seed))
+    file = folder / "rig.toml"
+    file.write_text(rig_toml(table), encoding="utf-8")
+    rng = np.random.default_rng(seed)
+    records = []
+    for role in ("estimation", "held_out"):
+        machine = Truth(table, [{"name": effect, **{key: off * v for key, v in values.items()}}])
+        voltage = prbs(7, 8, 0.25, 900, rng)
+        measured = machine.record(voltage).measured(rng.standard_normal((900, 2)) * machine.noise)
+        records.append(Experiment(role, role, voltage, measured, "prbs"))
+    case = Case("drift", Rig.from_toml(file), tuple(records))
+    candidate = next(c for c in candidates(case) if c.effect == effect)
+    x = np.array([axis.coordinate(values[axis.parameter]) for axis in candidate.axes])
+    model = ResidualModel(case)
+    e = model.of(np.zeros(0), (candidate.effect_at(x),), case.experiments)
+    none = np.zeros((e.size, 0))
+    return model, Fit((candidate,), np.zeros(0), (x,), e, none, float(e @ e), True)
+
+
+# Of eight rigs those whose contacts amplify most.
+@pytest.mark.parametrize("seed", [0, 1, 6, 7])
+@pytest.mark.parametrize("off", [0.999, 1.001])
+def test_a_machine_that_is_off_by_a_hair_leaves_no_more(tmp_path, seed, off):
+    model, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.03}, seed=seed, off=off)
+    spread = solver_spread(model, end, model.case.experiments)
+    e, drift = without_drift(end.residuals, spread)
+    chance = 4 * np.sqrt(2 / e.size)
+    assert np.mean(end.residuals**2) - 1 < np.mean(spread) + chance
+    assert 0.8 < np.mean(e**2) < 1 + chance
+    if seed == 0:
+        # Here a thousandth of the play makes a gap of a third of the noise: not to be called a cause.
+        assert np.mean(end.residuals**2) > 1.1
+        assert drift.log_gain > 100
+
+
+def test_effects_without_contacts_have_none(tmp_path):
+    model, end = _near_the_truth(tmp_path, "coulomb_friction", {"torque_Nm": 0.01}, seed=1)
+    assert not np.any(solver_spread(model, end))
+
+
+def test_white_residuals_gain_nothing():
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal(4000)
+    e, drift = without_drift(noise, rng.uniform(0.5, 4.0, 4000))
+    assert e is noise
+    assert drift == NO_DRIFT
+
+
+def test_residuals_that_drift_as_predicted_are_white_over_it():
+    rng = np.random.default_rng(6)
+    spread = np.repeat([0.0, 6.0], 2000)
+    residuals = np.sqrt(1 + spread) * rng.standard_normal(4000)
+    e, drift = without_drift(residuals, spread)
+    assert np.mean(e**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 4000))
+    assert drift.size == pytest.approx(np.sqrt(3.0))
+    # Half of the samples had variance 7 in place of 1; of each of them what it costs now is a 40th.
+    expected = 0.5 * 2000 * (7 - (1 + np.log(7)) / 40 - 39 / 40)
+    assert drift.log_gain == pytest.approx(expected, rel=0.05)
+
+
+def test_no_evidence_pays_for_a_rest_that_no_solver_leaves(tmp_path):
+    _, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.02}, seed=1)
+    assert disagreement_gain(end, Leftover(2e4, 2e4, 0.3)) > 1.9e4
+    assert disagreement_gain(end, Leftover(2e4, 2e4, 2.0)) < 2e3
