@@ -417,6 +417,10 @@ def blind(
         str,
         typer.Option(help="What makes the records: ritz (built in) or exudyn (extra 'blind')."),
     ] = "ritz",
+    only: Annotated[
+        str | None,
+        typer.Option(help="One sort of cases: none, faint, clear, pair or unlisted [default: a mix]."),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in --out; finished cases are taken up.")
     ] = False,
@@ -428,7 +432,7 @@ def blind(
 
     with TerminalProgress() as progress:
         summary = run_blind(
-            cases, seed, out, jobs=jobs, simulator=simulator, resume=resume, progress=progress
+            cases, seed, out, jobs=jobs, simulator=simulator, only=only, resume=resume, progress=progress
         )
     if as_json:
         _print_json(summary.numbers)

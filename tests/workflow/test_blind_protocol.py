@@ -70,6 +70,13 @@ def test_a_schedule_has_the_shares_and_every_effect():
     assert all({a, b} <= set(LISTED) for a, b in NOT_TOGETHER)
 
 
+def test_a_schedule_of_one_sort_has_nothing_else():
+    plan = schedule(31, np.random.default_rng(1), "none")
+    assert [(sort, name) for sort, _, name in plan] == [("none", "")] * 31
+    assert sum(exact for _, exact, _ in plan) == 16
+    assert {name for _, _, name in schedule(46, np.random.default_rng(1), "clear")} == set(LISTED)
+
+
 def test_rigs_are_arms_and_what_is_stated_is_off_by_tolerances():
     rng = np.random.default_rng(2)
     off = []
@@ -215,6 +222,8 @@ def test_bad_requests_are_one_line(tmp_path):
         run_blind(0, 1, tmp_path / "a")
     with pytest.raises(InputError, match="--simulator must be one of ritz, exudyn"):
         run_blind(1, 1, tmp_path / "a", simulator="matlab")
+    with pytest.raises(InputError, match="--only must be one of none, faint, clear, pair, unlisted"):
+        run_blind(1, 1, tmp_path / "a", only="difficult")
     with pytest.raises(InputError, match="no blind run to resume"):
         run_blind(1, 1, tmp_path / "a", resume=True)
     (tmp_path / "full").mkdir()

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from workflow.blind.exudyn_truth import ExudynTruth
 
 Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
+SORTS: tuple[Sort, ...] = ("none", "faint", "clear", "pair", "unlisted")
 Simulator = Literal["ritz", "exudyn"]
 SIMULATORS: tuple[Simulator, ...] = ("ritz", "exudyn")
 # Shares of a set of cases. The sets this imitates say nothing about the next one's mix; nor does this.
@@ -58,13 +59,19 @@ class BlindCase:
     answer: dict[str, Any]
 
 
-def schedule(n_cases: int, rng: np.random.Generator) -> list[tuple[Sort, bool, str]]:
-    """(sort, exact nominal?, first effect) of every case; every effect comes before one comes twice."""
+def schedule(
+    n_cases: int, rng: np.random.Generator, only: Sort | None = None
+) -> list[tuple[Sort, bool, str]]:
+    """(sort, exact nominal?, first effect) of every case; every effect comes before one comes twice.
+
+    only: nothing but cases of this sort.
+    """
     if n_cases < 1:
         raise ValueError(f"the number of cases must be at least 1; got {n_cases}")
     sorts: list[Sort] = []
     # Largest remainders, so that the shares hold for small numbers too.
-    shares = {sort: share * n_cases for sort, share in SHARES.items()}
+    mix = SHARES if only is None else {only: 1.0}
+    shares = {sort: share * n_cases for sort, share in mix.items()}
     for sort, share in shares.items():
         sorts += [sort] * int(share)
     rest = sorted(shares, key=lambda sort: -(shares[sort] % 1))

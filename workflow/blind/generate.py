@@ -37,8 +37,8 @@ def draw_case(seed: int, index: int, plan: Plan, simulator: Simulator = "ritz") 
     return make_case(*plan, np.random.default_rng([seed, 1, index]), simulator)
 
 
-def plan_cases(n_cases: int, seed: int) -> list[Plan]:
-    return schedule(n_cases, np.random.default_rng([seed, 0, n_cases]))
+def plan_cases(n_cases: int, seed: int, only: Sort | None = None) -> list[Plan]:
+    return schedule(n_cases, np.random.default_rng([seed, 0, n_cases]), only)
 
 
 def write_case(case: BlindCase, folder: Path) -> None:
@@ -118,6 +118,7 @@ def generate(
     jobs: int = 1,
     open_cases: bool = False,
     simulator: Simulator = "ritz",
+    only: Sort | None = None,
     finished: Mapping[str, Answer] | None = None,
     keep: Callable[[Answer], None] | None = None,
 ) -> list[Answer]:
@@ -135,7 +136,8 @@ def generate(
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
     work = partial(_one, seed, out, open_cases, simulator)
-    tasks = [(k, plan) for k, plan in enumerate(plan_cases(n_cases, seed)) if case_name(k) not in answers]
+    plans = plan_cases(n_cases, seed, only)
+    tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
 
     def take(done: Iterable[Answer]) -> None:
         for answer in done:

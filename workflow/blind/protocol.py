@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import workflow
-from workflow.blind.cases import SIMULATORS, Simulator
+from workflow.blind.cases import SIMULATORS, SORTS, Simulator, Sort
 from workflow.blind.exudyn_truth import load_exudyn
 from workflow.blind.generate import Answer, folder_hash, generate, refuse_filled
 from workflow.blind.report import confusion_figure, summary, text
@@ -55,12 +55,14 @@ def run_blind(
     *,
     jobs: int | None = None,
     simulator: str = "ritz",
+    only: str | None = None,
     resume: bool = False,
     progress: Progress | None = None,
     diagnose: Diagnose | None = None,
 ) -> RunSummary:
     """Generate, seal, diagnose, open, score. Raises InputError, one line, for whatever was given wrongly.
 
+    only: cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
     diagnose: (case folder, directory it must keep out of) -> document; the default starts a process.
     """
     progress = progress or Silence()
@@ -69,14 +71,18 @@ def run_blind(
         raise InputError(f"--simulator must be one of {', '.join(SIMULATORS)}; got {simulator!r}")
     if chosen == "exudyn":
         load_exudyn()
+    sort = next((name for name in SORTS if name == only), None)
+    if only is not None and sort is None:
+        raise InputError(f"--only must be one of {', '.join(SORTS)}; got {only!r}")
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     if n_cases < 1 or seed < 0:
         raise InputError(f"--cases must be at least 1 and --seed at least 0; got {n_cases} and {seed}")
     width = jobs or os.cpu_count() or 1
-    _begin(out, {"format": _FORMAT, "cases": n_cases, "seed": seed, "simulator": simulator}, resume)
+    settings = {"format": _FORMAT, "cases": n_cases, "seed": seed, "simulator": simulator}
+    _begin(out, settings if sort is None else {**settings, "only": sort}, resume)
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
-    _sealed_cases(out, n_cases, seed, width, chosen, progress)
+    _sealed_cases(out, n_cases, seed, width, chosen, sort, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
     _predict(out, names, width, diagnose or diagnose_in_process, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
@@ -101,10 +107,11 @@ def _begin(out: Path, settings: Mapping[str, Any], resume: bool) -> None:
         before = read_json(manifest)
         if not resume:
             raise InputError(f"{out} holds a blind run already; --resume continues it")
-        for key, value in settings.items():
-            if before.get(key) != value:
+        for key in {**before, **settings}:
+            begun, value = before.get(key), settings.get(key)
+            if begun != value:
                 raise InputError(
-                    f"{out}: cannot resume, the run was begun with {key} = {before.get(key)!r}, not {value!r}"
+                    f"{out}: cannot resume, the run was begun with {key} = {begun!r}, not {value!r}"
                 )
         return
     if resume:
@@ -118,7 +125,13 @@ def _begin(out: Path, settings: Mapping[str, Any], resume: bool) -> None:
 
 
 def _sealed_cases(
-    out: Path, n_cases: int, seed: int, jobs: int, simulator: Simulator, progress: Progress
+    out: Path,
+    n_cases: int,
+    seed: int,
+    jobs: int,
+    simulator: Simulator,
+    only: Sort | None,
+    progress: Progress,
 ) -> None:
     """Cases and closed seal; an interrupted generation goes on where it stopped."""
     progress.start("cases")
@@ -136,7 +149,14 @@ def _sealed_cases(
             progress.update("cases", count / n_cases, f"{count} of {n_cases}")
 
         answers = generate(
-            n_cases, seed, out / "cases", jobs=jobs, simulator=simulator, finished=finished, keep=keep
+            n_cases,
+            seed,
+            out / "cases",
+            jobs=jobs,
+            simulator=simulator,
+            only=only,
+            finished=finished,
+            keep=keep,
         )
         close_seal(out, answers)
         shutil.rmtree(parts)

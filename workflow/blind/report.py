@@ -35,10 +35,11 @@ def cell(numbers: Mapping[str, Any]) -> str:
 def text(document: Mapping[str, Any]) -> str:
     """The whole of scores.json as a page of plain text."""
     settings = document["settings"]
+    only = settings.get("only")
     found = document["diagnosis"]
     lines = [
         f"flexlink blind --cases {settings['cases']} --seed {settings['seed']} "
-        f"--simulator {settings['simulator']}",
+        f"--simulator {settings['simulator']}" + (f" --only {only}" if only else ""),
         f"commitment (salted SHA-256 of the labels, published before the diagnosis): "
         f"{document['commitment']}",
         "",
