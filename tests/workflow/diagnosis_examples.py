@@ -59,14 +59,15 @@ def write_case(folder: Path, *effects: dict[str, float | str], seed: int = 1) ->
 class KnownAnswer(Engine):
     """Says what it was told, with the residuals that follow.
 
-    verdict, detail: as in a Diagnosis. fails: cases it raises an error for; dies: cases that kill their
-    process. waits_s: seconds it takes before it answers. seen: file it appends the case's name to.
+    verdict, detail, unlisted: as in a Diagnosis. fails: cases it raises an error for; dies: cases that kill
+    their process. waits_s: seconds it takes before it answers. seen: file it appends the case's name to.
     """
 
     effects: tuple[dict[str, float | str], ...] = ()
     verdict: str = "effect"
     detail: str = "effect"
     ambiguous: tuple[str, ...] = ()
+    unlisted: tuple[Effect, ...] = ()
     fails: tuple[str, ...] = ()
     dies: tuple[str, ...] = ()
     waits_s: float = 0.0
@@ -141,6 +142,7 @@ class KnownAnswer(Engine):
             residuals_refit=before,
             residuals_after=after,
             simulations=model.simulations,
+            unlisted=self.unlisted,
             rivals=self._rivals(case, effects, sure),
         )
 

@@ -13,6 +13,7 @@ import pytest
 
 from diagnosis.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
+from plant.effects import GroundSpring
 from tests.workflow.command import start_flexlink
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.config import SimulatedSource
@@ -152,6 +153,19 @@ def test_every_verdict_has_its_words(folder, engine, words, blank):
     assert words in files["arm.html"].decode()
     answer = json.loads(files["arm.json"])
     assert (answer["verdict"], answer["detail_verdict"]) == (engine.verdict, engine.detail)
+
+
+def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, blank):
+    spring = GroundSpring(stiffness_Nm_rad=0.25)
+    files = made(folder, KnownAnswer((), "unknown", "unknown", unlisted=(spring,)))
+    html = files["arm.html"].decode()
+    assert "nothing on the list explains it; it looks like a linear spring from hub to ground" in html
+    assert (
+        "what explains the records best is a linear spring from hub to ground (stiffness 0.25 N m/rad)"
+        in html
+    )
+    assert "Look at the machine for a linear spring from hub to ground" in html
+    assert json.loads(files["arm.json"])["unlisted"] == [{"name": "ground_spring", "stiffness_Nm_rad": 0.25}]
 
 
 def test_what_was_suspected_is_spoken_of(tmp_path, blank):

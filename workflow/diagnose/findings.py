@@ -39,7 +39,9 @@ def headline(found: Diagnosis) -> str:
     if found.verdict == "none":
         return "No gap beyond sensor noise and the stated tolerances"
     if found.verdict == "unknown":
-        return "There is a gap, and nothing on the list explains it"
+        likeness = listing([effect_words(type(effect).id) for effect in found.unlisted])
+        text = "There is a gap, and nothing on the list explains it"
+        return f"{text}; it looks like {likeness}" if likeness else text
     names = listing([effect_words(name) for name in found.combination])
     text = f"The gap {'comes' if answer_probability(found) >= _SURE else 'may come'} from {names}"
     others = [

@@ -1,0 +1,66 @@
+"""Spaces of effects: the one in place of a stated value, and what is an effect only by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diagnosis.candidates import candidates, in_place_of
+from diagnosis.case import Case, Experiment
+from diagnosis.fit import Fit
+from diagnosis.hypotheses import Hypothesis
+from diagnosis.leftover import leftover
+from plant.presets import paper_link
+
+TOLERANCE = 0.05
+
+
+@pytest.fixture
+def listed():
+    """Of a rig whose hub inertia is known to five per cent, in records that swing by 1 rad."""
+    rig = paper_link().model_copy(update={"tolerances": {"hub.inertia_kg_m2": TOLERANCE}})
+    output = np.column_stack([np.linspace(-0.5, 0.5, 50)] * 2)
+    record = Experiment("only", "estimation", np.ones(50), output)
+    return candidates(Case("arm", rig, (record, replace(record, name="other", role="held_out"))))
+
+
+@pytest.mark.parametrize(
+    ("factor", "ratio"),
+    [
+        (1.4, 1.4),
+        (0.6, 0.6),
+        # Worth a name from three tolerances on; a value pulled by less begins there.
+        (1 + 2.5 * TOLERANCE, 1 + 3 * TOLERANCE),
+        (1 - 2.5 * TOLERANCE, 1 - 3 * TOLERANCE),
+    ],
+)
+def test_a_pulled_inertia_is_another_inertia_of_that_size_or_the_nearest_worth_a_name(listed, factor, ratio):
+    candidate, x = in_place_of("hub.inertia_kg_m2", factor, listed)
+    assert candidate.effect == "hub_inertia"
+    assert candidate.parameters(x)["ratio"] == pytest.approx(ratio, rel=1e-12)
+
+
+def test_a_value_that_no_effect_multiplies_has_none_in_its_place(listed):
+    assert in_place_of("link.density_kg_m3", 1.5, listed) is None
+
+
+def _ripple(listed, cycles_per_rev):
+    """Its hypothesis where nothing but noise is left over, at any number of cycles."""
+    (ripple,) = [c for c in listed if c.effect == "torque_ripple"]
+    x = np.array([0.0, cycles_per_rev, 0.0])
+    e = np.random.default_rng(5).standard_normal(200)
+    jacobian = np.random.default_rng(6).standard_normal((200, 3))
+    end = Fit((ripple,), np.zeros(0), (x,), e, jacobian, float(e @ e), True)
+    return Hypothesis.of(end, leftover(e, [100], 2))
+
+
+def test_a_period_that_no_record_completes_is_rather_something_unknown(listed):
+    (ripple,) = [c for c in listed if c.effect == "torque_ripple"]
+    least = ripple.axes[1].low
+    # A swing of 1 rad is a quarter of a period there.
+    assert least == pytest.approx(0.5 * np.pi)
+    inside, at_edge = _ripple(listed, 3 * least), _ripple(listed, least)
+    assert inside.log_weight > inside.unknown_weight
+    assert at_edge.log_weight < at_edge.unknown_weight
