@@ -26,14 +26,18 @@ Scale = Literal["log", "linear", "angle"]
 _TOLERANCES = 3.0
 # The same for friction that is added to a stated value: that may be stated too large by as many.
 _VISCOUS_TOLERANCES = 2.0
+# Nearly all parametric effects are no larger than this many tolerances: who states a value to 5 % is seldom
+# wrong by a factor of ten. Of an exact value nothing of that kind is known.
+_USUAL_TOLERANCES, _USUAL_SHARE = 30.0, 0.9
 
 
 @dataclass(frozen=True)
 class Axis:
     """One coordinate of a search: parameter, scale, range, and a step for difference quotients.
 
-    `low` and `high` are in the parameter's unit; the coordinate is its logarithm on a "log" axis. edge: at
-    the lower end the records no longer show what makes the effect this one (a period never completed).
+    `low` and `high` are in the parameter's unit; the coordinate is its logarithm on a "log" axis. Its prior
+    is flat over the range; with `usual` (low, high) nine tenths of it lie there. edge: at the lower end the
+    records no longer show what makes the effect this one (a period never completed).
     """
 
     parameter: str
@@ -42,6 +46,7 @@ class Axis:
     high: float
     step: float
     edge: bool = False
+    usual: tuple[float, float] | None = None
 
     def at_edge(self, coordinate: float) -> bool:
         """Whether the effect has turned into something else that happens to look like it (see `edge`)."""
@@ -60,12 +65,19 @@ class Axis:
             return -np.inf, np.inf
         return self.coordinate(self.low), self.coordinate(self.high)
 
-    @property
-    def width(self) -> float:
-        """Length of the range in the coordinate: its prior is flat over it."""
+    def log_density(self, coordinate: float) -> float:
+        """log of the prior density of the coordinate, inside the box."""
         if self.scale == "angle":
-            return 2 * np.pi
-        return self.coordinate(self.high) - self.coordinate(self.low)
+            return float(-np.log(2 * np.pi))
+        low, high = self.box
+        if self.usual is None:
+            return float(-np.log(high - low))
+        begin, end = np.clip([self.coordinate(v) for v in self.usual], low, high)
+        within, beyond = end - begin, high - low - (end - begin)
+        if not min(within, beyond) > 0:
+            return float(-np.log(high - low))
+        inside = begin <= coordinate <= end
+        return float(np.log(_USUAL_SHARE / within if inside else (1 - _USUAL_SHARE) / beyond))
 
 
 @dataclass(frozen=True)
@@ -123,10 +135,9 @@ class Candidate:
         low, high = zip(*(axis.box for axis in self.axes), strict=True)
         return np.array(low), np.array(high)
 
-    @property
-    def log_volume(self) -> float:
-        """log of the product of all widths."""
-        return float(sum(np.log(axis.width) for axis in self.axes))
+    def log_density(self, x: Real) -> float:
+        """log of the prior density of the coordinates x (A,)."""
+        return sum(axis.log_density(v) for axis, v in zip(self.axes, x, strict=True))
 
     def from_size(self, smallest: float) -> Candidate:
         """The same candidate with its size no smaller than this coordinate of its first axis."""
@@ -154,7 +165,7 @@ class Scales:
     hub_inertia_kg_m2: float
     link_stiffness_Nm_rad: float
     damping_Nms: float
-    viscous_tolerance_Nms: float
+    viscous_spread_Nms: float
     tip_noise_m: float
 
     @classmethod
@@ -174,8 +185,7 @@ class Scales:
             hub_inertia_kg_m2=rig.hub.inertia_kg_m2,
             link_stiffness_Nm_rad=3 * link.bending_stiffness_Nm2 / link.length_m,
             damping_Nms=rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms,
-            viscous_tolerance_Nms=_VISCOUS_TOLERANCES
-            * rig.tolerances.get("hub.viscous_friction_Nms", 0.0)
+            viscous_spread_Nms=rig.tolerances.get("hub.viscous_friction_Nms", 0.0)
             * rig.hub.viscous_friction_Nms,
             tip_noise_m=rig.sensors.tip_noise_m,
         )
@@ -202,6 +212,8 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
     """Every effect of the registry but quantisation (see `diagnosis.lattice`); signed ones twice."""
     s = Scales.of(case)
     tau, k, J = s.torque_Nm, s.link_stiffness_Nm_rad, s.hub_inertia_kg_m2
+    least_viscous = _VISCOUS_TOLERANCES * s.viscous_spread_Nms
+    usual_viscous = (least_viscous, _USUAL_TOLERANCES * s.viscous_spread_Nms)
     found = [
         _grid(
             "coulomb_friction", [_log("torque_Nm", 1e-5 * tau, tau, 1e-3)], [_geom(3e-4 * tau, 0.6 * tau, 14)]
@@ -223,8 +235,13 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
         ),
         _grid(
             "viscous_friction",
-            [_log("coefficient_Nms", max(1e-5 * s.damping_Nms, s.viscous_tolerance_Nms), 30 * s.damping_Nms)],
-            [_geom(max(1e-4 * s.damping_Nms, 1.2 * s.viscous_tolerance_Nms), 3 * s.damping_Nms, 8)],
+            [
+                replace(
+                    _log("coefficient_Nms", max(1e-5 * s.damping_Nms, least_viscous), 30 * s.damping_Nms),
+                    usual=usual_viscous if least_viscous > 0 else None,
+                )
+            ],
+            [_geom(max(1e-4 * s.damping_Nms, 1.2 * least_viscous), 3 * s.damping_Nms, 8)],
         ),
         _grid(
             "actuator_saturation",
@@ -352,15 +369,18 @@ def _ratio(effect: str, case: Case) -> list[Candidate]:
     largest = 50.0 if effect == "structural_damping" else 10.0
     points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
     points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
-    sides = [
-        Candidate(effect, (_log("ratio", 1 + least, largest),), tuple((float(p),) for p in points)),
-    ]
+    usual = 1 + _USUAL_TOLERANCES * tolerance
+    above = _log("ratio", 1 + least, largest)
+    if tolerance > 0:
+        above = replace(above, usual=(1 + least, usual))
+    sides = [Candidate(effect, (above,), tuple((float(p),) for p in points))]
     below = max(1 - least, 0.2) if least < 1 else 0.0
     if below > 0:
+        axis = _log("ratio", 1 / largest, below)
         sides.append(
             Candidate(
                 effect,
-                (_log("ratio", 1 / largest, below),),
+                (replace(axis, usual=(1 / usual, below)) if tolerance > 0 else axis,),
                 tuple((float(v),) for v in np.minimum(-points, np.log(below))),
                 sign=-1,
                 grows=False,

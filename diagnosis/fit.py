@@ -1,7 +1,7 @@
 """Maximum a posteriori fit of deviations and effect parameters, and the evidence of a set of candidates.
 
 Minimises |e|^2 + |d|^2 over the deviations d of the nominal parameters (more beyond two tolerances) and
-the coordinates x of the candidates (flat over their boxes), e being the whitened residuals:
+the coordinates x of the candidates (inside their boxes), e being the whitened residuals:
 Levenberg-Marquardt with difference quotients, inside the boxes.
 """
 
@@ -233,7 +233,7 @@ def _free(x: Real, gradient: Real, low: Real, high: Real) -> np.ndarray[tuple[in
 
 
 def log_evidence(fit: Fit) -> float:
-    """log of the integral of exp(-(|e|^2 + |d|^2)/2) over d (standard normal) and x (flat over its boxes).
+    """log of the integral of exp(-(|e|^2 + |d|^2)/2) over d (standard normal) and x (`Axis.log_density`).
 
     Laplace's approximation, cut off at the boxes: along every coordinate that ends at or near a bound, the
     Gaussian (or the slope down from the bound) is integrated over the inside only, given the others at their
@@ -254,7 +254,7 @@ def log_evidence(fit: Fit) -> float:
     gradient = (fit.jacobian.T @ fit.residuals)[P:]
     at = 0
     for candidate, x in zip(fit.candidates, fit.coordinates, strict=True):
-        value -= candidate.log_volume
+        value += candidate.log_density(x)
         low, high = candidate.box
         for i in range(x.size):
             value += _inside(x[i], gradient[at], spread[at], low[i], high[i])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from diagnosis.candidates import candidates, in_place_of
 from diagnosis.case import Case, Experiment
@@ -24,6 +25,27 @@ def listed():
     output = np.column_stack([np.linspace(-0.5, 0.5, 50)] * 2)
     record = Experiment("only", "estimation", np.ones(50), output)
     return candidates(Case("arm", rig, (record, replace(record, name="other", role="held_out"))))
+
+
+def test_every_prior_density_integrates_to_one(listed):
+    for axis in (axis for candidate in listed for axis in candidate.axes):
+        low, high = (0.0, 2 * np.pi) if axis.scale == "angle" else axis.box
+        edges = [] if axis.usual is None else [axis.coordinate(v) for v in axis.usual]
+        total, _ = quad(lambda x, axis=axis: np.exp(axis.log_density(x)), low, high, points=edges or None)
+        assert total == pytest.approx(1.0, rel=1e-9), axis
+
+
+def test_a_stated_value_is_seldom_wrong_by_more_than_thirty_tolerances(listed):
+    above, below = [c.axes[0] for c in listed if c.effect == "hub_inertia"]
+    factor = 1 + 30 * TOLERANCE
+    for axis, inside, beyond in (
+        (above, 0.99 * factor, 1.01 * factor),
+        (below, 1.01 / factor, 0.99 / factor),
+    ):
+        assert axis.log_density(np.log(inside)) > axis.log_density(np.log(beyond)) + 1
+    # Of what is stated as exact nothing of that kind is known.
+    (exact, _) = [c.axes[0] for c in listed if c.effect == "link_stiffness"]
+    assert exact.log_density(np.log(1.01)) == exact.log_density(np.log(9.0))
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
 import time
 import uuid
 import warnings
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from types import TracebackType
 from typing import Any, Self
@@ -29,6 +31,12 @@ def run_on_worker(task: Task) -> tuple[Done, ...]:
     """`run_task`, one at a time in each worker."""
     with _ONE_AT_A_TIME:
         return run_task(task)
+
+
+async def _call(distributed: Any, address: str) -> None:
+    """Connect and hang up. Raises whatever an address is refused with."""
+    line = await distributed.comm.connect(address, timeout=CONNECT_S)
+    await line.close()
 
 
 class DaskCluster:
@@ -61,6 +69,10 @@ class DaskCluster:
             logger.setLevel(logging.CRITICAL + 1)
         self._settings = dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECT_S:.0f}s"})
         try:
+            # First without a client: one that fails to connect is closed when it is collected, at any time
+            # and in any thread, and waits forever for the lock of a client that is being made just then.
+            with ThreadPoolExecutor(1) as aside:
+                aside.submit(asyncio.run, _call(distributed, address)).result()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # differing versions of packages: the code digest is checked
                 self._client: Any = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
