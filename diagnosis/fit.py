@@ -90,10 +90,9 @@ def fit(
     """
     P = deviations.size
     splits = np.cumsum([len(c.axes) for c in candidates])
-    low = np.concatenate([c.box[0] for c in candidates]) if candidates else np.zeros(0)
-    high = np.concatenate([c.box[1] for c in candidates]) if candidates else np.zeros(0)
+    low, high = _box(candidates)
     steps = _steps(candidates)
-    x = np.clip(np.concatenate(list(coordinates)) if candidates else np.zeros(0), low, high)
+    x = np.clip(np.concatenate([np.zeros(0), *coordinates]), low, high)
     d = deviations.copy()
 
     def effects(x: Real) -> tuple[Any, ...]:
@@ -171,10 +170,17 @@ def difference_quotients(
     def effects(x: Real) -> tuple[Any, ...]:
         return _effects(end.candidates, x)
 
-    x = np.concatenate(list(end.coordinates)) if end.candidates else np.zeros(0)
-    high = np.concatenate([c.box[1] for c in end.candidates]) if end.candidates else np.zeros(0)
+    x = np.concatenate([np.zeros(0), *end.coordinates])
+    _, high = _box(end.candidates)
     steps = _steps(end.candidates)
     return _jacobian(model, end.deviations, x, e, effects, steps, high, None, experiments)
+
+
+def _box(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
+    """Bounds (A,), (A,) of all coordinates in a row."""
+    boxes = [candidate.box for candidate in candidates]
+    low = np.concatenate([np.zeros(0), *(box[0] for box in boxes)])
+    return low, np.concatenate([np.zeros(0), *(box[1] for box in boxes)])
 
 
 def _steps(candidates: Sequence[Candidate]) -> Real:
