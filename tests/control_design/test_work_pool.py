@@ -18,12 +18,15 @@ from .plants import RelativeDisc, hub_arm
 
 _SPECIFICATION = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
 
+# A shell that runs the tests in the background has told them to ignore interrupts, and children inherit that.
 _ENDLESS = """
+import signal
 import numpy as np
 from control_design import SynthesisOptions, synthesise
 from control_design.example_plants import flexible_link, flexible_link_specification
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     tell = lambda fraction, message: print(message, flush=True)
     synthesise(
         [flexible_link("B")],
