@@ -139,15 +139,23 @@ class Screening:
         # Circular convolution over twice the longest record: no response reaches around.
         size = next_fast_len(2 * longest, real=True)
         transfer = np.fft.rfft(response, size, axis=0)
+
+        def answers(angle: Real) -> Real:
+            """(2, T, outputs) to a torque that follows the sine and the cosine of an angle (T,)."""
+            torque = np.stack([np.sin(angle), np.cos(angle)])
+            moved = np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)
+            return np.asarray(moved[:, : angle.size])
+
+        time = (np.arange(longest, dtype=np.float64) + 0.5) * dt
         found = []
-        for line in lines:
-            parts = []
-            for e in model.case.estimation:
-                time = (np.arange(len(e.input)) + 0.5) * dt
-                angle = 2 * np.pi * line * time if periodic else line * e.output[:, 0]
-                torque = np.stack([np.sin(angle), np.cos(angle)])
-                moved = np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)
-                parts.append(moved[:, : angle.size].reshape(2, -1))
+        for line in map(float, lines):
+            if periodic:
+                # The same in every record, up to its end.
+                all_along = answers(2 * np.pi * line * time)
+                moved = [all_along[:, : len(e.input)] for e in model.case.estimation]
+            else:
+                moved = [answers(line * e.output[:, 0]) for e in model.case.estimation]
+            parts = [part.reshape(2, -1) for part in moved]
             columns = -np.concatenate(parts, axis=1)
             H = np.empty((P + 2, P + 2))
             H[:P, :P] = self._A
