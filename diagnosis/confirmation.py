@@ -1,8 +1,8 @@
 """Do the held-out records confirm the answer that the estimation records gave?
 
 They are predicted from values that were fitted without them. As long as they confirm the answer they decide
-nothing. Where they leave more over than noise, solver disagreement and uncertain values explain, every answer
-that was still possible is confronted with them.
+nothing. Where they leave more over than noise, solver disagreement and uncertain values explain, or where a
+rival predicts them far better, every answer that was still possible is confronted with them.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from diagnosis.solver_spread import solver_spread, without_drift
 
 # Log odds for an unknown rest that held-out records may add before the answer counts as not confirmed.
 _CONFIRMED = 2.0
+# Log weight by which a rival may lead the answer once both have predicted the held-out records.
+_CONTRADICTED = 2.0
 # An answer this far behind the best in log weight is none any more.
 _STILL_POSSIBLE = 20.0
 
@@ -38,7 +40,7 @@ def confronted(
     if accepted.fit.weighing.model_error > 0 or not case.held_out:
         return None
     first = _prediction(model, accepted.fit)
-    if first.unknown_gain < _CONFIRMED:
+    if first.unknown_gain < _CONFIRMED and not _contradicted(model, hypotheses, accepted, first):
         return None
     best = max(max(h.log_weight, h.unknown_weight) for h in hypotheses)
     seen = {
@@ -47,13 +49,29 @@ def confronted(
         if max(h.log_weight, h.unknown_weight) > best - _STILL_POSSIBLE
     }
     # All others stay behind the best prediction by what they were behind before.
-    least = _Prediction(max(p.log_density + p.allowed_gain for p in seen.values()), 0.0, 0.0)
+    least = _Prediction(max(p.gain for p in seen.values()), 0.0, 0.0)
     return [_with(h, seen.get(k, least)) for k, h in enumerate(hypotheses)]
 
 
+def _contradicted(
+    model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis, first: _Prediction
+) -> bool:
+    """Whether a rival of no more effects is well ahead of the accepted answer once both have predicted."""
+    ahead = accepted.log_weight + first.gain + _CONTRADICTED
+    close: dict[tuple[frozenset[str], bool], Hypothesis] = {}
+    for h in sorted(hypotheses, key=lambda h: -h.weight):
+        if len(h.names) <= len(accepted.names) or not accepted.names:
+            close.setdefault((frozenset(h.names), h.is_answer), h)
+    return any(
+        h.weight + _prediction(model, h.fit).gain > ahead
+        for h in close.values()
+        if h is not accepted and h.weight > accepted.log_weight - _STILL_POSSIBLE
+    )
+
+
 def _with(hypothesis: Hypothesis, seen: _Prediction) -> Hypothesis:
-    known = hypothesis.log_weight + seen.log_density + seen.allowed_gain
-    unknown = hypothesis.unknown_weight + seen.log_density + seen.allowed_gain
+    known = hypothesis.log_weight + seen.gain
+    unknown = hypothesis.unknown_weight + seen.gain
     if hypothesis.is_answer:
         unknown += seen.unknown_gain
     return replace(hypothesis, log_weight=known, unknown_weight=unknown)
@@ -71,6 +89,11 @@ class _Prediction:
     log_density: float
     allowed_gain: float
     unknown_gain: float
+
+    @property
+    def gain(self) -> float:
+        """What they add to the log weight of exactly these effects."""
+        return self.log_density + self.allowed_gain
 
 
 def _prediction(model: ResidualModel, end: Fit) -> _Prediction:

@@ -63,6 +63,11 @@ class Hypothesis:
     def is_answer(self) -> bool:
         return self.log_weight > -np.inf
 
+    @property
+    def weight(self) -> float:
+        """Log weight of these causes alone, which for one beyond the list counts as unknown."""
+        return self.log_weight if self.is_answer else self.unknown_weight
+
     @classmethod
     def of(cls, fit: Fit, rest: Leftover, drift: Drift = NO_DRIFT) -> Hypothesis:
         """rest: what the fit leaves over, of residuals without the drift of correct solvers."""

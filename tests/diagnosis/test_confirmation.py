@@ -11,17 +11,18 @@ from workflow.blind.rigs import draw_rig, rig_toml
 from workflow.blind.truth import Truth
 
 
-def _case(folder, effects):
-    """Small motions to fit, large ones held out."""
+def _case(folder, effects, held_out=None, held_out_V=0.7):
+    """Small motions to fit, larger ones held out; held_out: effects there, if not the same."""
     table = draw_rig(np.random.default_rng(3))
     file = folder / "rig.toml"
     file.write_text(rig_toml(table), encoding="utf-8")
     rng = np.random.default_rng(4)
     experiments = []
     for k, (role, amplitude_V, hold) in enumerate(
-        [("estimation", 0.2, 8), ("estimation", 0.2, 15), ("held_out", 0.7, 20)]
+        [("estimation", 0.2, 8), ("estimation", 0.2, 15), ("held_out", held_out_V, 20)]
     ):
-        machine = Truth(table, effects)
+        there = effects if role == "estimation" or held_out is None else held_out
+        machine = Truth(table, there)
         voltage = prbs(7, hold, amplitude_V, 700, rng)
         measured = machine.record(voltage).measured(rng.standard_normal((700, 2)) * machine.noise)
         experiments.append(Experiment(f"{k}", role, voltage, measured, "prbs"))
@@ -58,3 +59,28 @@ def test_records_that_confirm_that_nothing_is_missing_change_nothing(tmp_path):
     found = diagnose(_case(tmp_path, []))
     assert found.verdict == "none"
     assert found.probabilities["none"] > 0.9
+
+
+def _payload(mass_kg):
+    return [{"name": "tip_payload", "mass_kg": mass_kg}]
+
+
+def test_a_fluke_of_the_estimation_records_is_no_effect(tmp_path):
+    # A payload in the estimation records alone, as a fluke of their noise would look.
+    found = diagnose(_case(tmp_path, _payload(1.5e-4), held_out=[], held_out_V=0.4))
+    assert found.held_out_decided
+    assert found.verdict == "none"
+    assert found.probabilities["none"] > 0.9
+
+
+def test_the_same_where_the_held_out_records_show_it_too_is_one(tmp_path):
+    found = diagnose(_case(tmp_path, _payload(1.5e-4), held_out_V=0.4))
+    assert not found.held_out_decided
+    assert found.combination == ("tip_payload",)
+
+
+def test_what_only_the_held_out_records_make_likely_is_an_effect(tmp_path):
+    found = diagnose(_case(tmp_path, _payload(1.2e-4), held_out_V=0.4))
+    assert found.held_out_decided
+    assert found.combination == ("tip_payload",)
+    assert found.probabilities["tip_payload"] > 0.9
