@@ -163,7 +163,13 @@ def _further(
 
 
 def _least_promise(lead: Fit) -> float:
-    """Beside play a further effect has to gain more (in log weight; half of that in linear estimates)."""
+    """Beside play a further effect has to gain more (in log weight; half of that in linear estimates).
+
+    Where a machine states a model error, what is left over is weighed by the size that it shows in the end: a
+    small promise may gain much.
+    """
+    if lead.weighing.model_error > 0:
+        return -np.inf
     return _PROMISE + (BESIDE_JAGGED if any(c.dependence == "jagged" for c in lead.candidates) else 0.0)
 
 
