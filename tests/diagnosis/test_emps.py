@@ -40,6 +40,12 @@ def test_the_same_two_explain_a_faster_motion_that_no_fit_has_seen(flexlink_data
     assert found.gap_closed > 0.9
 
 
+def test_a_larger_allowance_for_the_model_does_not_lose_the_offset(flexlink_data):
+    # Weighed by the error that is allowed the offset promises little, by the one that is left much.
+    found = diagnose(emps_axis.case(flexlink_data, "passes", model_error=0.2, correlation_samples=200.0))
+    assert set(found.combination) == {"coulomb_friction", "constant_offset"}
+
+
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):
     # Not in the published model: half the sum of forces at plus and minus one speed grows with the speed.
     found = diagnose(emps_axis.case(flexlink_data, "passes", refined=True, correlation_samples=100.0))
