@@ -236,8 +236,10 @@ def candidates(case: Case) -> tuple[Candidate, ...]:
         _grid(
             "viscous_friction",
             [
-                replace(
-                    _log("coefficient_Nms", max(1e-5 * s.damping_Nms, least_viscous), 30 * s.damping_Nms),
+                _log(
+                    "coefficient_Nms",
+                    max(1e-5 * s.damping_Nms, least_viscous),
+                    30 * s.damping_Nms,
                     usual=usual_viscous if least_viscous > 0 else None,
                 )
             ],
@@ -370,17 +372,15 @@ def _ratio(effect: str, case: Case) -> list[Candidate]:
     points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
     points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
     usual = 1 + _USUAL_TOLERANCES * tolerance
-    above = _log("ratio", 1 + least, largest)
-    if tolerance > 0:
-        above = replace(above, usual=(1 + least, usual))
+    above = _log("ratio", 1 + least, largest, usual=(1 + least, usual) if tolerance > 0 else None)
     sides = [Candidate(effect, (above,), tuple((float(p),) for p in points))]
     below = max(1 - least, 0.2) if least < 1 else 0.0
     if below > 0:
-        axis = _log("ratio", 1 / largest, below)
+        axis = _log("ratio", 1 / largest, below, usual=(1 / usual, below) if tolerance > 0 else None)
         sides.append(
             Candidate(
                 effect,
-                (replace(axis, usual=(1 / usual, below)) if tolerance > 0 else axis,),
+                (axis,),
                 tuple((float(v),) for v in np.minimum(-points, np.log(below))),
                 sign=-1,
                 grows=False,
@@ -389,8 +389,14 @@ def _ratio(effect: str, case: Case) -> list[Candidate]:
     return sides
 
 
-def _log(parameter: str, low: float, high: float, step: float = 1e-5) -> Axis:
-    return Axis(parameter, "log", low, high, step)
+def _log(
+    parameter: str,
+    low: float,
+    high: float,
+    step: float = 1e-5,
+    usual: tuple[float, float] | None = None,
+) -> Axis:
+    return Axis(parameter, "log", low, high, step, usual=usual)
 
 
 def _geom(low: float, high: float, count: int) -> list[float]:
