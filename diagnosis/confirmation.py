@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis.fit import Fit, difference_quotients
-from diagnosis.hypotheses import Hypothesis, disagreement_gain
+from diagnosis.hypotheses import STILL_POSSIBLE, Hypothesis, disagreement_gain
 from diagnosis.leftover import Leftover, leftover
 from diagnosis.machine_protocol import Real
 from diagnosis.residual import ResidualModel
@@ -23,8 +23,6 @@ from diagnosis.solver_spread import solver_spread, without_drift
 _CONFIRMED = 2.0
 # Log weight by which a rival may lead the answer once both have predicted the held-out records.
 _CONTRADICTED = 2.0
-# An answer this far behind the best in log weight is none any more.
-_STILL_POSSIBLE = 20.0
 
 
 def confronted(
@@ -42,11 +40,11 @@ def confronted(
     first = _prediction(model, accepted.fit)
     if first.unknown_gain < _CONFIRMED and not _contradicted(model, hypotheses, accepted, first):
         return None
-    best = max(max(h.log_weight, h.unknown_weight) for h in hypotheses)
+    best = max(h.largest_weight for h in hypotheses)
     seen = {
         k: first if h is accepted else _prediction(model, h.fit)
         for k, h in enumerate(hypotheses)
-        if max(h.log_weight, h.unknown_weight) > best - _STILL_POSSIBLE
+        if h.largest_weight > best - STILL_POSSIBLE
     }
     # All others stay behind the best prediction by what they were behind before.
     least = _Prediction(max(p.gain for p in seen.values()), 0.0, 0.0)
@@ -65,7 +63,7 @@ def _contradicted(
     return any(
         h.weight + _prediction(model, h.fit).gain > ahead
         for h in close.values()
-        if h is not accepted and h.weight > accepted.log_weight - _STILL_POSSIBLE
+        if h is not accepted and h.weight > accepted.log_weight - STILL_POSSIBLE
     )
 
 

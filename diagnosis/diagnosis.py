@@ -353,7 +353,7 @@ def _solver_variance(end: Fit, samples_per_record: float) -> float:
     Two correct solvers of play drift apart once a contact falls differently, and stay apart to the end of a
     record: an error of their usual disagreement that is correlated over the record.
     """
-    if not any(c.dependence == "jagged" for c in end.candidates):
+    if not end.jagged:
         return 1.0
     # median of the half-normal prior of the disagreement's size
     usual = 0.674 * DISAGREEMENT["jagged"]

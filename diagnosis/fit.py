@@ -56,6 +56,11 @@ class Fit:
         return tuple(c.effect for c in self.candidates)
 
     @property
+    def jagged(self) -> bool:
+        """Whether contacts switch: the cost jumps from one sequence of them to the next."""
+        return any(c.dependence == "jagged" for c in self.candidates)
+
+    @property
     def rms(self) -> float:
         return float(np.sqrt(np.mean(self.residuals**2)))
 

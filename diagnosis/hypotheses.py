@@ -34,6 +34,8 @@ _CUT = 1e3
 # Something unknown may have any size over four decades; what solvers of play disagree about has one known to
 # a factor of three: the log of the ratio of these ranges (in their logarithms).
 _KNOWN_SIZE = 2.0
+# An answer this far behind the best in log weight is none any more.
+STILL_POSSIBLE = 20.0
 # An effect whose period the records never complete is that effect only by name.
 _AT_EDGE = 2.0
 # What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
@@ -64,6 +66,11 @@ class Hypothesis:
         return self.log_weight > -np.inf
 
     @property
+    def largest_weight(self) -> float:
+        """Log weight of these effects, alone or with something unknown besides."""
+        return max(self.log_weight, self.unknown_weight)
+
+    @property
     def weight(self) -> float:
         """Log weight of these causes alone, which for one beyond the list counts as unknown."""
         return self.log_weight if self.is_answer else self.unknown_weight
@@ -72,8 +79,7 @@ class Hypothesis:
     def of(cls, fit: Fit, rest: Leftover, drift: Drift = NO_DRIFT) -> Hypothesis:
         """rest: what the fit leaves over, of residuals without the drift of correct solvers."""
         beside = len(fit.names) - 1
-        jagged = any(candidate.dependence == "jagged" for candidate in fit.candidates)
-        allowed = BESIDE_JAGGED * beside if jagged else 0.0
+        allowed = BESIDE_JAGGED * beside if fit.jagged else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
         prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
         if fit.weighing.model_error > 0:
@@ -109,7 +115,7 @@ def disagreement_gain(fit: Fit, rest: Leftover) -> float:
     """
     solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
     z = rest.size / max(solvers)
-    expected = _KNOWN_SIZE if any(c.dependence == "jagged" for c in fit.candidates) else 0.0
+    expected = _KNOWN_SIZE if fit.jagged else 0.0
     return max(0.0, rest.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from diagnosis.candidates import Axis, Candidate
 from diagnosis.case import Case
 from diagnosis.fit import Fit, fit
-from diagnosis.hypotheses import Hypothesis, log_prior, log_prior_unknown
+from diagnosis.hypotheses import STILL_POSSIBLE, Hypothesis, log_prior, log_prior_unknown
 from diagnosis.machine_protocol import Dependence, Real
 from diagnosis.residual import ResidualModel
 from diagnosis.search import weighed
@@ -24,8 +24,6 @@ from plant.modal import static_moment_kg_m
 IMITATED = "gravity"
 # Of unknown causes this share is a spring to ground: a third as probable as gravity.
 _SHARE = 0.06
-# Hypotheses this far behind the best in log weight are none any more.
-_STILL_POSSIBLE = 20.0
 _ITERATIONS = 15
 
 
@@ -49,13 +47,13 @@ def imitations(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fit
     """
     if not isinstance(model.case, Case):
         return ()
-    best = max(max(h.log_weight, h.unknown_weight) for h in hypotheses)
+    best = max(h.largest_weight for h in hypotheses)
     # As probable as a set with gravity would be, times what an unknown cause is beside a listed one.
     unlisted = log_prior_unknown() + float(np.log(_SHARE)) - log_prior((IMITATED,))
     springs = [
         weighed(model, _with_spring(model, h.fit), base)
         for h in hypotheses
-        if IMITATED in h.names and max(h.log_weight, h.unknown_weight) > best - _STILL_POSSIBLE
+        if IMITATED in h.names and h.largest_weight > best - STILL_POSSIBLE
     ]
     return tuple(Hypothesis(s.fit, -np.inf, s.log_weight + unlisted) for s in springs)
 

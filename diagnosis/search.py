@@ -170,7 +170,7 @@ def _least_promise(lead: Fit) -> float:
     """
     if lead.weighing.model_error > 0:
         return -np.inf
-    return _PROMISE + (BESIDE_JAGGED if any(c.dependence == "jagged" for c in lead.candidates) else 0.0)
+    return _PROMISE + (BESIDE_JAGGED if lead.jagged else 0.0)
 
 
 def _pulled(model: ResidualModel, lead: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
@@ -207,7 +207,7 @@ def _hopeless(end: Fit, base: Fit) -> bool:
 
 def _as_solvers_differ(model: ResidualModel, end: Fit) -> bool:
     """Whether play is in the set and what is left is no more than correct solvers of it may differ by."""
-    if not any(c.dependence == "jagged" for c in end.candidates):
+    if not end.jagged:
         return False
     e, drift = without_drift(end.residuals, solver_spread(model, end))
     return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["jagged"], drift.size) ** 2
@@ -256,7 +256,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
         promising = close and (quick or item.cost < around.cost - _LEAST_GAIN)
         promising = promising or (quick and not around.candidates)
         # An imitation of something else by play takes as long as everything besides.
-        costly = any(c.dependence == "jagged" for c in item.candidates) and not _near(item, base)
+        costly = item.jagged and not _near(item, base)
         if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
             item = _refined(model, fine if fine.cost <= item.cost else item, base)
