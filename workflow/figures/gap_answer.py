@@ -52,7 +52,7 @@ def draw_probabilities(
         axes.set_xticks([0, 20, 40, 60, 80, 100])
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("probability [%]")
-        axes.set_title("Which cause, given all records of estimation")
+        axes.set_title("Which cause, given the records")
     return figure
 
 
