@@ -36,17 +36,17 @@ from control_design import (
     synthesise,
     synthesise_jointly,
 )
-from control_design.ellipses import scale_to_minus_one
-from control_design.example_plants import (
+from control_design.analysis.joint_coverage import gamma_of_draws, joint_coverage
+from control_design.analysis.worst_case import worst_case, worst_of
+from control_design.plants.ellipses import scale_to_minus_one
+from control_design.plants.first_order import FirstOrder, Intervals
+from validation.example_plants import (
     LinkUncertainty,
     ResponseRecord,
     Scenario,
     flexible_link,
     flexible_link_specification,
 )
-from control_design.first_order import FirstOrder, Intervals
-from control_design.joint_coverage import gamma_of_draws, joint_coverage
-from control_design.worst_case import worst_case, worst_of
 
 BRUTE = 400_000
 MANY = 20_000

@@ -28,18 +28,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results_file import ResultsFile
-from control_design.certificate import Certificate, certify
-from control_design.closed_loop import MeasuredSensitivity, measure_sensitivity
-from control_design.controller import Controller
-from control_design.plant_set import UncertainPlant
-from control_design.synthesis import synthesise
-from workflow.config import RunConfig, SimulatedSource
-from workflow.entry import built_in_config
-from workflow.progress import Silence
-from workflow.run_directory import RunDirectory
-from workflow.simulated_rig import OUTPUT_NAMES, EncodedArm
-from workflow.stages import STAGES, StageInput
-from workflow.stages.results import load_plant
+from control_design.analysis.certificate import Certificate, certify
+from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
+from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import UncertainPlant
+from control_design.synthesis.synthesis import synthesise
+from workflow.config.run_config import RunConfig, SimulatedSource
+from workflow.engine.progress import Silence
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.entry import built_in_config
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
+from workflow.tasks.stages import STAGES, StageInput
+from workflow.tasks.stages.results import load_plant
 
 REACH_PERCENT = 5.0
 BAND_RAD_S = (0.5, 120.0)

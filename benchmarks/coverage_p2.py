@@ -20,11 +20,11 @@ import numpy as np
 from benchmarks.p2_plants import DT_S, Run, Setting, draw
 from benchmarks.results_file import ResultsFile
 from ident import GobfModel, IdentOptions, identify
-from ident.basis import regressor
-from ident.embedding import EmbeddingOptions, classical, tangent
-from ident.nominal import nominal_near
-from ident.posterior import ResponsePosterior
+from ident.basis.functions import regressor
+from ident.basis.posterior import ResponsePosterior
 from ident.uncertainty import FrequencyUncertainty
+from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
+from ident.uncertainty.nominal import nominal_near
 
 OMEGA = np.geomspace(0.3, 300.0, 150)
 BANDS = ((0.3, 1), (1, 5), (5, 13), (13, 19), (19, 55), (55, 85), (66, 72), (85, 150), (150, 190), (190, 301))

@@ -29,17 +29,17 @@ from scipy.signal import lfilter
 
 from benchmarks.results_file import ResultsFile
 from ident import GobfModel, IdentOptions, Record, identify
-from ident.autoregression import fit_autoregression
-from ident.basis import free_response
-from ident.comparators import PolynomialModel, armax, arx, oe
-from ident.embedding import EmbeddingOptions, tangent
+from ident.basis.functions import free_response
+from ident.basis.poles import Poles
+from ident.checks.validation import fit_on_fresh_data
+from ident.fit.least_squares import fit
+from ident.fit.regression import prepare
 from ident.frequency_fit import identify_frf
-from ident.least_squares import fit
-from ident.pole_search import PoleSearch
-from ident.poles import Poles
-from ident.regression import prepare
+from ident.search.pole_search import PoleSearch
 from ident.uncertainty import FrequencyUncertainty
-from ident.validation import fit_on_fresh_data
+from ident.uncertainty.autoregression import fit_autoregression
+from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from validation.comparators.comparators import PolynomialModel, armax, arx, oe
 
 HALF = 512
 ORDERS = (4, 6, 8, 10)

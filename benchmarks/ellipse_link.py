@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.results_file import ResultsFile
 from control_design import Controller, SynthesisOptions, certify, synthesise
-from control_design.example_plants import Scenario, flexible_link, flexible_link_specification
+from validation.example_plants import Scenario, flexible_link, flexible_link_specification
 
 REFERENCE: dict[Scenario, dict[int | str, float]] = {
     "A": {3: 0.996, 4: 0.994, 5: 0.937, 6: 0.931, "youla": 0.931},

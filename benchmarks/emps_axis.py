@@ -21,7 +21,7 @@ from numba import njit
 from scipy.signal import butter, filtfilt
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-from diagnosis.case import Role
+from diagnosis.machine.case import Role
 
 Real = npt.NDArray[np.float64]
 

@@ -27,12 +27,12 @@ from scipy.signal import lfilter
 
 from benchmarks.results_file import ResultsFile
 from ident import IdentOptions, identify
-from ident.candidate_cost import CandidateCost
-from ident.comparators import oe
-from ident.coordinates import search_space
-from ident.poles import Poles
-from ident.regression import prepare
+from ident.basis.coordinates import search_space
+from ident.basis.poles import Poles
+from ident.fit.regression import prepare
+from ident.search.candidate_cost import CandidateCost
 from tests.ident.benchmark_plants import max_length_sequence, p1
+from validation.comparators.comparators import oe
 
 FOURTH_ORDER = IdentOptions(n_real=2, n_pairs=1)
 FIRST_FIT = """

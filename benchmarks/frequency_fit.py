@@ -23,8 +23,8 @@ from scipy.optimize import least_squares
 
 from benchmarks.results_file import ResultsFile
 from ident import IdentOptions
+from ident.data.frf_records import FrfRepeats
 from ident.frequency_fit import identify_frf
-from ident.frf_records import FrfRepeats
 from ident.uncertainty import FrequencyUncertainty
 from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
 

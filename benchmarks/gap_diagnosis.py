@@ -4,7 +4,7 @@
 
 diagnoses the 15 labelled cases twice, with the exact and with the uncertain rig file. Cases of one's own:
 
-    python -m workflow.blind.generate --cases 120 --seed 501 --out CASES --open
+    python -m validation.blind.generate --cases 120 --seed 501 --out CASES --open
     python -m benchmarks.gap_diagnosis --cases CASES --name gap_diagnosis_own
 """
 
@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.results_file import ResultsFile
-from workflow.blind.report import scores_text
-from workflow.blind.score import score
-from workflow.storage import read_json
+from validation.blind.report import scores_text
+from validation.blind.score import score
+from workflow.engine.storage import read_json
 
 LABELLED = Path(os.environ.get("FLEXLINK_GAP", Path(__file__).parents[2] / "shared" / "gap")) / "labelled"
 

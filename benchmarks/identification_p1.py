@@ -16,8 +16,8 @@ import numpy as np
 from benchmarks.p1_measures import HEADER, PLAIN, Model, Score, bounds, row, score
 from benchmarks.results_file import ResultsFile
 from ident import IdentOptions, Record, identify
-from ident.comparators import armax, arx, oe
-from ident.subspace import moesp
+from validation.comparators.comparators import armax, arx, oe
+from validation.comparators.subspace import moesp
 
 Fit = Callable[[Record], tuple[Model, np.ndarray]]
 OURS = "GOBF, order from data"

@@ -21,9 +21,9 @@ from benchmarks.identification_p1 import PEERS, REACH_HEADER, Fit, ours, quantil
 from benchmarks.p1_measures import FRICTION, HEADER, PLAIN, Score, Variant, bounds, row, score
 from benchmarks.results_file import ResultsFile
 from ident import IdentOptions, Record, identify
-from ident.comparators import oe
-from ident.structure import filter_input
+from ident.basis.structure import filter_input
 from tests.ident.benchmark_plants import DT_S, Truth
+from validation.comparators.comparators import oe
 
 KNOWN = "GOBF, known: rel. degree 2, {} integr."
 

@@ -39,7 +39,7 @@ from control_design import (
     synthesise,
     youla_bracket,
 )
-from control_design.example_plants import flexible_link, flexible_link_specification
+from validation.example_plants import flexible_link, flexible_link_specification
 
 ORDER = 6
 PUBLISHED = ((0.015, 0.965), (0.028, 1.137), (0.050, 1.40))  # damping, max(|W1 S|, |W3 K S|)

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from ident.record import Record
+from ident.data.record import Record
 from tests.ident.benchmark_plants import DT_S, Truth, max_length_sequence, p1, p1_friction, run
 
 GRID = np.geomspace(0.1, 600, 400)

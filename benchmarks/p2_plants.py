@@ -14,7 +14,7 @@ import numpy as np
 from scipy import signal
 from scipy.linalg import block_diag
 
-from ident.record import Record
+from ident.data.record import Record
 
 DT_S = 0.005
 # Three modes, then the two of the variant with five: frequency [Hz], damping ratio, gain.

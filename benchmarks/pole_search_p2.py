@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmarks.results_file import ResultsFile
 from ident import IdentOptions
-from ident.pole_search import PoleSearch
-from ident.regression import Regression, prepare
+from ident.fit.regression import Regression, prepare
+from ident.search.pole_search import PoleSearch
 from tests.ident.benchmark_plants import p2
 
 ROWS: dict[str, dict[str, object]] = {

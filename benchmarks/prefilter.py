@@ -17,10 +17,10 @@ import numpy as np
 
 from benchmarks.results_file import ResultsFile
 from control_design import certify, synthesise
-from control_design.ellipses import Ellipses
-from control_design.example_plants import flexible_link, flexible_link_specification
-from control_design.prefilter import Prefilter, PrefilterOptions, design_prefilter
-from control_design.weights import RationalWeight
+from control_design.convex.reference_filter import Prefilter, PrefilterOptions, design_prefilter
+from control_design.plants.ellipses import Ellipses
+from control_design.plants.weights import RationalWeight
+from validation.example_plants import flexible_link, flexible_link_specification
 
 MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 

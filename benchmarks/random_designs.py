@@ -32,7 +32,7 @@ from control_design import (
     synthesise,
 )
 from ident import Poles
-from ident.basis import basis_response, basis_state_space
+from ident.basis.functions import basis_response, basis_state_space
 from ident.uncertainty import ResponsePosterior
 
 DT_S = 0.005

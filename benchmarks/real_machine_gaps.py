@@ -1,4 +1,4 @@
-"""What real machines have that their models lack, by the diagnosis of `diagnosis.own_plant`.
+"""What real machines have that their models lack, by the diagnosis of `diagnosis.machine.own_plant`.
 
     FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.real_machine_gaps
 
@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks import emps_axis, ruler_robot, serial_link_stage
 from benchmarks.results_file import ResultsFile
 from diagnosis import Diagnosis, PlantCase, diagnose, pooled_rms
-from diagnosis.model_error import correlation_length
+from diagnosis.fit.model_error import correlation_length
 
 Print = Callable[[str], None]
 

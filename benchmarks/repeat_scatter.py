@@ -25,13 +25,13 @@ from scipy.stats import f as f_distribution
 
 from benchmarks.results_file import ResultsFile
 from ident import IdentOptions, Record, band_limited, identify
+from ident.checks.validation import repeat_scatter
 from ident.closed_loop import indirect, two_stage
-from ident.conditions import combine_posteriors, combine_responses, record_posteriors
-from ident.embedding import EmbeddingOptions
+from ident.data.frf_records import FrfRepeats
 from ident.frequency_fit import FrfIdentification, identify_frf
-from ident.frf_records import FrfRepeats
 from ident.uncertainty import FrequencyUncertainty
-from ident.validation import repeat_scatter
+from ident.uncertainty.conditions import combine_posteriors, combine_responses, record_posteriors
+from ident.uncertainty.embedding import EmbeddingOptions
 
 HZ = 2 * np.pi
 Print = Callable[[str], None]
@@ -227,7 +227,7 @@ were other plants (table of modes): no noise bound of another day can cover that
 single gross errors, kept out of the means, are counted. A fitted model averages over frequencies: its own
 ellipses are a fifth of the measured ones, right about noise and far too small for another day. Adding the
 gain that a date's runs share helps where gain is what differs. For other days use conditions
-(ident.conditions), with four or more of them.
+(ident.uncertainty.conditions), with four or more of them.
 """
 
 

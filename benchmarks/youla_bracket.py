@@ -12,8 +12,8 @@ import argparse
 import time
 
 from benchmarks.results_file import ResultsFile
-from control_design.example_plants import flexible_link, flexible_link_specification
-from control_design.youla import BracketProblem, YoulaOptions, youla_bracket
+from control_design.convex.youla import BracketProblem, YoulaOptions, youla_bracket
+from validation.example_plants import flexible_link, flexible_link_specification
 
 PUBLISHED = {"A": (0.912, 0.931, 0.945), "B": (0.916, 1.065, 1.205), "C": (0.916, 1.268, 1.705)}
 OURS_BY_ORDER = {

@@ -1,9 +1,8 @@
 """From an uncertain frequency response to a certified controller."""
 
-from control_design.between_grid_points import AllFrequencies
-from control_design.c_code import c_header, c_source
-from control_design.certificate import Certificate, PlantVerdict, SpecificationItem, certify
-from control_design.closed_loop import (
+from control_design.analysis.between_grid_points import AllFrequencies
+from control_design.analysis.certificate import Certificate, PlantVerdict, SpecificationItem, certify
+from control_design.analysis.closed_loop import (
     ClosedLoopTrajectory,
     LinearMachine,
     SampledMachine,
@@ -11,25 +10,26 @@ from control_design.closed_loop import (
     simulate,
     step_metrics,
 )
-from control_design.controller import Controller, ControllerStepper
-from control_design.ellipses import Ellipses
-from control_design.guards import Guard
-from control_design.joint_coverage import JointCoverage
-from control_design.joint_synthesis import JointDesign, synthesise_jointly
-from control_design.margins import Margins
-from control_design.plant_set import Channel, Mode, UncertainPlant
-from control_design.prefilter import Prefilter, PrefilterOptions, design_prefilter
+from control_design.analysis.joint_coverage import JointCoverage
+from control_design.analysis.margins import Margins
+from control_design.controllers.c_code import c_header, c_source
+from control_design.controllers.controller import Controller, ControllerStepper
+from control_design.convex.reference_filter import Prefilter, PrefilterOptions, design_prefilter
+from control_design.convex.youla import YoulaBracket, YoulaOptions, youla_bracket
+from control_design.plants.ellipses import Ellipses
+from control_design.plants.guards import Guard
+from control_design.plants.plant_set import Channel, Mode, UncertainPlant
+from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification, SpecificationError
-from control_design.synthesis import SynthesisOptions, synthesise
-from control_design.synthesis_result import (
+from control_design.synthesis.joint_synthesis import JointDesign, synthesise_jointly
+from control_design.synthesis.synthesis import SynthesisOptions, synthesise
+from control_design.synthesis.synthesis_result import (
     BlockingPoint,
     Outcome,
     StartReport,
     SynthesisError,
     SynthesisResult,
 )
-from control_design.weights import RationalWeight
-from control_design.youla import YoulaBracket, YoulaOptions, youla_bracket
 
 __all__ = [
     "AllFrequencies",

@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from control_design.biquads import SectionKind, imaginary_axis
-from control_design.ellipses import Complex, Real
-from control_design.plant_set import Mode, UncertainPlant, modes_of
-from control_design.weights import RationalWeight, bandwidth_weight, effort_limit_weight
+from control_design.controllers.biquads import SectionKind, imaginary_axis
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight
 
 __all__ = ["RationalWeight", "Specification", "SpecificationError", "performance_modes"]
 

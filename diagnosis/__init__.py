@@ -1,16 +1,16 @@
 """Why simulation and machine differ: which unmodelled effect, how sure, how far the gap shrinks with it."""
 
-from diagnosis.case import Case, Experiment
 from diagnosis.diagnosis import Diagnosis, NamedEffect, diagnose
-from diagnosis.discrimination import Rival
-from diagnosis.experiment_choices import Limits
-from diagnosis.hypotheses import Hypothesis, Probabilities, probabilities
-from diagnosis.next_experiment import NextExperiment
-from diagnosis.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-from diagnosis.residual import ResidualModel, pooled_rms
-from diagnosis.rivals import rivals_of
-from diagnosis.search import Search, search
-from diagnosis.where_records import Where
+from diagnosis.evidence.hypotheses import Hypothesis, Probabilities, probabilities
+from diagnosis.evidence.search import Search, search
+from diagnosis.fit.residual import ResidualModel, pooled_rms
+from diagnosis.machine.case import Case, Experiment
+from diagnosis.machine.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
+from diagnosis.next_experiment.competing import rivals_of
+from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.experiment_choices import Limits
+from diagnosis.next_experiment.next_experiment import NextExperiment
+from diagnosis.where.where_records import Where
 
 __all__ = [
     "Case",

@@ -8,19 +8,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diagnosis.candidates import Candidate
-from diagnosis.case import Case
-from diagnosis.confirmation import confronted
-from diagnosis.discrimination import Rival
-from diagnosis.fit import Fit, fit
-from diagnosis.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
-from diagnosis.imitation import IMITATED, imitations
-from diagnosis.machine_protocol import CaseOfMachine, Real
-from diagnosis.model_error import at_its_own_level
-from diagnosis.residual import ResidualModel, pooled_rms
-from diagnosis.rivals import rival_of_fit, rivals_of
-from diagnosis.rounding import Rounding, leads_over, rounding_effect
-from diagnosis.search import Progress, search
+from diagnosis.evidence.confirmation import confronted
+from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
+from diagnosis.evidence.look_alikes import IMITATED, imitations
+from diagnosis.evidence.search import Progress, search
+from diagnosis.fit.fit import Fit, fit
+from diagnosis.fit.model_error import at_its_own_level
+from diagnosis.fit.residual import ResidualModel, pooled_rms
+from diagnosis.machine.candidates import Candidate
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.rounding import Rounding, leads_over, rounding_effect
+from diagnosis.next_experiment.competing import rival_of_fit, rivals_of
+from diagnosis.next_experiment.discrimination import Rival
 
 Verdict = Literal["none", "effect", "unknown"]
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from scipy.signal import dlsim
 
 from ident import IdentOptions, Record
-from ident.miso_uncertainty import response_uncertainty
 from ident.several_inputs import identify_miso
+from ident.uncertainty.miso_uncertainty import response_uncertainty
 from plant import prbs, two_link_operating_point
 
 DT_S, ELBOW_ANGLE_RAD, NOISE_M, AMPLITUDE_V = 0.002, 2 * np.pi / 3, 2e-5, 1.0

@@ -1,19 +1,19 @@
 """Identification: records in, GOBF models with their uncertainty out."""
 
-from ident.basis import basis_response, basis_state_space, regressor
-from ident.error_surface import ErrorSurface, error_surface
+from ident.basis.functions import basis_response, basis_state_space, regressor
+from ident.basis.miso_model import MisoModel
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.data.record import Record
+from ident.data.signal_filter import band_limited
 from ident.frequency_fit import FrfIdentification, identify_frf
 from ident.identify import Identification, identify
 from ident.miso_identification import MisoIdentification
-from ident.miso_model import MisoModel
-from ident.model import GobfModel
-from ident.options import IdentOptions
-from ident.poles import Poles
-from ident.prefilter import band_limited
-from ident.record import Record
-from ident.search_trace import SearchTrace
+from ident.search.error_surface import ErrorSurface, error_surface
+from ident.search.search_trace import SearchTrace
 from ident.several_inputs import identify_miso
-from ident.structure import Structure
 
 __all__ = [
     "ErrorSurface",

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ident.arrays import RealArray
-from ident.embedding import EmbeddingOptions, tangent
-from ident.frequency_uncertainty import FrequencyUncertainty
+from ident.basis.options import IdentOptions
+from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import RealArray
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
 from ident.identify import Identification, identify
-from ident.options import IdentOptions
-from ident.posterior import ResponsePosterior
-from ident.record import Record
+from ident.uncertainty.embedding import EmbeddingOptions, tangent
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,20 @@ from typing import Any, Self
 import numpy as np
 from scipy.stats import chi2
 
-from ident.arrays import RealArray, readonly_real
-from ident.embedding import EmbeddingOptions
-from ident.frequency_uncertainty import FrequencyUncertainty
-from ident.frf_embedding import embed_response
-from ident.frf_polish import to_log
-from ident.frf_regression import FrfFit, FrfRegression, fit_response, pole_directions, prepare_response
-from ident.frf_search import FrfSearch
-from ident.model import GobfModel
-from ident.options import IdentOptions
-from ident.order_selection import OrderStep
-from ident.pole_warnings import pole_warnings
-from ident.poles import Poles
-from ident.posterior import ResponsePosterior
-from ident.search_trace import SearchTrace
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import RealArray, readonly_real
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.fit.frf_refinement import to_log
+from ident.fit.frf_regression import FrfFit, FrfRegression, fit_response, pole_directions, prepare_response
+from ident.search.frf_search import FrfSearch
+from ident.search.order_selection import OrderStep
+from ident.search.pole_warnings import pole_warnings
+from ident.search.search_trace import SearchTrace
+from ident.uncertainty.embedding import EmbeddingOptions
+from ident.uncertainty.frf_embedding import embed_response
 
 # The covariances explain the residual if chi-square is no less probable than this.
 _LEVEL = 0.99

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ident.arrays import RealArray, readonly_real
-from ident.model import GobfModel
-from ident.order_selection import OrderStep
-from ident.prior_tests import PriorTest
-from ident.search_trace import SearchTrace
-from ident.structure import Structure
+from ident.basis.model import GobfModel
+from ident.basis.structure import Structure
+from ident.checks.prior_tests import PriorTest
+from ident.data.arrays import RealArray, readonly_real
+from ident.search.order_selection import OrderStep
+from ident.search.search_trace import SearchTrace
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,20 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from ident.arrays import RealArray
-from ident.identification import Identification
-from ident.input_checks import advice, refuse_unusable
-from ident.integrators_prior import integrators_test
-from ident.least_squares import fit, linearisation
-from ident.model import GobfModel
-from ident.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
-from ident.options import IdentOptions
-from ident.order_selection import OrderSelection, Progress
-from ident.pole_search import PoleSearch
-from ident.pole_warnings import pole_warnings
-from ident.poles import Poles
-from ident.polish import Bounds, Polished, free_optimality
-from ident.prior_tests import (
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.checks.input_checks import advice, refuse_unusable
+from ident.checks.integrators_prior import integrators_test
+from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
+from ident.checks.prior_tests import (
     Fitted,
     PriorTest,
     best_under_relative_degree,
@@ -32,10 +25,17 @@ from ident.prior_tests import (
     relative_degree_test,
     too_few_poles,
 )
-from ident.record import Record
-from ident.regression import Regression, prepare, restructured, thinned
-from ident.search_trace import PolishedMinimum, SearchTrace
-from ident.structured_fit import structured_fit, structured_optimality
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.least_squares import fit, linearisation
+from ident.fit.refinement import Bounds, Polished, free_optimality
+from ident.fit.regression import Regression, prepare, restructured, thinned
+from ident.fit.structured_fit import structured_fit, structured_optimality
+from ident.identification import Identification
+from ident.search.order_selection import OrderSelection, Progress
+from ident.search.pole_search import PoleSearch
+from ident.search.pole_warnings import pole_warnings
+from ident.search.search_trace import PolishedMinimum, SearchTrace
 
 # Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
 _MISLED = 1.2

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ident.arrays import RealArray, readonly_real
-from ident.miso_model import MisoModel
-from ident.order_selection import OrderStep
-from ident.search_trace import SearchTrace
-from ident.structure import Structure
+from ident.basis.miso_model import MisoModel
+from ident.basis.structure import Structure
+from ident.data.arrays import RealArray, readonly_real
+from ident.search.order_selection import OrderStep
+from ident.search.search_trace import SearchTrace
 
 
 @dataclass(frozen=True, eq=False)

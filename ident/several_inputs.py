@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from ident.arrays import RealArray
-from ident.identify import _in_order
-from ident.miso_identification import MisoIdentification
-from ident.miso_model import MisoModel
-from ident.miso_regression import (
+from ident.basis.miso_model import MisoModel
+from ident.basis.options import IdentOptions
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.miso_regression import (
     MisoRegression,
     fit,
     linearisation,
@@ -25,15 +25,15 @@ from ident.miso_regression import (
     project,
     restructured,
 )
-from ident.miso_search import MisoSearch, MisoSelection
-from ident.options import IdentOptions
-from ident.order_selection import Progress
-from ident.pole_warnings import pole_warnings
-from ident.polish import Bounds, Polished, free_optimality
-from ident.record import Record
-from ident.regression import thinned
-from ident.residual_colour import effective_samples
-from ident.search_trace import SearchTrace
+from ident.fit.refinement import Bounds, Polished, free_optimality
+from ident.fit.regression import thinned
+from ident.fit.residual_colour import effective_samples
+from ident.identify import _in_order
+from ident.miso_identification import MisoIdentification
+from ident.search.miso_search import MisoSearch, MisoSelection
+from ident.search.order_selection import Progress
+from ident.search.pole_warnings import pole_warnings
+from ident.search.search_trace import SearchTrace
 
 # As in `ident.identify`: level at which a nuisance left to the data stays, and how far initial states may
 # have led a search from rest astray.

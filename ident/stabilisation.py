@@ -19,17 +19,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ident.arrays import RealArray, readonly_real
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.data.arrays import RealArray, readonly_real
+from ident.data.record import Record
+from ident.fit.least_squares import fit
+from ident.fit.refinement import Polished
+from ident.fit.regression import Regression, prepare, thinned
+from ident.fit.residual_colour import effective_samples
 from ident.identification import Identification
-from ident.least_squares import fit
-from ident.options import IdentOptions
-from ident.order_selection import Progress
-from ident.pole_search import PoleSearch
-from ident.poles import Poles
-from ident.polish import Polished
-from ident.record import Record
-from ident.regression import Regression, prepare, thinned
-from ident.residual_colour import effective_samples
+from ident.search.order_selection import Progress
+from ident.search.pole_search import PoleSearch
 
 FREQUENCY_TOLERANCE = 0.01
 DAMPING_TOLERANCE = 0.05

@@ -20,7 +20,7 @@ MAY_IMPORT = {
 }
 ROOMS = set(MAY_IMPORT)
 # control_design takes result types from ident, never its estimators.
-RESULT_TYPES = {"ident.uncertainty", "ident.model", "ident.poles", "ident"}
+RESULT_TYPES = {"ident.uncertainty", "ident.basis.model", "ident.basis.poles", "ident"}
 NOT_IN_NUMERICAL_CODE = ("matplotlib", "typer", "rich", "jinja2")
 
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 import typer
 
-from workflow.errors import (
+from workflow.engine.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL,
     EXIT_NOT_CERTIFIED,
@@ -84,7 +84,7 @@ def run(
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     from workflow.console import TerminalProgress, print_summary
-    from workflow.entry import run_from_files
+    from workflow.tasks.entry import run_from_files
 
     with TerminalProgress() as progress:
         summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
@@ -105,7 +105,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate the experiments of a configuration and write them as CSV."""
-    from workflow.entry import simulate_to_csv
+    from workflow.tasks.entry import simulate_to_csv
 
     files = simulate_to_csv(config, out)
     if as_json:
@@ -188,10 +188,10 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
-    from ident.options import IdentOptions
+    from ident.basis.options import IdentOptions
+    from workflow.config.settings import check
     from workflow.console import TerminalProgress, print_summary
-    from workflow.log_identification import identify_logs
-    from workflow.settings import check
+    from workflow.tasks.log_identification import identify_logs
 
     chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators}
     chosen |= {
@@ -260,7 +260,7 @@ def design(
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
     from workflow.console import print_summary
-    from workflow.entry import design_controller
+    from workflow.tasks.entry import design_controller
 
     summary = design_controller(source, specification, out=out, seed=seed)
     if as_json:
@@ -277,8 +277,8 @@ def report(
 ) -> None:
     """Write report.html of a run directory anew and print its table."""
     from workflow.console import print_summary
-    from workflow.pipeline import rebuild_report
-    from workflow.run_directory import RunDirectory
+    from workflow.engine.run_directory import RunDirectory
+    from workflow.tasks.pipeline import rebuild_report
 
     summary = rebuild_report(RunDirectory.open(directory))
     if as_json:
@@ -295,9 +295,9 @@ def paper(
     as_json: Json = False,
 ) -> None:
     """Redraw the figures of Ziaei & Wang 2006 with what the paper reports beside what we find."""
+    from validation.paper.command import redraw_paper
+    from validation.paper.settings import PaperSettings
     from workflow.console import TerminalProgress, print_summary
-    from workflow.paper.command import redraw_paper
-    from workflow.paper.settings import PaperSettings
 
     with TerminalProgress() as progress:
         summary = redraw_paper(out, PaperSettings(seed=seed), replace=replace, progress=progress)
@@ -427,7 +427,7 @@ def blind(
     as_json: Json = False,
 ) -> None:
     """Cases from an independent simulator, labels sealed by a salted hash, diagnosis, opening, scores."""
-    from workflow.blind.protocol import run_blind
+    from validation.blind.protocol import run_blind
     from workflow.console import TerminalProgress, print_summary
 
     with TerminalProgress() as progress:
@@ -446,7 +446,7 @@ def _degree(text: str | None) -> int | str | None:
 
 
 def _print_json(document: Mapping[str, Any]) -> None:
-    from workflow.storage import strict_json
+    from workflow.engine.storage import strict_json
 
     sys.stdout.write(json.dumps(strict_json(document), allow_nan=False, ensure_ascii=False, indent=1) + "\n")
 

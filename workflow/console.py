@@ -14,8 +14,8 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.table import Column, Table
 from rich.text import Text
 
-from workflow.errors import printable
-from workflow.summary import RunSummary
+from workflow.engine.errors import printable
+from workflow.tasks.summary import RunSummary
 
 
 class _Remaining(ProgressColumn):

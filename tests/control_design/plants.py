@@ -5,7 +5,7 @@ from __future__ import annotations
 import control
 import numpy as np
 
-from control_design.example_plants import ResponseRecord
+from validation.example_plants import ResponseRecord
 
 
 class RelativeDisc:

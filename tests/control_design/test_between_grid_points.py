@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from control_design import Certificate, Channel, Controller, Specification, UncertainPlant, certify
-from control_design.example_plants import ResponseRecord, flexible_link, flexible_link_specification
-from control_design.first_order import FirstOrder, Intervals, cleared_integrators
-from control_design.plant_set import frequency_response
-from control_design.rational_response import RationalResponse
-from control_design.set_expansion import stacked
-from control_design.worst_case import KINDS, worst_case
+from control_design.analysis.worst_case import KINDS, worst_case
+from control_design.plants.first_order import FirstOrder, Intervals, cleared_integrators
+from control_design.plants.plant_set import frequency_response
+from control_design.plants.rational_response import RationalResponse
+from control_design.plants.set_expansion import stacked
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
+from validation.example_plants import ResponseRecord, flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc, hub_arm, random_stable, tip_acceleration
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import bilinear
 
-from control_design.angle_program import AngleProgram, Rows
-from control_design.biquads import Cascade
-from control_design.ellipses import Ellipses
+from control_design.controllers.biquads import Cascade
+from control_design.plants.ellipses import Ellipses
+from control_design.synthesis.angle_program import AngleProgram, Rows
 
 _SECTIONS = [
     ("second_order",),

@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 
 from control_design import Controller
-from control_design.c_code import c_header, c_source
+from control_design.controllers.c_code import c_header, c_source
 
 _DT = 0.005
 _COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")

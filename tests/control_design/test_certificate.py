@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from control_design import Certificate, Channel, Controller, Specification, UncertainPlant, certify
-from control_design.example_plants import ResponseRecord
+from validation.example_plants import ResponseRecord
 
 from .plants import RelativeDisc, hub_arm, tip_acceleration
 

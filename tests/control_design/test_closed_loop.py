@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from control_design import ClosedLoopTrajectory, Controller, LinearMachine, simulate, step_metrics
-from control_design.closed_loop import measure_sensitivity
+from control_design.analysis.closed_loop import measure_sensitivity
 
 from .plants import hub_arm
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from control_design.ellipses import (
+from control_design.plants.ellipses import (
     Ellipses,
     distance_to_minus_one,
     farthest_distance,

@@ -9,13 +9,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from control_design import Channel, RationalWeight, Specification
-from control_design.example_plants import LinkUncertainty
-from control_design.first_order import FirstOrder, Intervals, cleared_integrators, pole_factor, zero_factor
-from control_design.plant_set import frequency_response
-from control_design.rational_response import RationalResponse
-from control_design.set_expansion import OwnGridSet, PosteriorSet
+from control_design.plants.first_order import (
+    FirstOrder,
+    Intervals,
+    cleared_integrators,
+    pole_factor,
+    zero_factor,
+)
+from control_design.plants.plant_set import frequency_response
+from control_design.plants.rational_response import RationalResponse
+from control_design.plants.set_expansion import OwnGridSet, PosteriorSet
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
+from validation.example_plants import LinkUncertainty
 
 from .plants import hub_arm, random_stable
 

@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import norm
 
 from control_design import Certificate, Channel, Controller, Specification, UncertainPlant, certify
-from control_design.example_plants import ResponseRecord, flexible_link, flexible_link_specification
-from control_design.first_order import FirstOrder, Intervals
-from control_design.joint_coverage import JointCoverage, gamma_of_draws, joint_coverage
-from control_design.rational_response import RationalResponse
-from control_design.set_expansion import stacked
+from control_design.analysis.joint_coverage import JointCoverage, gamma_of_draws, joint_coverage
+from control_design.plants.first_order import FirstOrder, Intervals
+from control_design.plants.rational_response import RationalResponse
+from control_design.plants.set_expansion import stacked
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
+from validation.example_plants import ResponseRecord, flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc, hub_arm, tip_acceleration
 

@@ -15,12 +15,12 @@ from control_design import (
     synthesise,
     synthesise_jointly,
 )
-from control_design.example_plants import flexible_link, flexible_link_specification
-from control_design.guards import different_responses, guard_grid, winds
-from control_design.joint_coverage import gamma_of_draws, unstable_draws
-from control_design.plant_set import frequency_response
+from control_design.analysis.joint_coverage import gamma_of_draws, unstable_draws
+from control_design.plants.guards import different_responses, guard_grid, winds
+from control_design.plants.plant_set import frequency_response
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
+from validation.example_plants import flexible_link, flexible_link_specification
 
 from .plants import random_stable
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from control_design.minimax import PlaneRows, plane, smallest_ratio, turning
+from control_design.convex.minimax import PlaneRows, plane, smallest_ratio, turning
 
 
 def _rows(at, factor, offset, level, slope=None, reach=None):

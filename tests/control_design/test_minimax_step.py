@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from control_design.minimax_step import minimax_step
+from control_design.synthesis.minimax_step import minimax_step
 
 
 def _random(seed: int, rows: int = 120, n: int = 7):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from control_design import Channel, UncertainPlant
-from control_design.example_plants import (
+from control_design.plants.plant_set import count_integrators, frequency_response, modes_of
+from validation.example_plants import (
     LinkUncertainty,
     ResponseRecord,
     flexible_link,
     nominal_matches_centre,
 )
-from control_design.plant_set import count_integrators, frequency_response, modes_of
 
 from .plants import RelativeDisc, hub_arm, random_stable
 

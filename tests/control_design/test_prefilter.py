@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import scipy.io
 
-from control_design.closed_loop import LinearMachine, simulate
-from control_design.controller import Controller
-from control_design.ellipses import Ellipses
-from control_design.plant_set import UncertainPlant
-from control_design.prefilter import (
+from control_design.analysis.closed_loop import LinearMachine, simulate
+from control_design.controllers.controller import Controller
+from control_design.convex.reference_filter import (
     Prefilter,
     PrefilterOptions,
     design_prefilter,
     worst_matching_error,
 )
-from control_design.weights import RationalWeight
+from control_design.plants.ellipses import Ellipses
+from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.weights import RationalWeight
 
 from .plants import RelativeDisc, hub_arm
 

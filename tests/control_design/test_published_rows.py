@@ -20,7 +20,7 @@ from control_design import (
     design_prefilter,
     synthesise,
 )
-from control_design.example_plants import flexible_link, flexible_link_specification
+from validation.example_plants import flexible_link, flexible_link_specification
 
 pytestmark = pytest.mark.slow
 

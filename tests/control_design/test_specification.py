@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from control_design import RationalWeight, Specification, SpecificationError, UncertainPlant
-from control_design.example_plants import flexible_link
+from validation.example_plants import flexible_link
 
 from .plants import hub_arm, tip_acceleration
 

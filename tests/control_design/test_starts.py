@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from control_design import Specification, SynthesisOptions, UncertainPlant, certify, synthesise
-from control_design.biquads import Cascade
-from control_design.descent import MinimaxDescent, _Boundary
-from control_design.ellipses import distance_to_minus_one, largest_disturbance_gain
-from control_design.example_plants import flexible_link, flexible_link_specification
-from control_design.problem import Problem
-from control_design.starts import StartMaker, with_cancelling_section
+from control_design.controllers.biquads import Cascade
+from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
+from control_design.synthesis.descent import MinimaxDescent, _Boundary
+from control_design.synthesis.problem import Problem
+from control_design.synthesis.starts import StartMaker, with_cancelling_section
+from validation.example_plants import flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc
 

@@ -6,13 +6,13 @@ import control
 import numpy as np
 import pytest
 
-from control_design.certificate import certify
-from control_design.controller import Controller
-from control_design.first_order import Intervals
-from control_design.plant_set import UncertainPlant
+from control_design.analysis.certificate import certify
+from control_design.controllers.controller import Controller
+from control_design.plants.first_order import Intervals
+from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.stated_uncertainty import StatedDiscs
+from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
-from control_design.stated_uncertainty import StatedDiscs
-from control_design.weights import RationalWeight
 
 DT_S = 0.05
 WEIGHT = RationalWeight(numerator=(0.2, 0.1), denominator=(0.1, 1.0))

@@ -20,7 +20,7 @@ from control_design import (
     certify,
     synthesise,
 )
-from control_design.example_plants import flexible_link, flexible_link_specification
+from validation.example_plants import flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc, hub_arm, tip_acceleration
 

@@ -15,9 +15,9 @@ from control_design import (
     simulate,
     step_metrics,
 )
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.posterior import ResponsePosterior
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
 from plant import SampledArm, linear_arm, paper_link
 
 

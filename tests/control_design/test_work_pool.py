@@ -23,7 +23,7 @@ _ENDLESS = """
 import signal
 import numpy as np
 from control_design import SynthesisOptions, synthesise
-from control_design.example_plants import flexible_link, flexible_link_specification
+from validation.example_plants import flexible_link, flexible_link_specification
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)

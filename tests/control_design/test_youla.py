@@ -8,13 +8,13 @@ import control
 import numpy as np
 import pytest
 
-from control_design.example_plants import flexible_link, flexible_link_specification
-from control_design.orthonormal_basis import basis_response, basis_state_space
-from control_design.plant_set import UncertainPlant
+from control_design.convex.orthonormal_basis import basis_response, basis_state_space
+from control_design.convex.youla import YoulaBracket, YoulaOptions, youla_bracket
+from control_design.convex.youla_basis import coprime_factors
+from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
-from control_design.weights import RationalWeight
-from control_design.youla import YoulaBracket, YoulaOptions, youla_bracket
-from control_design.youla_basis import coprime_factors
+from validation.example_plants import flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc, hub_arm
 

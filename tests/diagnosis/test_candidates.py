@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from diagnosis.candidates import candidates, in_place_of
-from diagnosis.case import Case, Experiment
-from diagnosis.fit import Fit
-from diagnosis.hypotheses import Hypothesis
-from diagnosis.leftover import leftover
+from diagnosis.evidence.hypotheses import Hypothesis
+from diagnosis.fit.discrepancy import leftover
+from diagnosis.fit.fit import Fit
+from diagnosis.machine.candidates import candidates, in_place_of
+from diagnosis.machine.case import Case, Experiment
 from plant.presets import paper_link
 
 TOLERANCE = 0.05

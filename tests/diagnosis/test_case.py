@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from diagnosis import Case, Experiment
-from diagnosis.candidates import candidates
-from diagnosis.nominal import NominalParameters
+from diagnosis.fit.nominal import NominalParameters
+from diagnosis.machine.candidates import candidates
 from plant import EFFECTS, paper_link
 
 RNG = np.random.default_rng(5)

@@ -7,8 +7,8 @@ import pytest
 
 from diagnosis import Case, Experiment, diagnose
 from plant import Rig, prbs
-from workflow.blind.rigs import draw_rig, rig_toml
-from workflow.blind.truth import Truth
+from validation.blind.rigs import draw_rig, rig_toml
+from validation.blind.truth import Truth
 
 
 def _case(folder, effects, held_out=None, held_out_V=0.7):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from diagnosis.candidates import Axis, Candidate
-from diagnosis.fit import Fit, log_evidence
-from diagnosis.hypotheses import Hypothesis, log_prior, probabilities
-from diagnosis.leftover import leftover
+from diagnosis.evidence.hypotheses import Hypothesis, log_prior, probabilities
+from diagnosis.fit.discrepancy import leftover
+from diagnosis.fit.fit import Fit, log_evidence
+from diagnosis.machine.candidates import Axis, Candidate
 from plant import EFFECTS
 
 SLOPE = np.array([0.5, -1.2, 0.8, 2.0])

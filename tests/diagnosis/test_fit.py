@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from diagnosis import Case, Experiment
-from diagnosis.candidates import candidates
-from diagnosis.fit import fit
-from diagnosis.residual import ResidualModel
-from diagnosis.screening import Screening
+from diagnosis.evidence.screening import Screening
+from diagnosis.fit.fit import fit
+from diagnosis.fit.residual import ResidualModel
+from diagnosis.machine.candidates import candidates
 from plant import Rig, prbs
-from workflow.blind.rigs import draw_rig, draw_tolerances, rig_toml, stated
-from workflow.blind.truth import Truth
+from validation.blind.rigs import draw_rig, draw_tolerances, rig_toml, stated
+from validation.blind.truth import Truth
 
 
 @pytest.fixture(scope="module")

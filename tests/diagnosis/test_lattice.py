@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from diagnosis import Case, diagnose
-from diagnosis.lattice import cell_residual, lattice_step
+from diagnosis.machine.quantisation_grid import cell_residual, lattice_step
 from tests.diagnosis.recorded import recorded_case
 
 NOISE = 1e-3

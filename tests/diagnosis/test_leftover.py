@@ -8,7 +8,7 @@ import scipy.signal
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from diagnosis.leftover import _log_factor, leftover
+from diagnosis.fit.discrepancy import _log_factor, leftover
 
 SEGMENTS = [1400, 1001, 1200]
 

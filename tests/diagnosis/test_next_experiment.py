@@ -10,12 +10,12 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from diagnosis import ResidualModel
-from diagnosis.candidates import candidates
-from diagnosis.discrimination import Rival
-from diagnosis.experiment_choices import Excitation, Limits, excitations
-from diagnosis.fit import fit
-from diagnosis.next_experiment import next_experiment
-from diagnosis.rivals import rival_of_fit, rivals_of
+from diagnosis.fit.fit import fit
+from diagnosis.machine.candidates import candidates
+from diagnosis.next_experiment.competing import rival_of_fit, rivals_of
+from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.experiment_choices import Excitation, Limits, excitations
+from diagnosis.next_experiment.next_experiment import next_experiment
 from plant import prbs, simulate
 from plant.effects import (
     ActuatorLag,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis.nominal import prior_cost, prior_curvature, prior_slope
+from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 
 
 @pytest.mark.parametrize("d", [0.0, 0.7, -1.9, 2.4, -3.3])

@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
-from diagnosis.fit import Fit
-from diagnosis.machine_protocol import Weighing
-from diagnosis.model_error import at_its_own_level, correlation_length, log_evidence_with_model_error
+from diagnosis.fit.fit import Fit
+from diagnosis.fit.model_error import at_its_own_level, correlation_length, log_evidence_with_model_error
+from diagnosis.machine.machine_protocol import Weighing
 from examples import own_plant
 from plant import simulate
 from tests.diagnosis.synthetic_residuals import RIG, made, white

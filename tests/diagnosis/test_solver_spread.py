@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from diagnosis import Case, Experiment
-from diagnosis.candidates import candidates
-from diagnosis.fit import Fit
-from diagnosis.hypotheses import disagreement_gain
-from diagnosis.leftover import Leftover
-from diagnosis.residual import ResidualModel
-from diagnosis.solver_spread import NO_DRIFT, solver_spread, without_drift
+from diagnosis.evidence.hypotheses import disagreement_gain
+from diagnosis.fit.discrepancy import Leftover
+from diagnosis.fit.fit import Fit
+from diagnosis.fit.residual import ResidualModel
+from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
+from diagnosis.machine.candidates import candidates
 from plant import Rig, prbs
-from workflow.blind.rigs import draw_rig, rig_toml
-from workflow.blind.truth import Truth
+from validation.blind.rigs import draw_rig, rig_toml
+from validation.blind.truth import Truth
 
 
 def _near_the_truth(folder, effect, values, *, seed, off=1.0):

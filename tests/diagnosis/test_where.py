@@ -9,12 +9,12 @@ import pytest
 from scipy.fft import dct
 
 from diagnosis import Case, Experiment, ResidualModel
-from diagnosis.distortion import period_of, periodic_findings
-from diagnosis.regimes import motions
-from diagnosis.where import subsystem_mass, where
-from diagnosis.where_common import common_findings
-from diagnosis.where_energy import band_gaps, sensor_gaps
-from diagnosis.where_sentences import best_curve
+from diagnosis.where.distortion import period_of, periodic_findings
+from diagnosis.where.regimes import motions
+from diagnosis.where.where import subsystem_mass, where
+from diagnosis.where.where_common import common_findings
+from diagnosis.where.where_energy import band_gaps, sensor_gaps
+from diagnosis.where.where_sentences import best_curve
 from plant import EFFECTS, multisine, multisine_lines, simulate
 from plant.effects import (
     CoulombFriction,

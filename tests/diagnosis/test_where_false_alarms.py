@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from diagnosis.where import where
+from diagnosis.where.where import where
 from tests.diagnosis.synthetic_residuals import made, white
 
 LEVEL = 0.1

@@ -14,10 +14,10 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from workflow.config import load_config
-from workflow.pipeline import run_pipeline
-from workflow.run_directory import RunDirectory
-from workflow.stages.results import load_certificate
+from workflow.config.run_config import load_config
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.pipeline import run_pipeline
+from workflow.tasks.stages.results import load_certificate
 
 ROOT = Path(__file__).resolve().parents[2]
 GOLDEN = Path(__file__).with_name("margins.toml")

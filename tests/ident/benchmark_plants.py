@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from ident.record import Record
+from ident.data.record import Record
 
 DT_S = 0.005
 

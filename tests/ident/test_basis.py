@@ -8,7 +8,7 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.basis import (
+from ident.basis.functions import (
     all_pass_response,
     all_pass_signal,
     basis_response,
@@ -16,8 +16,8 @@ from ident.basis import (
     free_response,
     regressor,
 )
-from ident.paper_realisation import complex_realisation, real_realisation
-from ident.poles import Poles
+from ident.basis.paper_realisation import complex_realisation, real_realisation
+from ident.basis.poles import Poles
 
 real_poles = st.lists(st.floats(-0.95, 0.95), max_size=3)
 pair_poles = st.lists(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.batched_direct import minimise_in_batches
-from ident.direct import minimise
+from ident.search.batched_direct import minimise_in_batches
+from ident.search.direct import minimise
 
 
 def valley(rng, dimension):

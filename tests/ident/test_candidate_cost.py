@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.candidate_cost import CandidateCost
-from ident.coordinates import search_space
-from ident.least_squares import fit
-from ident.options import IdentOptions
-from ident.poles import Poles
-from ident.regression import prepare
-from ident.structure import Structure
+from ident.basis.coordinates import search_space
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.fit.least_squares import fit
+from ident.fit.regression import prepare
+from ident.search.candidate_cost import CandidateCost
 from tests.ident.benchmark_plants import as_record, p2
 
 STRUCTURES = {

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.conditions import combine_posteriors, combine_responses, mean_record, record_posteriors
-from ident.embedding import EmbeddingOptions
-from ident.frequency_uncertainty import FrequencyUncertainty
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.posterior import ResponsePosterior
-from ident.record import Record
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
+from ident.uncertainty.conditions import combine_posteriors, combine_responses, mean_record, record_posteriors
+from ident.uncertainty.embedding import EmbeddingOptions
 
 DT = 0.01
 OMEGA = np.geomspace(1.0, 300.0, 25)

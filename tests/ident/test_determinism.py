@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 import ident
-from ident.arrays import kernel_array
-from ident.embedding import tangent
+from ident.basis.options import IdentOptions
+from ident.data.arrays import kernel_array
 from ident.identify import identify
-from ident.options import IdentOptions
 from ident.several_inputs import identify_miso
+from ident.uncertainty.embedding import tangent
 from tests.ident.benchmark_plants import p1, p1_friction, p2, p3
 
 FOURTH_ORDER = IdentOptions(n_real=2, n_pairs=1)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.autoregression import fit_autoregression
-from ident.embedding import EmbeddingOptions, classical, tangent
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.data.record import Record
+from ident.data.signal_filter import band_limited
 from ident.identify import identify
-from ident.model import GobfModel
-from ident.options import IdentOptions
-from ident.poles import Poles
-from ident.prefilter import band_limited
-from ident.record import Record
+from ident.uncertainty.autoregression import fit_autoregression
+from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
 
 from .three_mode_arm import BANDS, DT, OMEGA, per_band, random_arm
 

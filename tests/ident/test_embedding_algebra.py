@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.stats import multivariate_normal
 
-from ident.embedding_algebra import (
+from ident.uncertainty.embedding_algebra import (
     RegressionBlock,
     conditional_posterior,
     evaluate_grid,

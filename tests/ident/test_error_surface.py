@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.error_surface import ErrorSurface, error_surface
-from ident.least_squares import fit
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.regression import prepare
-from ident.structure import Structure
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.fit.least_squares import fit
+from ident.fit.regression import prepare
+from ident.search.error_surface import ErrorSurface, error_surface
 from tests.ident.benchmark_plants import as_record, max_length_sequence, run
 
 POLE = Poles.from_continuous(omega_rad_s=[15.0], zeta=[0.015], dt_s=0.005)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from control_design.plant_set import UncertainPlant
+from control_design.plants.plant_set import UncertainPlant
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.fit.frf_refinement import from_log, to_log
+from ident.fit.frf_regression import fit_response, pole_directions, prepare_response
 from ident.frequency_fit import FrfIdentification, identify_frf
-from ident.frf_polish import from_log, to_log
-from ident.frf_regression import fit_response, pole_directions, prepare_response
-from ident.options import IdentOptions
-from ident.poles import Poles
 from ident.uncertainty import FrequencyUncertainty
 from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
 

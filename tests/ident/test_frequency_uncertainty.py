@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ncx2
 
-from ident.ellipses import offset_disc_radius
+from ident.data.ellipses import offset_disc_radius
 from ident.uncertainty import FrequencyUncertainty
 
 DT = 0.01

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ident.basis.options import IdentOptions
 from ident.closed_loop import indirect
+from ident.data.frf_records import FrfRepeats
 from ident.frequency_fit import identify_frf
-from ident.frf_records import FrfRepeats
-from ident.options import IdentOptions
 from ident.uncertainty import FrequencyUncertainty
 
 DT = 0.01

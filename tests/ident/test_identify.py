@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ident.basis.options import IdentOptions
+from ident.checks.input_checks import clipped_share, excitation_limit_rad_s
+from ident.fit.residual_colour import effective_samples
 from ident.identify import Identification, identify
-from ident.input_checks import clipped_share, excitation_limit_rad_s
-from ident.options import IdentOptions
-from ident.residual_colour import effective_samples
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
 
 OMEGA = np.geomspace(0.1, 600, 400)

@@ -7,8 +7,8 @@ import pytest
 import scipy.signal
 
 from ident import IdentOptions, identify
-from ident.input_checks import clipped_share, excitation_limit_rad_s
-from ident.record import Record
+from ident.checks.input_checks import clipped_share, excitation_limit_rad_s
+from ident.data.record import Record
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p2
 from tests.ident.three_mode_arm import random_arm
 

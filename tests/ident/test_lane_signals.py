@@ -6,10 +6,10 @@ import numba
 import numpy as np
 import pytest
 
-from ident.basis import block_parameters, regressor
-from ident.lane_signals import cascade_states, combine, pitch_of, products, row_products, single_states
-from ident.lanes import WIDTH, load, shifted, splat, store, total
-from ident.poles import Poles
+from ident.basis.functions import block_parameters, regressor
+from ident.basis.poles import Poles
+from ident.fit.lane_signals import cascade_states, combine, pitch_of, products, row_products, single_states
+from ident.fit.lanes import WIDTH, load, shifted, splat, store, total
 
 SETS = {
     "one real": Poles([0.9]),

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.linalg import lstsq, qr
 
-from ident.basis import block_parameters, free_response, regressor
-from ident.descent import linearise_by_products, room_for_rows
-from ident.kernels import candidate_rss
-from ident.least_squares import driving_signal, fit, linearisation, project
-from ident.options import IdentOptions
-from ident.poles import Poles
-from ident.polish import Bounds, free_optimality, pole_system, polish
-from ident.regression import prepare, thinned
-from ident.structure import Structure
+from ident.basis.functions import block_parameters, free_response, regressor
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.fit.descent import linearise_by_products, room_for_rows
+from ident.fit.kernels import candidate_rss
+from ident.fit.least_squares import driving_signal, fit, linearisation, project
+from ident.fit.refinement import Bounds, free_optimality, pole_system, polish
+from ident.fit.regression import prepare, thinned
 from tests.ident.benchmark_plants import as_record, p2
 
 STRUCTURES = {

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ident.basis.options import IdentOptions
+from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.closed_loop import check_feedback, two_stage
-from ident.conditions import combine_posteriors, mean_record, record_posteriors
-from ident.embedding import EmbeddingOptions
+from ident.data.frf_records import FrfRepeats
+from ident.data.record import Record
+from ident.data.signal_filter import band_limited
 from ident.frequency_fit import identify_frf
-from ident.frf_records import FrfRepeats
 from ident.identify import identify
-from ident.options import IdentOptions
-from ident.prefilter import band_limited
-from ident.record import Record
-from ident.validation import fit_on_fresh_data, repeat_scatter
+from ident.uncertainty.conditions import combine_posteriors, mean_record, record_posteriors
+from ident.uncertainty.embedding import EmbeddingOptions
 
 HZ = 2 * np.pi
 COUNTS_PER_RAD = 1024 / (2 * np.pi)

@@ -4,9 +4,9 @@ import control
 import numpy as np
 import pytest
 
-from ident.basis import basis_response
-from ident.model import GobfModel
-from ident.poles import Poles
+from ident.basis.functions import basis_response
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
 
 MODEL = GobfModel(
     poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]),

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident import GobfModel, Poles
-from ident.frequency_uncertainty import FrequencyUncertainty
-from ident.model_files import FORMAT, ModelFile
+from ident.basis.model_files import FORMAT, ModelFile
+from ident.data.frequency_uncertainty import FrequencyUncertainty
 
 numbers = st.floats(-1e6, 1e6)
 inside = st.floats(-0.99, 0.99)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.basis import basis_response
-from ident.model import GobfModel
-from ident.nominal import nominal_near
-from ident.poles import Poles
-from ident.posterior import ResponsePosterior
+from ident.basis.functions import basis_response
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.uncertainty.nominal import nominal_near
 
 DT = 0.01
 OMEGA = np.geomspace(0.5, 200.0, 60)

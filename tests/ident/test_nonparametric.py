@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.nonparametric import coherence, empirical_frf
-from ident.record import Record
+from ident.data.nonparametric import coherence, empirical_frf
+from ident.data.record import Record
 
 DT = 0.01
 B, A = [0.0, 0.2, 0.1], [1.0, -1.5, 0.7]

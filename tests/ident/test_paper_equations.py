@@ -20,18 +20,19 @@ import scipy.linalg
 import scipy.optimize
 import scipy.signal
 
-from ident.basis import all_pass_response, basis_response, basis_state_space, block_parameters, regressor
-from ident.candidate_cost import CandidateCost
-from ident.comparators import fir
-from ident.coordinates import search_space
-from ident.direct import minimise
-from ident.error_surface import error_surface
-from ident.least_squares import fit
-from ident.model import GobfModel
-from ident.options import Algorithm, IdentOptions
-from ident.paper_realisation import complex_realisation, real_realisation
-from ident.poles import Poles
-from ident.real_pair import (
+from ident.basis.coordinates import search_space
+from ident.basis.functions import (
+    all_pass_response,
+    basis_response,
+    basis_state_space,
+    block_parameters,
+    regressor,
+)
+from ident.basis.model import GobfModel
+from ident.basis.options import Algorithm, IdentOptions
+from ident.basis.paper_realisation import complex_realisation, real_realisation
+from ident.basis.poles import Poles
+from ident.basis.real_pair import (
     combination,
     kautz_numerators,
     pair_metric,
@@ -39,9 +40,14 @@ from ident.real_pair import (
     paper_numerators,
     rotated_numerators,
 )
-from ident.record import Record
-from ident.regression import prepare
-from ident.structure import Structure
+from ident.basis.structure import Structure
+from ident.data.record import Record
+from ident.fit.least_squares import fit
+from ident.fit.regression import prepare
+from ident.search.candidate_cost import CandidateCost
+from ident.search.direct import minimise
+from ident.search.error_surface import error_surface
+from validation.comparators.comparators import fir
 
 HERE = Path(__file__).parent
 DT_S = 0.005

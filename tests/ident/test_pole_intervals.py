@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ident import GobfModel, IdentOptions, Poles, identify
-from ident.basis import basis_response
-from ident.embedding import classical, tangent
-from ident.pole_intervals import pole_intervals
-from ident.posterior import ResponsePosterior
+from ident.basis.functions import basis_response
+from ident.basis.posterior import ResponsePosterior
+from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.pole_intervals import pole_intervals
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, p2
 from tests.ident.three_mode_arm import random_arm
 

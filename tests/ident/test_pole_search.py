@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.basis import block_parameters
-from ident.coordinates import search_space
-from ident.direct import best_apart, minimise
-from ident.options import Algorithm, IdentOptions
-from ident.pole_search import PoleSearch
-from ident.poles import Poles
-from ident.regression import prepare
+from ident.basis.coordinates import search_space
+from ident.basis.functions import block_parameters
+from ident.basis.options import Algorithm, IdentOptions
+from ident.basis.poles import Poles
+from ident.fit.regression import prepare
+from ident.search.direct import best_apart, minimise
+from ident.search.pole_search import PoleSearch
 from tests.ident.benchmark_plants import as_record, p1, p2
 
 ALGORITHMS = typing.get_args(Algorithm)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.poles import Poles
+from ident.basis.poles import Poles
 
 
 @settings(deadline=None)

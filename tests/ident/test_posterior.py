@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.model import GobfModel
-from ident.poles import Poles
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
 from ident.uncertainty import EmbeddingReport, ResponsePosterior
 
 DT = 0.02

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ident.basis.options import IdentOptions
+from ident.data.record import Record
+from ident.data.signal_filter import band_limited, increments
 from ident.identify import identify
-from ident.options import IdentOptions
-from ident.prefilter import band_limited, increments
-from ident.record import Record
 from tests.ident.benchmark_plants import as_record
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ident.basis.options import IdentOptions
+from ident.checks.prior_tests import PriorTest
 from ident.identify import Identification, identify
-from ident.options import IdentOptions
-from ident.prior_tests import PriorTest
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction
 
 OMEGA = np.geomspace(0.1, 600, 400)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.basis import free_response
+from ident.basis.functions import free_response
+from ident.basis.options import IdentOptions
+from ident.checks.validation import fit_on_fresh_data
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
+from ident.data.signal_filter import band_limited
 from ident.frequency_fit import identify_frf
-from ident.frequency_uncertainty import FrequencyUncertainty
 from ident.identify import identify
-from ident.options import IdentOptions
-from ident.prefilter import band_limited
-from ident.record import Record
-from ident.validation import fit_on_fresh_data
 
 
 def percent(y, residual):

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.basis import basis_response, regressor
-from ident.poles import Poles
-from ident.real_pair import kautz_numerators, pair_metric, pair_response, paper_numerators, rotated_numerators
+from ident.basis.functions import basis_response, regressor
+from ident.basis.poles import Poles
+from ident.basis.real_pair import (
+    kautz_numerators,
+    pair_metric,
+    pair_response,
+    paper_numerators,
+    rotated_numerators,
+)
 
 POLES = [0.9 * np.exp(0.3j), 0.99 * np.exp(2.5j), 0.3 * np.exp(1.0j), 0.999 * np.exp(0.05j)]
 SOLUTIONS = {

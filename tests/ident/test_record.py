@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from ident.record import Record
+from ident.data.record import Record
 
 T, U, Y = "t_s", "u_V", "y_rad"
 

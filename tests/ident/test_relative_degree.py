@@ -7,10 +7,10 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from ident.basis import basis_response, basis_state_space
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.relative_degree import conditions, conditions_with_sensitivities, null_space
+from ident.basis.functions import basis_response, basis_state_space
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.relative_degree import conditions, conditions_with_sensitivities, null_space
 
 DT_S = 0.005
 

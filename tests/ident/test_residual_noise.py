@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.autoregression import autocovariance, first_rows, fit_autoregression, whitened
-from ident.embedding import EmbeddingOptions, tangent
-from ident.embedding_algebra import (
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.data.record import Record
+from ident.uncertainty.autoregression import autocovariance, first_rows, fit_autoregression, whitened
+from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding_algebra import (
     conditional_posterior,
     evaluate_grid,
     kernel_spectrum,
     reduce_regression,
     tc_factor,
 )
-from ident.embedding_rows import EmbeddingRows
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.record import Record
-from ident.residual_noise import Absorbed, gls_residuals
-from ident.structure import Structure
+from ident.uncertainty.embedding_rows import EmbeddingRows
+from ident.uncertainty.residual_noise import Absorbed, gls_residuals
 
 from .three_mode_arm import DT, random_arm
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.residual_tests import (
+from ident.checks.residual_tests import (
     ResidualTest,
     independence_test,
     residual_advice,

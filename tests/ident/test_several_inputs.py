@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis import free_response
+from ident.basis.functions import free_response
+from ident.basis.miso_model import MisoModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.data.record import Record
+from ident.fit.miso_regression import fit, linearisation, pole_sensitivities, prepare_inputs, project
 from ident.identify import identify
-from ident.miso_model import MisoModel
-from ident.miso_regression import fit, linearisation, pole_sensitivities, prepare_inputs, project
-from ident.miso_search import MisoSearch
-from ident.miso_uncertainty import response_uncertainty
-from ident.options import IdentOptions
-from ident.poles import Poles
-from ident.record import Record
+from ident.search.miso_search import MisoSearch
 from ident.several_inputs import MisoIdentification, identify_miso
+from ident.uncertainty.miso_uncertainty import response_uncertainty
 from tests.ident.benchmark_plants import p3
 
 DT_S = 0.01

@@ -8,15 +8,15 @@ import scipy.linalg
 import scipy.optimize
 import scipy.signal
 
-from ident.least_squares import fit
-from ident.model import GobfModel
-from ident.options import IdentOptions
-from ident.poles import Poles
-from ident.polish import Bounds
-from ident.regression import prepare
-from ident.relative_degree import conditions
-from ident.structure import Structure
-from ident.structured_fit import (
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.basis.relative_degree import conditions
+from ident.basis.structure import Structure
+from ident.fit.least_squares import fit
+from ident.fit.refinement import Bounds
+from ident.fit.regression import prepare
+from ident.fit.structured_fit import (
     structured_fit,
     structured_optimality,
     structured_polish,

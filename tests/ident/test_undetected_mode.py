@@ -7,15 +7,15 @@ import pytest
 from scipy import signal
 from scipy.stats import multivariate_normal
 
-from ident.basis import basis_response
-from ident.embedding import EmbeddingOptions, tangent
-from ident.embedding_algebra import KernelPosterior, reduce_regression
-from ident.embedding_rows import EmbeddingRows
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.record import Record
-from ident.structure import Structure
-from ident.undetected_mode import (
+from ident.basis.functions import basis_response
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.data.record import Record
+from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding_algebra import KernelPosterior, reduce_regression
+from ident.uncertainty.embedding_rows import EmbeddingRows
+from ident.uncertainty.undetected_mode import (
     CandidatePairs,
     PairMixture,
     candidate_pairs,

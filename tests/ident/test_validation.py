@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.frequency_uncertainty import FrequencyUncertainty
-from ident.model import GobfModel
-from ident.poles import Poles
-from ident.posterior import ResponsePosterior
-from ident.record import Record
-from ident.validation import FreshFit, Invalidation, fit_on_fresh_data, invalidate, repeat_scatter
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.checks.validation import FreshFit, Invalidation, fit_on_fresh_data, invalidate, repeat_scatter
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
 
 DT = 0.01
 OMEGA = np.linspace(1.0, 100.0, 60)

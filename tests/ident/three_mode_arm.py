@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from ident.record import Record
+from ident.data.record import Record
 
 DT = 0.005
 OMEGA = np.geomspace(0.3, 300.0, 150)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.workflow.command import FAST_ARM, Answer
 from workflow.cli import main
-from workflow.summary import RunSummary
+from workflow.tasks.summary import RunSummary
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def refused(flexlink: Callable[..., Answer]) -> Callable[..., str]:
 @pytest.fixture(scope="session")
 def fast_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
     """Directory and summary of the fast arm's run."""
-    from workflow.entry import run_from_files
+    from workflow.tasks.entry import run_from_files
 
     out = tmp_path_factory.mktemp("fast") / "run"
     return out, run_from_files(FAST_ARM, out)

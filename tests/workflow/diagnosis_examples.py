@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.case import Case
 from diagnosis.diagnosis import Diagnosis, NamedEffect
-from diagnosis.discrimination import Rival
-from diagnosis.residual import ResidualModel, pooled_rms
+from diagnosis.fit.residual import ResidualModel, pooled_rms
+from diagnosis.machine.case import Case
+from diagnosis.next_experiment.discrimination import Rival
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects import Effect
 from plant.presets import paper_link

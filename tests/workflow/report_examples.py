@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from control_design.certificate import certify
-from control_design.closed_loop import ClosedLoopTrajectory as LoopTrajectory
-from control_design.controller import Controller
-from control_design.joint_coverage import JointCoverage
-from control_design.plant_set import Channel, UncertainPlant
-from control_design.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
-from control_design.youla import PlantBracket, YoulaBracket
-from ident.basis import basis_response
+from control_design.analysis.certificate import certify
+from control_design.analysis.closed_loop import ClosedLoopTrajectory as LoopTrajectory
+from control_design.analysis.joint_coverage import JointCoverage
+from control_design.controllers.controller import Controller
+from control_design.convex.youla import PlantBracket, YoulaBracket
+from control_design.plants.plant_set import Channel, UncertainPlant
+from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
+from ident.basis.functions import basis_response
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.checks.validation import ScatterRow, fit_on_fresh_data
+from ident.data.record import Record
 from ident.identify import Identification
-from ident.model import GobfModel
-from ident.order_selection import OrderStep
-from ident.poles import Poles
-from ident.record import Record
-from ident.search_trace import PolishedMinimum, SearchStage, SearchTrace
+from ident.search.order_selection import OrderStep
+from ident.search.search_trace import PolishedMinimum, SearchStage, SearchTrace
 from ident.stabilisation import Stabilisation
-from ident.structure import Structure
 from ident.uncertainty import ResponsePosterior
-from ident.validation import ScatterRow, fit_on_fresh_data
-from workflow.conditioning import as_fitted
-from workflow.config import RunConfig
-from workflow.loop_conditions import Condition, condition_arrays
-from workflow.run_directory import RunDirectory, StageData
-from workflow.stages import closed_loop as closed_loop_stage
-from workflow.stages import identify as identify_stage
-from workflow.stages import uncertainty as uncertainty_stage
-from workflow.stages.results import ChannelResult, RunRecord
+from workflow.config.run_config import RunConfig
+from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.tasks.conditioning import as_fitted
+from workflow.tasks.loop_conditions import Condition, condition_arrays
+from workflow.tasks.stages import closed_loop as closed_loop_stage
+from workflow.tasks.stages import identify as identify_stage
+from workflow.tasks.stages import uncertainty as uncertainty_stage
+from workflow.tasks.stages.results import ChannelResult, RunRecord
 
 DT_S = 0.01
 INPUT = "voltage_V"

@@ -15,12 +15,12 @@ import pytest
 import scipy.io
 from pydantic import ValidationError
 
-from control_design.certificate import certify
-from control_design.joint_coverage import JointCoverage
-from control_design.plant_set import UncertainPlant
-from control_design.prefilter import Prefilter
+from control_design.analysis.certificate import certify
+from control_design.analysis.joint_coverage import JointCoverage
+from control_design.convex.reference_filter import Prefilter
+from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification
-from control_design.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_options import SynthesisOptions
 from tests.workflow.report_examples import (
     DT_S,
     bracket_document,
@@ -30,19 +30,16 @@ from tests.workflow.report_examples import (
     posterior,
     whole_document,
 )
-from workflow.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
-from workflow.errors import InputError
-from workflow.proportions import wilson_interval
-from workflow.reference_filter import (
-    find_prefilter,
-    model_answer,
-    prefilter_bytes,
-    prefilter_file,
-    prefilter_of,
-    prefilter_words,
+from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.engine.errors import InputError
+from workflow.tasks.achievable_performance import (
+    bracket_numbers,
+    bracket_of,
+    find_bracket,
+    order_advice,
+    yardstick_words,
 )
-from workflow.summary import gamma_of, verdict_of
-from workflow.whole_responses import (
+from workflow.tasks.joint_coverage import (
     certify_whole,
     joint_numbers,
     joint_words,
@@ -50,13 +47,16 @@ from workflow.whole_responses import (
     synthesise_asked,
     undrawable,
 )
-from workflow.yardstick import (
-    bracket_numbers,
-    bracket_of,
-    find_bracket,
-    order_advice,
-    yardstick_words,
+from workflow.tasks.proportions import wilson_interval
+from workflow.tasks.reference_filter import (
+    find_prefilter,
+    model_answer,
+    prefilter_bytes,
+    prefilter_file,
+    prefilter_of,
+    prefilter_words,
 )
+from workflow.tasks.summary import gamma_of, verdict_of
 
 _COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
@@ -157,8 +157,8 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
     def calibrate(law, plants, specification, *, rng, coverage, draws, omega_min_rad_s=1e-4):
         return JointCoverage(coverage, draws, 0.9, 0.99, 0.95, 0.88, 0.9, 0.4, 0.998, 0.99)
 
-    monkeypatch.setattr("control_design.certificate.calibrate", calibrate)
-    monkeypatch.setattr("workflow.whole_responses.joint_coverage", calibrate)
+    monkeypatch.setattr("control_design.analysis.certificate.calibrate", calibrate)
+    monkeypatch.setattr("workflow.tasks.joint_coverage.joint_coverage", calibrate)
     found = {}
     for wanted in (False, True):
         options = CertificateOptions.model_validate({"calibrate": wanted, "joint_draws": 100})
@@ -185,8 +185,8 @@ def test_calibration_is_designed_for(monkeypatch):
         asked.append("jointly")
         return SimpleNamespace(result="result", sentence=lambda: "2 of 10000 unstable")
 
-    monkeypatch.setattr("workflow.whole_responses.synthesise", plain)
-    monkeypatch.setattr("workflow.whole_responses.synthesise_jointly", jointly)
+    monkeypatch.setattr("workflow.tasks.joint_coverage.synthesise", plain)
+    monkeypatch.setattr("workflow.tasks.joint_coverage.synthesise_jointly", jointly)
     exact = UncertainPlant("exact", model().to_control())
     options = CertificateOptions.model_validate({"calibrate": True})
     rng, how = np.random.default_rng(1), SynthesisOptions()

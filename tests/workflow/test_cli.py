@@ -13,7 +13,7 @@ import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
 from workflow.cli import main
-from workflow.errors import InputError
+from workflow.engine.errors import InputError
 
 FILES_CONFIG = """
 [run]
@@ -307,7 +307,7 @@ def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
     )
     assert designed.code == 0, designed.err
     assert json.loads(designed.out)["certified"] is True
-    from control_design.controller import Controller
+    from control_design.controllers.controller import Controller
 
     assert Controller.from_json((tmp_path / "controller.json").read_text()).order == 2
 
@@ -319,7 +319,7 @@ def test_design_from_a_run_directory(flexlink, fast_run, tmp_path):
 
 
 def test_design_writes_what_the_ending_asks_for(flexlink, fast_run, tmp_path):
-    from control_design.controller import Controller
+    from control_design.controllers.controller import Controller
 
     for ending in (".mat", ".c"):
         assert flexlink("design", fast_run[0], "--out", tmp_path / f"controller{ending}").code == 0
@@ -340,12 +340,12 @@ def test_version_and_module_entry():
 
 
 def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
-    import workflow.entry
+    import workflow.tasks.entry
 
     def broken(*arguments, **options):
         raise ZeroDivisionError("division\nby zero")
 
-    monkeypatch.setattr(workflow.entry, "run_from_files", broken)
+    monkeypatch.setattr(workflow.tasks.entry, "run_from_files", broken)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 1
     assert (
@@ -355,12 +355,12 @@ def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
 
 
 def test_lack_of_memory_is_no_internal_error(flexlink, monkeypatch, tmp_path):
-    import workflow.entry
+    import workflow.tasks.entry
 
     def too_much(*arguments, **options):
         return np.zeros(2**45)  # more than any address space
 
-    monkeypatch.setattr(workflow.entry, "run_from_files", too_much)
+    monkeypatch.setattr(workflow.tasks.entry, "run_from_files", too_much)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 1
     assert answer.err.startswith("flexlink: out of memory (Unable to allocate")
@@ -368,16 +368,16 @@ def test_lack_of_memory_is_no_internal_error(flexlink, monkeypatch, tmp_path):
 
 
 def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
-    import workflow.entry
+    import workflow.tasks.entry
 
     def stop(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(workflow.entry, "run_from_files", stop)
+    monkeypatch.setattr(workflow.tasks.entry, "run_from_files", stop)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 130
     assert answer.err == "flexlink: interrupted; `flexlink run --out DIR --resume` continues\n"
-    monkeypatch.setattr(workflow.entry, "simulate_to_csv", stop)
+    monkeypatch.setattr(workflow.tasks.entry, "simulate_to_csv", stop)
     answer = flexlink("simulate", "--out", tmp_path / "run")
     assert (answer.code, answer.err) == (130, "flexlink: interrupted\n")
 
@@ -426,7 +426,7 @@ def test_design_of_an_impossible_specification_is_three_like_a_run(flexlink, tmp
 
 
 def test_a_full_disk_leaves_no_half_of_the_experiments(refused, monkeypatch, tmp_path):
-    from workflow import storage
+    from workflow.engine import storage
 
     write = storage.write_bytes
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT
-from workflow.config import FileSource, RunConfig, SimulatedSource, load_config
-from workflow.entry import built_in_config
-from workflow.errors import InputError
-from workflow.excitations import BangBang, Doublet, LogChirp, Multisine, Prbs
-from workflow.settings import check
+from workflow.config.excitations import BangBang, Doublet, LogChirp, Multisine, Prbs
+from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, load_config
+from workflow.config.settings import check
+from workflow.engine.errors import InputError
+from workflow.tasks.entry import built_in_config
 
 MINIMAL = """
 [run]

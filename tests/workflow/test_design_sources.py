@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy.io
 
-from control_design.controller import Controller
-from control_design.prefilter import Prefilter
-from ident.frequency_uncertainty import FrequencyUncertainty
-from ident.model import GobfModel
-from ident.model_files import ModelFile
-from ident.poles import Poles
+from control_design.controllers.controller import Controller
+from control_design.convex.reference_filter import Prefilter
+from ident.basis.model import GobfModel
+from ident.basis.model_files import ModelFile
+from ident.basis.poles import Poles
+from ident.data.frequency_uncertainty import FrequencyUncertainty
 
 DT_S = 0.05
 # A loose search: these tests are about files, not about the last percent of gamma.
@@ -224,7 +224,7 @@ def test_order_too_low_is_said_with_what_a_higher_one_reaches(flexlink, wish, tm
 
 def test_too_fast_for_any_order_is_said(flexlink, wish, tmp_path, monkeypatch):
     """A zero at +2 rad/s: refused before optimising, with the bandwidth that is left."""
-    from control_design.order_search import OrderSearch
+    from control_design.synthesis.order_search import OrderSearch
 
     def never(self):
         raise AssertionError("the optimiser was started")
@@ -243,7 +243,7 @@ def test_too_fast_for_any_order_is_said(flexlink, wish, tmp_path, monkeypatch):
 
 def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypatch):
     """The solver finds nothing: said so, nothing written."""
-    from control_design.order_search import OrderResult, OrderSearch
+    from control_design.synthesis.order_search import OrderResult, OrderSearch
 
     monkeypatch.setattr(OrderSearch, "run", lambda self: OrderResult(None, (), ()))
     write_json(tmp_path / "arm.json", document(arm()))

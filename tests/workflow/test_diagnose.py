@@ -11,18 +11,18 @@ import tomllib
 import numpy as np
 import pytest
 
-from diagnosis.residual import pooled_rms
+from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects import GroundSpring
 from tests.workflow.command import start_flexlink
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
-from workflow.config import SimulatedSource
+from workflow.config.run_config import SimulatedSource
 from workflow.diagnose import command, outputs, page
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.command import diagnose_cases
 from workflow.diagnose.outputs import Options, files_of
 from workflow.diagnose.processes import Step, perform
-from workflow.errors import InputError, StageError
+from workflow.engine.errors import InputError, StageError
 from workflow.figures.style import Picture
 
 QUESTIONS = (

@@ -7,7 +7,7 @@ import pytest
 
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from workflow.diagnose.case_files import load_case
-from workflow.errors import InputError
+from workflow.engine.errors import InputError
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis.case import Case, Experiment
+from diagnosis.machine.case import Case, Experiment
 from plant import EFFECTS, parse_effects, simulate
 from tests.workflow.diagnosis_examples import small_rig
 from workflow.diagnose.controller_check import check_controller

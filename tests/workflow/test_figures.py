@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from control_design.stability import closed_loop_poles
-from ident.error_surface import error_surface
+from control_design.analysis.stability import closed_loop_poles
+from ident.checks.validation import fit_on_fresh_data, independence_test, whiteness_test
+from ident.search.error_surface import error_surface
 from ident.uncertainty import FrequencyUncertainty
-from ident.validation import fit_on_fresh_data, independence_test, whiteness_test
 from tests.workflow import report_examples as example
 from workflow.figures import style
 from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.model_files import ModelFile
+from ident.basis.model_files import ModelFile
 from tests.ident.benchmark_plants import P2_HZ, p2
 from tests.workflow.test_report import ATTACK, Page
 from workflow.cli import main
-from workflow.errors import InputError
+from workflow.engine.errors import InputError
 from workflow.figures.style import Picture
-from workflow.log_identification import identify_logs, read_model
 from workflow.report import identify_page as page_module
-from workflow.summary import between
+from workflow.tasks.log_identification import identify_logs, read_model
+from workflow.tasks.summary import between
 
 DT_S = 0.005
 COLUMNS = ("--input", "u_V", "--output", "tip_m", "--time", "t_s")

@@ -8,13 +8,13 @@ import control
 import numpy as np
 import pytest
 
-from workflow.config import ClosedLoopOptions
-from workflow.loop_conditions import ConditionBench
-from workflow.pipeline import config_of
-from workflow.run_directory import RunDirectory
-from workflow.sampled_plant import realise
-from workflow.simulated_rig import rig_of
-from workflow.stages.results import load_posterior, load_synthesis
+from workflow.config.run_config import ClosedLoopOptions
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.loop_conditions import ConditionBench
+from workflow.tasks.pipeline import config_of
+from workflow.tasks.sampled_plant import realise
+from workflow.tasks.simulated_rig import rig_of
+from workflow.tasks.stages.results import load_posterior, load_synthesis
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ import pandas as pd
 import pytest
 
 from tests.golden import margins
-from workflow.config import load_config
-from workflow.run_directory import RunDirectory
-from workflow.stages.results import load_plant
+from workflow.config.run_config import load_config
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.stages.results import load_plant
 
 Example = Callable[[str], tuple[dict[str, Any], Path]]
 

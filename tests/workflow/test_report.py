@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import workflow.report
-from control_design.prefilter import Prefilter
+from control_design.convex.reference_filter import Prefilter
 from tests.workflow import report_examples as example
-from workflow.errors import InputError
+from workflow.engine.errors import InputError
+from workflow.engine.run_directory import RunDirectory, StageData
 from workflow.figures.style import Picture
 from workflow.report import write_report
 from workflow.report.words import count, decibels, frequency, listing, number, sentence
-from workflow.run_directory import RunDirectory, StageData
-from workflow.stages.results import load_records
+from workflow.tasks.stages.results import load_records
 
 ATTACK = "<script>alert(1)</script>"
 

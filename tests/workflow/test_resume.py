@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, start_flexlink
-from workflow import storage
-from workflow.config import load_config
-from workflow.entry import run_from_files
-from workflow.errors import InputError
-from workflow.progress import Silence
-from workflow.run_directory import RunDirectory
-from workflow.stages import STAGES
+from workflow.config.run_config import load_config
+from workflow.engine import storage
+from workflow.engine.errors import InputError
+from workflow.engine.progress import Silence
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.entry import run_from_files
+from workflow.tasks.stages import STAGES
 
 NAMES = [stage.name for stage in STAGES]
 

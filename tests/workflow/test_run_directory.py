@@ -8,9 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workflow.errors import InputError
-from workflow.randomness import stage_rng
-from workflow.run_directory import RunDirectory, StageData, default_directory, first_difference, hash_of
+from workflow.engine.errors import InputError
+from workflow.engine.randomness import stage_rng
+from workflow.engine.run_directory import (
+    RunDirectory,
+    StageData,
+    default_directory,
+    first_difference,
+    hash_of,
+)
 
 CONFIG = {"run": {"name": "a", "seed": 1}, "channels": [{"input": "u", "output": "y"}]}
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.signal import dlsim
 
-from control_design.closed_loop import simulate
-from control_design.controller import Controller
-from ident.poles import Poles
+from control_design.analysis.closed_loop import simulate
+from control_design.controllers.controller import Controller
+from ident.basis.poles import Poles
 from ident.uncertainty import ResponsePosterior
-from workflow.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
+from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 
 DT_S = 0.01
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from workflow.errors import InputError
-from workflow.settings import InputPath, check, expand, read_toml
+from workflow.config.settings import InputPath, check, expand, read_toml
+from workflow.engine.errors import InputError
 
 
 class Strict(BaseModel):

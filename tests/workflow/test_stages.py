@@ -9,28 +9,30 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from control_design.certificate import certify
+from control_design.analysis.certificate import certify
+from ident.basis.options import IdentOptions
+from ident.data.record import Record
 from ident.identify import identify
-from ident.options import IdentOptions
-from ident.record import Record
 from plant import linear_arm
 from plant.presets import paper_link
 from tests.workflow.command import FAST_ARM
-from workflow.conditioning import as_bounded, as_fitted
-from workflow.config import Channel, FileRecord, load_config
-from workflow.design_options import PrefilterSettings
-from workflow.errors import InputError
-from workflow.pipeline import config_of
-from workflow.progress import Silence
-from workflow.reference_filter import prefilter_of
-from workflow.run_directory import RunDirectory
-from workflow.settings import check
-from workflow.simulated_rig import EncodedArm
-from workflow.stages import StageInput
-from workflow.stages.closed_loop import run_closed_loop
-from workflow.stages.prefilter import design_filter
-from workflow.stages.records import read_log, refuse_constant_input, with_common_sampling_time
-from workflow.stages.results import (
+from workflow.config.design_options import PrefilterSettings
+from workflow.config.run_config import Channel, FileRecord, load_config
+from workflow.config.settings import check
+from workflow.engine.errors import InputError
+from workflow.engine.progress import Silence
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.achievable_performance import bracket_of
+from workflow.tasks.conditioning import as_bounded, as_fitted
+from workflow.tasks.joint_coverage import joint_of
+from workflow.tasks.pipeline import config_of
+from workflow.tasks.reference_filter import prefilter_of
+from workflow.tasks.simulated_rig import EncodedArm
+from workflow.tasks.stages import StageInput
+from workflow.tasks.stages.closed_loop import run_closed_loop
+from workflow.tasks.stages.prefilter import design_filter
+from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
+from workflow.tasks.stages.results import (
     ChannelResult,
     RunRecord,
     load_certificate,
@@ -42,9 +44,7 @@ from workflow.stages.results import (
     load_records,
     load_synthesis,
 )
-from workflow.stages.uncertainty import posterior_of
-from workflow.whole_responses import joint_of
-from workflow.yardstick import bracket_of
+from workflow.tasks.stages.uncertainty import posterior_of
 
 
 @pytest.fixture(scope="module")
@@ -336,8 +336,8 @@ def test_files_of_three_kinds_give_the_same_record(tmp_path):
 
 def test_slice_and_mirror(tmp_path, flexlink_data):
     """The second half of the DaISy arm is the first with its sign turned, as its description says."""
-    from workflow.config import Channel, FileSource
-    from workflow.stages.records import read_record
+    from workflow.config.run_config import Channel, FileSource
+    from workflow.tasks.stages.records import read_record
 
     path = flexlink_data / "daisy_robot_arm" / "robot_arm.csv"
     tables = [

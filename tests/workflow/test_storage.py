@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workflow import storage
-from workflow.errors import InputError
+from workflow.engine import storage
+from workflow.engine.errors import InputError
 
 ARRAYS = {
     "signal/0/output": np.random.default_rng(3).standard_normal((50, 2)),

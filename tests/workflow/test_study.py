@@ -16,14 +16,14 @@ import pytest
 
 from tests.workflow.command import FAST_ARM, start_flexlink
 from tests.workflow.study_examples import SMALL_STUDY, assert_same_study, point_bytes, write_study
-from workflow.config import load_config
-from workflow.errors import InputError
-from workflow.pipeline import config_of
-from workflow.progress import Silence
-from workflow.run_directory import RunDirectory
+from workflow.config.run_config import load_config
+from workflow.engine.errors import InputError
+from workflow.engine.progress import Silence
+from workflow.engine.run_directory import RunDirectory
 from workflow.study.directory import StudyDirectory
 from workflow.study.run import run_study
-from workflow.summary import RunSummary
+from workflow.tasks.pipeline import config_of
+from workflow.tasks.summary import RunSummary
 
 
 @pytest.fixture(scope="module")

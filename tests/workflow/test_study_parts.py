@@ -14,15 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 
-from control_design.prefilter import Prefilter
+from control_design.convex.reference_filter import Prefilter
 from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.report_examples import bracket_document, whole_document
 from tests.workflow.study_examples import assert_same_study, write_study
-from workflow.config import RunConfig, load_config
-from workflow.entry import built_in_config
+from workflow.config.run_config import RunConfig, load_config
+from workflow.config.settings import check
 from workflow.figures.study import Mark, Panel, draw_pareto
 from workflow.figures.style import PREDICTED, render
-from workflow.settings import check
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.keys import last_name, parse_key, with_values
 from workflow.study.local import LocalProcesses
@@ -33,6 +32,7 @@ from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
 from workflow.study.task import Job, Task, run_task
 from workflow.study.toml_text import toml_text
+from workflow.tasks.entry import built_in_config
 
 
 def test_keys_reach_into_tables_and_lists():

@@ -35,16 +35,16 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from diagnosis.case import Case, Experiment
-from ident.record import Record
+from diagnosis.machine.case import Case, Experiment
+from ident.data.record import Record
 from plant.effects import EFFECTS
 from plant.rig import Rig
-from workflow import storage
-from workflow.config import Section
-from workflow.errors import InputError, naming
-from workflow.run_directory import hash_of
-from workflow.settings import check, expand, read_toml
-from workflow.stages.records import read_log
+from workflow.config.run_config import Section
+from workflow.config.settings import check, expand, read_toml
+from workflow.engine import storage
+from workflow.engine.errors import InputError, naming
+from workflow.engine.run_directory import hash_of
+from workflow.tasks.stages.records import read_log
 
 CASE_FILE = "case.toml"
 RIG_FILE = "rig.toml"

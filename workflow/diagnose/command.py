@@ -17,7 +17,7 @@ from workflow.diagnose.outputs import Engine, Options, made_from
 from workflow.diagnose.overview import closure_words, overview_page, short_answer
 from workflow.diagnose.processes import Finished, Step, Work, run_all
 from workflow.diagnose.words import parameter_words, probability_words, times_noise
-from workflow.errors import (
+from workflow.engine.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL,
     EXIT_NOT_CERTIFIED,
@@ -26,9 +26,9 @@ from workflow.errors import (
     StageError,
     one_line,
 )
-from workflow.progress import Progress, Silence
+from workflow.engine.progress import Progress, Silence
 from workflow.report.words import listing
-from workflow.summary import Row, RunSummary, Section
+from workflow.tasks.summary import Row, RunSummary, Section
 
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
 

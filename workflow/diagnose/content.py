@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.where_records import Where
+from diagnosis.where.where_records import Where
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck
 from workflow.diagnose.following import Following

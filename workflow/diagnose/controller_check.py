@@ -16,20 +16,20 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-from control_design.certificate import Certificate, certify
-from control_design.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
-from control_design.controller import Controller
-from control_design.plant_set import Channel, UncertainPlant, modes_of
+from control_design.analysis.certificate import Certificate, certify
+from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
+from control_design.analysis.stability import closed_loop_poles
+from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import Channel, UncertainPlant, modes_of
 from control_design.specification import Specification, SpecificationError
-from control_design.stability import closed_loop_poles
-from control_design.synthesis import synthesise
-from control_design.synthesis_options import SynthesisOptions
-from control_design.synthesis_result import Outcome
-from diagnosis.case import Case
-from ident.record import Record
+from control_design.synthesis.synthesis import synthesise
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_result import Outcome
+from diagnosis.machine.case import Case
+from ident.data.record import Record
 from plant import Effect, Rig, SampledArm
 from workflow.diagnose.linear_machine import sampled_linear_machine
-from workflow.loop_sensitivity import measure_on, plan_sensitivity
+from workflow.tasks.loop_sensitivity import measure_on, plan_sensitivity
 
 Real = npt.NDArray[np.float64]
 

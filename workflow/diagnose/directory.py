@@ -22,10 +22,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from workflow import storage
-from workflow.code_version import code_digest
-from workflow.errors import InputError, naming
-from workflow.run_directory import first_difference
+from workflow.engine import storage
+from workflow.engine.code_version import code_digest
+from workflow.engine.errors import InputError, naming
+from workflow.engine.run_directory import first_difference
 
 LAYOUT_VERSION = 1
 MANIFEST = "diagnose.json"

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from diagnosis.diagnosis import Diagnosis
-from workflow import storage
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.findings import answer_probability, presence_of
+from workflow.engine import storage
 
 Real = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.imitation import IMITATED
+from diagnosis.evidence.look_alikes import IMITATED
 from workflow.diagnose.words import (
     effect_words,
     key_words,

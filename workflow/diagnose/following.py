@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.discrimination import Rival
-from diagnosis.experiment_choices import Limits
-from diagnosis.imitation import IMITATED
-from diagnosis.next_experiment import NextExperiment, next_experiment
+from diagnosis.evidence.look_alikes import IMITATED
+from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.experiment_choices import Limits
+from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
 from plant.simulate import simulate
 from workflow.diagnose.findings import unlisted_words
 from workflow.diagnose.words import effect_words, probability_words

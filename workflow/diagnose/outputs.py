@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from diagnosis.case import Case
 from diagnosis.diagnosis import Diagnosis, diagnose
-from diagnosis.where import where
-from workflow import storage
+from diagnosis.machine.case import Case
+from diagnosis.where.where import where
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.content import CasePage
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
@@ -17,7 +16,8 @@ from workflow.diagnose.document import document_of, json_text
 from workflow.diagnose.following import following
 from workflow.diagnose.page import case_page
 from workflow.diagnose.repaired_rig import effects_text, rig_text
-from workflow.errors import naming
+from workflow.engine import storage
+from workflow.engine.errors import naming
 
 Report = Callable[[float, str], None]
 # Shares of a case's time, for the progress bar only.

@@ -22,7 +22,7 @@ from multiprocessing.process import BaseProcess
 
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.outputs import Engine, Options, files_of
-from workflow.errors import InputError, StageError, one_line
+from workflow.engine.errors import InputError, StageError, one_line
 
 _ONE_THREAD: Mapping[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"

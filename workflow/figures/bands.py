@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from control_design.ellipses import farthest_distance, nearest_distance
+from control_design.plants.ellipses import farthest_distance, nearest_distance
 from ident.uncertainty import FrequencyUncertainty
 
 Real = npt.NDArray[np.float64]

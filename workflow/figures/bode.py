@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from ident.model import GobfModel
+from ident.basis.model import GobfModel
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real, degrees_near, response_band

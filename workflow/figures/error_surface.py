@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 
-from ident.error_surface import ErrorSurface
-from ident.search_trace import SearchStage
+from ident.search.error_surface import ErrorSurface
+from ident.search.search_trace import SearchStage
 from workflow.figures import style
 from workflow.figures.bands import Real
 

@@ -9,7 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from diagnosis.where_records import BandGap, EquivalentCurve, ExperimentGap, PartGap, RegimeBin, RegimeFinding
+from diagnosis.where.where_records import (
+    BandGap,
+    EquivalentCurve,
+    ExperimentGap,
+    PartGap,
+    RegimeBin,
+    RegimeFinding,
+)
 from workflow.figures import gap_style, style
 
 SENSOR_COLOURS = {"hub_angle": style.UNCERTAIN, "tip": style.HIGHLIGHT}

@@ -10,7 +10,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from control_design.ellipses import nearest_distance
+from control_design.plants.ellipses import nearest_distance
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real

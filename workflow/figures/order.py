@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from ident.order_selection import OrderStep
+from ident.search.order_selection import OrderStep
 from ident.stabilisation import Stabilisation
 from workflow.figures import style
 from workflow.figures.bode import EmpiricalResponse

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ident.model import GobfModel
+from ident.basis.model import GobfModel
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline, response_band

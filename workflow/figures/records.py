@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ident.record import Record
+from ident.data.record import Record
 from workflow.figures import style
 from workflow.figures.bands import Real, outline
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.validation import ScatterRow
+from ident.checks.validation import ScatterRow
 from workflow.figures import style
 
 

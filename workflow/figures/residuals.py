@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.validation import ResidualTest
+from ident.checks.validation import ResidualTest
 from workflow.figures import style
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from control_design.controller import Controller
-from control_design.ellipses import distance_to_minus_one, largest_disturbance_gain
-from control_design.plant_set import UncertainPlant
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
+from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from workflow.figures import style
 from workflow.figures.bands import Real

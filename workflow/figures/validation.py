@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.record import Record
-from ident.validation import FreshFit
+from ident.checks.validation import FreshFit
+from ident.data.record import Record
 from workflow.figures import style
 from workflow.figures.bands import outline
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from workflow import storage
-from workflow.config import RunConfig
+from workflow.config.run_config import RunConfig
+from workflow.engine import storage
+from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import Picture, render
 from workflow.report.data import RunData, load
 from workflow.report.loop_sections import (
@@ -20,8 +21,7 @@ from workflow.report.page import Plot, Section, Table
 from workflow.report.pictures import pictures_of
 from workflow.report.rendering import page
 from workflow.report.verdict import reproducibility_section, verdict_of
-from workflow.run_directory import RunDirectory
-from workflow.summary import summarise
+from workflow.tasks.summary import summarise
 
 __all__ = ["write_report"]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from control_design.prefilter import Prefilter
-from workflow.reference_filter import prefilter_of, prefilter_words
+from control_design.convex.reference_filter import Prefilter
 from workflow.report.data import RunData
 from workflow.report.page import Block, Code, Remarks, Table, Text, heading, maybe
 from workflow.report.words import frequency, number, percent, sentence
-from workflow.whole_responses import joint_numbers, joint_of, joint_words
-from workflow.yardstick import bracket_of, order_advice, yardstick_words
+from workflow.tasks.achievable_performance import bracket_of, order_advice, yardstick_words
+from workflow.tasks.joint_coverage import joint_numbers, joint_of, joint_words
+from workflow.tasks.reference_filter import prefilter_of, prefilter_words
 
 
 def beyond_words(data: RunData) -> list[str]:

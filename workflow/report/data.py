@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from control_design.certificate import Certificate
-from control_design.plant_set import UncertainPlant
-from control_design.synthesis_result import Outcome, SynthesisResult
-from ident.model import GobfModel
-from ident.record import Record
+from control_design.analysis.certificate import Certificate
+from control_design.plants.plant_set import UncertainPlant
+from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
+from ident.basis.model import GobfModel
+from ident.data.record import Record
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty
-from workflow.conditioning import as_fitted
-from workflow.config import Channel, RunConfig
-from workflow.run_directory import RunDirectory, StageData
-from workflow.stages.results import (
+from workflow.config.run_config import Channel, RunConfig
+from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.tasks.conditioning import as_fitted
+from workflow.tasks.stages.results import (
     ChannelResult,
     RunRecord,
     channel_result,

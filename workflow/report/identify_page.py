@@ -10,7 +10,7 @@ from importlib import metadata
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.validation import fit_on_fresh_data
+from ident.checks.validation import fit_on_fresh_data
 from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.order import draw_order
 from workflow.figures.poles import draw_poles
@@ -18,7 +18,6 @@ from workflow.figures.records import ShownRecord, draw_records
 from workflow.figures.residuals import draw_residual_tests
 from workflow.figures.style import Picture, render
 from workflow.figures.validation import draw_validation
-from workflow.log_identification import LogIdentification
 from workflow.report.model_blocks import (
     STABILISATION_CAPTION,
     band_table,
@@ -35,7 +34,8 @@ from workflow.report.model_blocks import (
 from workflow.report.page import Block, Plot, Section, Table, Text, maybe
 from workflow.report.rendering import page
 from workflow.report.words import count, frequency, listing, number, percent, sentence
-from workflow.stages.uncertainty import tests_by_name
+from workflow.tasks.log_identification import LogIdentification
+from workflow.tasks.stages.uncertainty import tests_by_name
 
 _LIGHT = 0.3
 

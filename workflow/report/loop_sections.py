@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from control_design.synthesis_result import Outcome
+from control_design.synthesis.synthesis_result import Outcome
 from workflow.report.beyond_margins import order_blocks, prefilter_blocks, whole_blocks
 from workflow.report.data import RunData
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text, maybe
 from workflow.report.words import count, decibels, frequency, listing, number, percent, quantity, sentence
-from workflow.whole_responses import open_words
+from workflow.tasks.joint_coverage import open_words
 
 _NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
 

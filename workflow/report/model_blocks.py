@@ -9,12 +9,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ident.options import IdentOptions
+from ident.basis.options import IdentOptions
 from ident.stabilisation import Stabilisation
 from workflow.report.page import Block, Remarks, Table, maybe
 from workflow.report.words import count, frequency, listing, number, percent
-from workflow.stages.uncertainty import noise_order
-from workflow.summary import between
+from workflow.tasks.stages.uncertainty import noise_order
+from workflow.tasks.summary import between
 
 Document = Mapping[str, Any]
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from workflow.config import SimulatedSource
+from workflow.config.run_config import SimulatedSource
 from workflow.report.data import ChannelData, RunData
 from workflow.report.model_blocks import (
     STABILISATION_CAPTION,
@@ -23,7 +23,7 @@ from workflow.report.model_blocks import (
 from workflow.report.page import Block, Plot, Remarks, Section, Table, Text, heading, maybe
 from workflow.report.pictures import channel_picture, fresh_index, shown_pair
 from workflow.report.words import count, frequency, listing, number, percent, sentence
-from workflow.stages.uncertainty import tests_by_name
+from workflow.tasks.stages.uncertainty import tests_by_name
 
 _ROLE = {"estimation": "estimation", "validation": "validation", "repeat": "repeat"}
 

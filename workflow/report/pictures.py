@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from control_design.frequency_grid import frequency_grid
-from control_design.plant_set import Mode, modes_of
-from control_design.stability import closed_loop_poles
-from ident.error_surface import error_surface
+from control_design.analysis.stability import closed_loop_poles
+from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.plant_set import Mode, modes_of
+from ident.checks.validation import ScatterRow, fit_on_fresh_data
+from ident.search.error_surface import error_surface
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
-from ident.validation import ScatterRow, fit_on_fresh_data
 from workflow.figures.bands import Real
 from workflow.figures.bode import EmpiricalResponse, draw_bode
 from workflow.figures.closed_loop import (
@@ -40,7 +40,7 @@ from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
 from workflow.report.data import ChannelData, RunData
-from workflow.stages.uncertainty import tests_by_name
+from workflow.tasks.stages.uncertainty import tests_by_name
 
 Drawer = Callable[[], Figure]
 

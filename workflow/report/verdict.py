@@ -10,7 +10,7 @@ from workflow.report.beyond_margins import beyond_words
 from workflow.report.data import ChannelData, RunData
 from workflow.report.page import Block, Code, Section, Table, Text
 from workflow.report.words import count, frequency, listing, number, percent, sentence
-from workflow.whole_responses import open_words
+from workflow.tasks.joint_coverage import open_words
 
 
 @dataclass(frozen=True)

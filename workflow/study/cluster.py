@@ -14,7 +14,7 @@ from importlib import import_module
 from types import TracebackType
 from typing import Any, Self
 
-from workflow.errors import InputError, StageError, one_line
+from workflow.engine.errors import InputError, StageError, one_line
 from workflow.study.task import Done, Task, failed, run_task
 
 CONNECT_S = 10.0

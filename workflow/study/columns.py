@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from workflow.reference_filter import prefilter_of
-from workflow.summary import gamma_of
-from workflow.whole_responses import joint_numbers
-from workflow.yardstick import bracket_numbers
+from workflow.tasks.achievable_performance import bracket_numbers
+from workflow.tasks.joint_coverage import joint_numbers
+from workflow.tasks.reference_filter import prefilter_of
+from workflow.tasks.summary import gamma_of
 
 Number = float | int | None
 

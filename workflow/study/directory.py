@@ -21,16 +21,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from workflow import storage
-from workflow.config import RunConfig
-from workflow.errors import InputError
-from workflow.pipeline import stage_input_hash
-from workflow.run_directory import RunDirectory, first_difference
-from workflow.stages import Stage
+from workflow.config.run_config import RunConfig
+from workflow.engine import storage
+from workflow.engine.errors import InputError
+from workflow.engine.run_directory import RunDirectory, first_difference
 from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point
 from workflow.study.task import Done
 from workflow.study.toml_text import toml_text
-from workflow.summary import summarise
+from workflow.tasks.pipeline import stage_input_hash
+from workflow.tasks.stages import Stage
+from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1
 

@@ -11,16 +11,16 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from workflow import storage
-from workflow.config import RunConfig, load_config
-from workflow.entry import built_in_config
-from workflow.errors import InputError
-from workflow.pipeline import config_of
-from workflow.run_directory import RunDirectory, hash_of
-from workflow.settings import check
-from workflow.stages import STAGES, Stage
+from workflow.config.run_config import RunConfig, load_config
+from workflow.config.settings import check
+from workflow.engine import storage
+from workflow.engine.errors import InputError
+from workflow.engine.run_directory import RunDirectory, hash_of
 from workflow.study.keys import last_name, with_values
 from workflow.study.settings import Axis, StudyConfig
+from workflow.tasks.entry import built_in_config
+from workflow.tasks.pipeline import config_of
+from workflow.tasks.stages import STAGES, Stage
 
 PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
 POINT_STAGES: tuple[Stage, ...] = tuple(

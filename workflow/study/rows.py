@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from workflow.run_directory import RunDirectory
-from workflow.stages.results import load_document
+from workflow.engine.run_directory import RunDirectory
 from workflow.study.columns import COLUMNS, Number, numbers_of
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot
-from workflow.summary import gamma_of, verdict_of
-from workflow.yardstick import order_advice
+from workflow.tasks.achievable_performance import order_advice
+from workflow.tasks.stages.results import load_document
+from workflow.tasks.summary import gamma_of, verdict_of
 
 State = Literal["certified", "does not settle", "not certified", "impossible", "failed"]
 

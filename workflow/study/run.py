@@ -10,12 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
-from workflow import storage
-from workflow.code_version import code_digest
-from workflow.errors import InputError, StageError
-from workflow.pipeline import config_of
-from workflow.progress import Progress, Silence
-from workflow.run_directory import RunDirectory
+from workflow.engine import storage
+from workflow.engine.code_version import code_digest
+from workflow.engine.errors import InputError, StageError
+from workflow.engine.progress import Progress, Silence
+from workflow.engine.run_directory import RunDirectory
 from workflow.study.cluster import DaskCluster
 from workflow.study.columns import COLUMNS
 from workflow.study.directory import StudyDirectory, stage_files
@@ -25,7 +24,8 @@ from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_wi
 from workflow.study.search import Grid, ParzenSearch, Strategy
 from workflow.study.settings import StudyConfig, load_study
 from workflow.study.task import Done, Job, Task
-from workflow.summary import Row, RunSummary, Section
+from workflow.tasks.pipeline import config_of
+from workflow.tasks.summary import Row, RunSummary, Section
 
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
 

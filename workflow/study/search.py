@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from typing import Any, Protocol
 
-from workflow.errors import InputError
+from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
 from workflow.study.points import Point, PointMaker
 from workflow.study.rows import PointRow

@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from workflow.config import Section
-from workflow.errors import InputError
-from workflow.settings import check, expand, read_toml
+from workflow.config.run_config import Section
+from workflow.config.settings import check, expand, read_toml
+from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
 from workflow.study.keys import last_name, parse_key
 

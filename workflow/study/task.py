@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from workflow import storage
-from workflow.code_version import code_digest
-from workflow.config import RunConfig
-from workflow.errors import InputError, StageError, one_line
-from workflow.pipeline import stage_input_hash
-from workflow.progress import Silence
-from workflow.run_directory import RunDirectory
-from workflow.stages import STAGES, StageInput
+from workflow.config.run_config import RunConfig
+from workflow.engine import storage
+from workflow.engine.code_version import code_digest
+from workflow.engine.errors import InputError, StageError, one_line
+from workflow.engine.progress import Silence
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.pipeline import stage_input_hash
+from workflow.tasks.stages import STAGES, StageInput
 
 
 @dataclass(frozen=True, eq=False)

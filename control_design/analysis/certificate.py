@@ -1,0 +1,534 @@
+"""The certificate: what was checked about a controller, independently of the optimiser that made it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from control_design.analysis.between_grid_points import AllFrequencies, bound_all_frequencies
+from control_design.analysis.joint_coverage import JointCoverage, at_level
+from control_design.analysis.joint_coverage import joint_coverage as calibrate
+from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
+from control_design.analysis.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
+from control_design.analysis.worst_case import WorstCase, worst_case
+from control_design.controllers.biquads import SOLVER_SLACK
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.frequency_grid import frequency_grid, plant_grid
+from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.specification import Specification
+
+_PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
+_NOT_LOOKED_AT = AllFrequencies.nothing("not looked at")
+
+
+@dataclass(frozen=True)
+class SpecificationItem:
+    """One requirement on one plant: met or not, with the number that decides it and where.
+
+    bound: what was proved of `achieved` for all frequencies, where that was possible.
+    """
+
+    requirement: str
+    plant: str
+    required: float
+    achieved: float
+    unit: str
+    met: bool
+    omega_rad_s: float | None = None
+    bound: float | None = None
+
+    def sentence(self) -> str:
+        """One line for a report."""
+        where = "" if self.omega_rad_s is None else f" at {self.omega_rad_s:.4g} rad/s"
+        verdict = "met" if self.met else "NOT met"
+        unit = f" {self.unit}" if self.unit else ""
+        numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
+        known = self.met and self.bound is not None
+        proved = f" ({self.bound:.4g} proved for all frequencies)" if known else ""
+        return f"{self.plant}: {self.requirement}: {numbers}{proved}: {verdict}"
+
+
+@dataclass(frozen=True)
+class PlantVerdict:
+    """Everything checked on one plant.
+
+    closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted
+    value over the ellipses (<= 1 met, 0 = not asked), frequency of the largest. bandwidth_rad_s: up to here
+    every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
+    uncertainty is known everywhere. all_frequencies: what was proved between the grid points.
+    """
+
+    plant: str
+    stable: bool
+    pole_radius: float
+    closed_loop_modes: tuple[Mode, ...]
+    nyquist: NyquistCount
+    nominal_margins: Margins
+    worst_margins: Margins
+    worst_margin_omega_rad_s: float
+    worst_weighted: float
+    worst_weighted_kind: str
+    worst_weighted_omega_rad_s: float
+    worst_peak_sensitivity: float
+    bandwidth_rad_s: float
+    frequencies: int
+    own_grid_rad_s: tuple[float, float] | None = None
+    all_frequencies: AllFrequencies = _NOT_LOOKED_AT
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Verdict on a controller for a set of uncertain plants.
+
+    certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches
+    -1, and every item of the specification is met: for all frequencies on plants where
+    `PlantVerdict.all_frequencies` is possible, else on the grids named in `checked`. gamma: largest weighted
+    worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or None where
+    some plant allows no proof. joint: calibration of the ellipses to whole responses, where asked for; the
+    ellipses checked are then those of the calibrated level where it is above the given one.
+    """
+
+    certified: bool
+    gamma: float
+    plants: tuple[PlantVerdict, ...]
+    items: tuple[SpecificationItem, ...]
+    checked: tuple[str, ...]
+    not_checked: tuple[str, ...]
+    gamma_bound: float | None = None
+    joint: JointCoverage | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; infinities become None inside margins and the string "inf" elsewhere."""
+        data = asdict(self)
+        for verdict, plain in zip(self.plants, data["plants"], strict=True):
+            plain["nominal_margins"] = verdict.nominal_margins.to_dict()
+            plain["worst_margins"] = verdict.worst_margins.to_dict()
+        data["joint"] = None if self.joint is None else self.joint.to_dict()
+        cleaned: dict[str, Any] = _plain(data)
+        return cleaned
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Certificate:
+        """Inverse of `to_dict`."""
+        plants = []
+        for plain in data["plants"]:
+            values = {key: _number(value) for key, value in plain.items()}
+            values["closed_loop_modes"] = tuple(Mode(**mode) for mode in plain["closed_loop_modes"])
+            values["nyquist"] = NyquistCount(**plain["nyquist"])
+            values["nominal_margins"] = Margins.from_dict(plain["nominal_margins"])
+            values["worst_margins"] = Margins.from_dict(plain["worst_margins"])
+            own = plain["own_grid_rad_s"]
+            values["own_grid_rad_s"] = None if own is None else tuple(own)
+            proof = plain.get("all_frequencies")
+            if proof is not None:
+                bounds = {kind: _number(bound) for kind, bound in proof["bounds"].items()}
+                numbers = {key: _number(value) for key, value in proof.items()}
+                values["all_frequencies"] = AllFrequencies(**(numbers | {"bounds": bounds}))
+            plants.append(PlantVerdict(**values))
+        items = [
+            SpecificationItem(**{key: _number(value) for key, value in item.items()})
+            for item in data["items"]
+        ]
+        return cls(
+            certified=bool(data["certified"]),
+            gamma=_number(data["gamma"]),
+            plants=tuple(plants),
+            items=tuple(items),
+            checked=tuple(data["checked"]),
+            not_checked=tuple(data["not_checked"]),
+            gamma_bound=_number(data.get("gamma_bound")),
+            joint=JointCoverage.from_dict(data["joint"]) if data.get("joint") else None,
+        )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return "inf" if value > 0 else "-inf" if value < 0 else "nan"
+    return value
+
+
+def _number(value: Any) -> Any:
+    return float(value) if isinstance(value, str) and value in ("inf", "-inf", "nan") else value
+
+
+def certify(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    *,
+    omega_min_rad_s: float = 1e-4,
+    n_dense: int = 6000,
+    between_own_points: Literal["nothing", "linear"] = "nothing",
+    joint_coverage: float | None = None,
+    rng: np.random.Generator | None = None,
+    joint_draws: int = 4000,
+    joint_stable_share: float = 0.999,
+) -> Certificate:
+    """Check a controller from any source against plants and specification.
+
+    The grid is built here from the poles of plants, controller and closed loop and refined where the checks
+    are worst; the optimiser's grid plays no part. Between its points the worst cases are bounded
+    (`between_grid_points`), for plants whose uncertainty can be evaluated with its derivatives: posteriors of
+    coefficients, plants without uncertainty, and uncertainties that offer `first_order`.
+
+    between_own_points: what may be assumed of a response known on its own frequencies only. "nothing": no
+    statement between them. "linear": at fraction x between two neighbours it lies in (1 - x) E_k + x E_{k+1}.
+
+    joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
+    and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
+
+    joint_stable_share: with a joint coverage, share of those responses that must be stable. It is a
+    requirement of its own: ellipses propagate parameters to first order, and no level of theirs speaks for
+    draws far outside (`joint_synthesis` designs for it).
+
+    Raises
+    ------
+    ValueError
+        If the plants are none, sampling times or computational delays do not match, or the loop is algebraic.
+    """
+    if not plants:
+        raise ValueError("certify needs at least one plant")
+    if controller.computational_delay_samples != specification.computational_delay_samples:
+        raise ValueError(
+            f"the controller has {controller.computational_delay_samples} samples of computational delay, "
+            f"the specification {specification.computational_delay_samples}"
+        )
+    joint = None
+    if joint_coverage is not None:
+        if rng is None:
+            raise ValueError("joint_coverage needs rng, a numpy.random.Generator to draw responses with")
+        joint = calibrate(
+            controller,
+            plants,
+            specification,
+            rng=rng,
+            coverage=joint_coverage,
+            draws=joint_draws,
+            omega_min_rad_s=omega_min_rad_s,
+        )
+        plants = [at_level(plant, max(plant.level, joint.level)) for plant in plants]
+    verdicts: list[PlantVerdict] = []
+    items: list[SpecificationItem] = []
+    for plant in plants:
+        verdict, found = _check_plant(
+            controller, plant, specification, omega_min_rad_s, n_dense, between_own_points
+        )
+        verdicts.append(verdict)
+        items += found
+    if specification.controller_damping is not None:
+        items.append(_controller_damping_item(controller, specification.controller_damping))
+    if specification.integrator:
+        items.append(_integrator_item(controller, plants[0]))
+    if joint is not None:
+        items.append(_stable_share_item(joint, plants, joint_stable_share))
+    robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
+    proofs = [v.all_frequencies for v in verdicts]
+    robust = robust and all(proof.proved or not proof.possible for proof in proofs)
+    return Certificate(
+        certified=bool(robust and all(item.met for item in items)),
+        gamma=max(v.worst_weighted for v in verdicts),
+        plants=tuple(verdicts),
+        items=tuple(items),
+        checked=_checked_words(verdicts, specification, between_own_points, joint),
+        not_checked=_not_checked_words(plants, verdicts, between_own_points, joint),
+        gamma_bound=max(proof.gamma for proof in proofs) if all(p.possible for p in proofs) else None,
+        joint=joint,
+    )
+
+
+def _check_plant(
+    controller: Controller,
+    plant: UncertainPlant,
+    specification: Specification,
+    omega_min_rad_s: float,
+    n_dense: int,
+    between_own_points: str,
+) -> tuple[PlantVerdict, list[SpecificationItem]]:
+    poles = closed_loop_poles(controller, plant)
+    radius = float(np.max(np.abs(poles))) if poles.size else 0.0
+    loop_modes = modes_of(poles, plant.dt_s, zeta_below=1.0)
+    own_modes = modes_of(controller.poles, plant.dt_s)
+    near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
+    light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
+    wanted = frequency_grid(
+        plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=n_dense, n_mode=120 * len(light)
+    )
+    grid = plant_grid(plant, wanted) if plant.own_grid is None else _with_own_grid(plant, wanted)
+
+    def response(omega: Real) -> Complex:
+        return controller.response(omega, with_delay=False)
+
+    worst = worst_case(response, plant, specification, grid)
+    refinable = plant.own_grid is None
+
+    def loop_gain(omega: Real) -> Complex:
+        return controller.response(omega) * plant.at(omega).centre
+
+    integrators, unstable = loop_integrators(controller, plant)
+    if refinable:
+        count = nyquist_count(loop_gain, worst.omega_rad_s, integrators=integrators, unstable_poles=unstable)
+        nominal = nominal_margins(loop_gain, worst.omega_rad_s)
+    else:
+        count = nyquist_count(
+            loop_gain, grid, integrators=integrators, unstable_poles=unstable, refinable=False
+        )
+        nominal = nominal_margins(loop_gain, grid, refinable=False)
+    distance = worst.values["distance"]
+    margins = ellipse_margins(worst.loop_factor, worst.ellipses, distance).worse(nominal)
+    at = int(np.argmin(distance))
+    kinds = [(*worst.peak(kind), kind) for kind in ("tracking", "modulus", "effort", "mode damping")]
+    weighted, where, kind = max(kinds, key=lambda entry: entry[0])
+    stable = bool(radius < 1.0)
+    below = np.flatnonzero(distance < np.sqrt(2.0))
+    bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
+    if stable and count.matches and margins.modulus > 0:
+        proof = bound_all_frequencies(
+            controller,
+            plant,
+            specification,
+            worst,
+            modes=tuple(light),
+            omega_min_rad_s=omega_min_rad_s,
+            between_own_points=between_own_points,
+        )
+    else:
+        proof = AllFrequencies.refuted("the loop is not robustly stable on the dense grid")
+    verdict = PlantVerdict(
+        plant=plant.name,
+        stable=stable,
+        pole_radius=radius,
+        closed_loop_modes=tuple(m for m in loop_modes if m.zeta < 1.0),
+        nyquist=count,
+        nominal_margins=nominal,
+        worst_margins=margins,
+        worst_margin_omega_rad_s=float(worst.omega_rad_s[at]),
+        worst_weighted=weighted if margins.modulus > 0 else float("inf"),
+        worst_weighted_kind=kind,
+        worst_weighted_omega_rad_s=where,
+        worst_peak_sensitivity=1.0 / margins.modulus if margins.modulus > 0 else float("inf"),
+        bandwidth_rad_s=bandwidth,
+        frequencies=int(worst.omega_rad_s.size),
+        own_grid_rad_s=None
+        if plant.own_grid is None
+        else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
+        all_frequencies=proof,
+    )
+    items = _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]), proof)
+    if specification.mode_damping is not None:
+        items.append(_mode_damping_item(plant.name, loop_modes, specification))
+    return verdict, items
+
+
+def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
+    """Every frequency of the user's grid, and `wanted` outside its range."""
+    own = plant.own_grid
+    assert own is not None
+    outside = wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
+    inside = own[own > 0]
+    return np.asarray(np.unique(np.concatenate([inside, outside])), dtype=np.float64)
+
+
+def _items(
+    plant: UncertainPlant,
+    specification: Specification,
+    worst: WorstCase,
+    margins: Margins,
+    omega: float,
+    proof: AllFrequencies,
+) -> list[SpecificationItem]:
+    wanted = specification.modulus_margin
+    items = [
+        SpecificationItem(
+            "modulus margin, worst case",
+            plant.name,
+            wanted,
+            margins.modulus,
+            "",
+            bool(margins.modulus >= wanted) and _proved(proof, "modulus"),
+            omega,
+            wanted / proof.bounds["modulus"] if proof.possible else None,
+        )
+    ]
+    asked = {
+        "tracking": specification.bandwidth_rad_s is not None or specification.sensitivity_weight is not None,
+        "effort": specification.effort_limit is not None or specification.effort_weight is not None,
+        "mode damping": specification.mode_peak_ratio is not None,
+    }
+    words = {
+        "tracking": "tracking, largest |W1 S|",
+        "effort": "effort, largest |W3 K S|",
+        "mode damping": "damping of the mode, largest |W4 Gp S|",
+    }
+    for kind in asked:
+        if asked[kind]:
+            value, place = worst.peak(kind)
+            met = bool(value <= 1.0) and _proved(proof, kind)
+            bound = proof.bounds[kind] if proof.possible else None
+            items.append(SpecificationItem(words[kind], plant.name, 1.0, value, "", met, place, bound))
+    if specification.delay_margin_s is not None:
+        items.append(
+            SpecificationItem(
+                "delay margin, worst case",
+                plant.name,
+                specification.delay_margin_s,
+                margins.delay_s,
+                "s",
+                bool(margins.delay_s >= specification.delay_margin_s),
+            )
+        )
+    return items
+
+
+def _proved(proof: AllFrequencies, kind: str) -> bool:
+    """Whether a kind is shown to meet its limit for all frequencies, where that can be shown at all."""
+    return not proof.possible or proof.bounds[kind] <= 1.0 + _PROOF_SLACK
+
+
+def _mode_damping_item(plant: str, modes: Sequence[Mode], specification: Specification) -> SpecificationItem:
+    """Least damped mode of the nominal closed loop in the band; without one there, damping is no issue."""
+    assert specification.mode_damping is not None
+    assert specification.mode_band_rad_s is not None
+    low, high = specification.mode_band_rad_s
+    inside = [mode for mode in modes if low <= mode.omega_rad_s <= high]
+    least = min(inside, key=lambda mode: mode.zeta, default=None)
+    return SpecificationItem(
+        "damping ratio of the nominal closed loop's modes",
+        plant,
+        specification.mode_damping,
+        1.0 if least is None else least.zeta,
+        "",
+        least is None or least.zeta >= specification.mode_damping,
+        None if least is None else least.omega_rad_s,
+    )
+
+
+def _controller_damping_item(controller: Controller, required: float) -> SpecificationItem:
+    # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.
+    w = 2 / controller.dt_s * (controller.poles - 1) / (controller.poles + 1)
+    pairs = w[np.imag(w) > 0]
+    zeta = -np.real(pairs) / np.abs(pairs)
+    least = int(np.argmin(zeta)) if pairs.size else None
+    achieved = 1.0 if least is None else float(zeta[least])
+    return SpecificationItem(
+        "damping ratio of the controller's own poles",
+        "controller",
+        required,
+        achieved,
+        "",
+        achieved >= required * (1 - SOLVER_SLACK),
+        None if least is None else float(np.abs(pairs[least])),
+    )
+
+
+def _stable_share_item(
+    joint: JointCoverage, plants: Sequence[UncertainPlant], required: float
+) -> SpecificationItem:
+    name = plants[0].name if len(plants) == 1 else "all plants together"
+    return SpecificationItem(
+        f"share of {joint.draws} sampled responses that are stable",
+        name,
+        required,
+        joint.stable_share,
+        "",
+        bool(joint.stable_share >= required),
+    )
+
+
+def _integrator_item(controller: Controller, plant: UncertainPlant) -> SpecificationItem:
+    own = loop_integrators(controller, plant)[0] - plant.n_integrators
+    return SpecificationItem(
+        "integrators in the controller", "controller", 1.0, float(own), "", bool(own >= 1)
+    )
+
+
+def _checked_words(
+    verdicts: Sequence[PlantVerdict],
+    specification: Specification,
+    between_own_points: str,
+    joint: JointCoverage | None,
+) -> tuple[str, ...]:
+    words = [
+        "nominal closed-loop poles of the full state space (plant, controller, computational delay)",
+        "Nyquist count of the uncertainty centre against the count a stable loop needs",
+        "distance of every ellipse from -1 and every weighted worst case, exact on the ellipse, on "
+        "a dense grid of "
+        + ", ".join(f"{v.frequencies} frequencies ({v.plant})" for v in verdicts)
+        + ", refined around the maxima",
+        "gain, phase, delay and modulus margins, nominal and worst case over the ellipses on that grid",
+    ]
+    for verdict in verdicts:
+        proof = verdict.all_frequencies
+        if proof.proved:
+            assumed = (
+                ", assuming that between its own frequencies the response lies on a straight line between "
+                "members of neighbouring ellipses"
+                if verdict.own_grid_rad_s is not None and between_own_points == "linear"
+                else ""
+            )
+            words.append(
+                f"{verdict.plant}: for all frequencies from 0 to Nyquist (bounds on {proof.intervals} "
+                f"intervals): no ellipse comes nearer to -1 than {proof.distance:.4g}, the weighted worst "
+                f"case is at most {proof.gamma:.4g}, and the winding is that of a stable loop; so every "
+                f"plant in the ellipses with the nominal's unstable poles is stable{assumed}"
+            )
+    if joint is not None:
+        words.append(joint.sentence())
+    if specification.mode_peak_ratio is not None:
+        words.append("damping of the flexible mode as the peak of |Gp S| in its band")
+    if specification.mode_damping is not None:
+        words.append("damping ratios of the nominal closed loop's modes in their band")
+    return tuple(words)
+
+
+def _not_checked_words(
+    plants: Sequence[UncertainPlant],
+    verdicts: Sequence[PlantVerdict],
+    between_own_points: str,
+    joint: JointCoverage | None,
+) -> tuple[str, ...]:
+    words: list[str] = []
+    for verdict in verdicts:
+        proof = verdict.all_frequencies
+        if proof.proved:
+            words.append(
+                f"{verdict.plant}: rounding errors of double precision, and gain, phase and delay margins "
+                "between grid points"
+            )
+        else:
+            words.append(f"{verdict.plant}: between grid points: not proved ({proof.reason})")
+    if joint is None:
+        words.append(
+            "joint level: the ellipses hold at their level at each frequency, not at all frequencies together"
+        )
+    words += [
+        "nonlinear effects (friction, saturation, quantisation, backlash) and anything outside the ellipses",
+        "that the true plant has as many unstable poles and integrators as the nominal",
+    ]
+    for plant, verdict in zip(plants, verdicts, strict=True):
+        if verdict.own_grid_rad_s is not None:
+            low, high = verdict.own_grid_rad_s
+            between = (
+                "between its points a straight line between members is assumed"
+                if between_own_points == "linear"
+                else "between its points nothing is known"
+            )
+            words.append(
+                f"{plant.name}: the uncertainty is known on its own grid only; {between}, and below "
+                f"{low:.4g} and above {high:.4g} rad/s the nominal alone was used, without uncertainty"
+            )
+        elif plant.uncertainty is None:
+            words.append(f"{plant.name}: no uncertainty was given; only the nominal plant was checked")
+        if plant.performance is not None:
+            words.append(
+                f"{plant.name}: correlation between measured and performance channel is not used "
+                "(any pair of members allowed)"
+            )
+    return tuple(words)

@@ -1,0 +1,372 @@
+"""Closed-loop simulation on anything that can be sampled: the nonlinear arm, a linear model, later a real
+machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import control
+import numpy as np
+import numpy.typing as npt
+
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Real, readonly_complex, readonly_real
+
+
+class SampledMachine(Protocol):
+    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` is
+    one."""
+
+    @property
+    def dt_s(self) -> float: ...
+    def reset(self) -> None: ...
+    def measure(self) -> Real: ...
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None: ...
+
+
+class LinearMachine:
+    """A discrete `control.StateSpace` as a SampledMachine.
+
+    Inputs: command, and optionally a second one driven by `hub_torque_Nm`; any number of outputs. The first
+    column of D must be zero: a sampled machine cannot answer at t_k to a command that is applied from t_k on.
+    """
+
+    def __init__(self, system: control.StateSpace) -> None:
+        if system.dt is None or system.dt is True or not system.dt > 0:
+            raise ValueError(
+                f"LinearMachine needs a discrete system with dt in seconds; got dt = {system.dt}"
+            )
+        if system.ninputs not in (1, 2):
+            raise ValueError(f"LinearMachine needs one or two inputs; got {system.ninputs}")
+        if np.any(np.asarray(system.D) != 0):
+            raise ValueError(
+                "LinearMachine needs D = 0: the measurement at t_k comes before the command at t_k"
+            )
+        self._a, self._b, self._c = (np.array(getattr(system, m), dtype=np.float64) for m in "ABC")
+        self._dt_s = float(system.dt)
+        self.reset()
+
+    @property
+    def dt_s(self) -> float:
+        return self._dt_s
+
+    def reset(self) -> None:
+        self._x = np.zeros(self._a.shape[0])
+
+    def measure(self) -> Real:
+        """Outputs (Y,) at t_k."""
+        return np.asarray(self._c @ self._x, dtype=np.float64)
+
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        """Hold the command for one sample.
+
+        Raises
+        ------
+        ValueError
+            If a disturbance torque is given and the system has no second input for it.
+        """
+        if self._b.shape[1] == 1:
+            if hub_torque_Nm != 0.0:
+                raise ValueError("this LinearMachine has one input; a hub torque needs a second one")
+            self._x = self._a @ self._x + self._b[:, 0] * u
+        else:
+            self._x = self._a @ self._x + self._b @ np.array([u, hub_torque_Nm])
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopTrajectory:
+    """What happened: time_s (T,), reference (T,), output (T, Y) as measured, command (T,) as applied during
+    [t_k, t_{k+1}), limited (T,) whether a limit was active when the command at t_k was computed; dt_s,
+    measured_index of the controlled output."""
+
+    time_s: Real
+    reference: Real
+    output: Real
+    command: Real
+    limited: npt.NDArray[np.bool_]
+    dt_s: float
+    measured_index: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "reference", "output", "command"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        limited = np.array(self.limited, dtype=np.bool_)
+        limited.setflags(write=False)
+        object.__setattr__(self, "limited", limited)
+        n = self.time_s.size
+        shapes = {f.name: np.shape(getattr(self, f.name)) for f in fields(self)[:5]}
+        if self.output.ndim != 2 or any(shape[0] != n for shape in shapes.values()):
+            raise ValueError(f"trajectory needs (T,) arrays and output (T, Y); got {shapes}")
+
+    @property
+    def measured(self) -> Real:
+        """The controlled output, (T,)."""
+        return self.output[:, self.measured_index]
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Plain arrays for `numpy.savez`."""
+        return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> ClosedLoopTrajectory:
+        """Inverse of `to_arrays`."""
+        values: dict[str, Any] = {f.name: np.asarray(arrays[f.name]) for f in fields(cls)}
+        values["dt_s"] = float(values["dt_s"])
+        values["measured_index"] = int(values["measured_index"])
+        return cls(**values)
+
+
+def simulate(
+    controller: Controller,
+    machine: SampledMachine,
+    reference: npt.ArrayLike,
+    *,
+    measured_index: int = 0,
+    hub_torque_Nm: npt.ArrayLike | None = None,
+    input_disturbance: npt.ArrayLike | None = None,
+    output_disturbance: npt.ArrayLike | None = None,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
+) -> ClosedLoopTrajectory:
+    """Run u = K (r - y) on a machine from rest.
+
+    At t_k: measure y_k, add output_disturbance, quantise with measurement_step, compute the limited command,
+    quantise it with command_step, queue it for t_{k + delay}; then the machine holds the queued command (plus
+    input_disturbance) until t_{k+1}. With no limits and no quantisation this is exactly the feedback of K
+    z^-delay and the machine used in the loop analysis.
+
+    Parameters
+    ----------
+    reference : (T,) array
+        Set point at t_k, unit of the measured output.
+    hub_torque_Nm, input_disturbance, output_disturbance : (T,) arrays, optional
+        Torque handed to the machine; added to the applied command; added to the measured output.
+    measurement_step, command_step : float
+        Quantisation (mid-tread rounding) in output and input units; 0 = none.
+
+    Raises
+    ------
+    ValueError
+        If sampling times or lengths do not match, or a value is not finite.
+    """
+    wanted = _signal("reference", reference, None)
+    n = wanted.size
+    torque = _signal("hub_torque_Nm", hub_torque_Nm, n)
+    added = _signal("input_disturbance", input_disturbance, n)
+    shift = _signal("output_disturbance", output_disturbance, n)
+    if not np.isclose(machine.dt_s, controller.dt_s, rtol=1e-9, atol=0):
+        raise ValueError(f"controller and machine differ in dt_s: {controller.dt_s} and {machine.dt_s}")
+    if not (measurement_step >= 0 and command_step >= 0):
+        raise ValueError("measurement_step and command_step must not be negative")
+    machine.reset()
+    stepper = controller.stepper()
+    queue = [0.0] * controller.computational_delay_samples
+    output: list[Real] = []
+    command = np.empty(n)
+    limited = np.zeros(n, dtype=np.bool_)
+    for k in range(n):
+        y = np.array(machine.measure(), dtype=np.float64)
+        y[measured_index] += shift[k]
+        if measurement_step > 0:
+            y[measured_index] = np.round(y[measured_index] / measurement_step) * measurement_step
+        u = stepper.step(float(wanted[k] - y[measured_index]))
+        limited[k] = stepper.limited
+        if command_step > 0:
+            u = float(np.round(u / command_step) * command_step)
+        queue.append(u)
+        applied = queue.pop(0)
+        output.append(y)
+        command[k] = applied
+        if torque[k] != 0.0:
+            machine.advance(applied + added[k], hub_torque_Nm=float(torque[k]))
+        else:
+            machine.advance(applied + added[k])
+    return ClosedLoopTrajectory(
+        np.asarray(np.arange(n) * controller.dt_s, dtype=np.float64),
+        wanted,
+        np.array(output),
+        command,
+        limited,
+        controller.dt_s,
+        measured_index,
+    )
+
+
+def _signal(name: str, value: npt.ArrayLike | None, n: int | None) -> Real:
+    if value is None:
+        return np.zeros(n or 0)
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim != 1 or array.size == 0 or (n is not None and array.size != n):
+        raise ValueError(f"{name} must be (T,) with T = {n or 'at least 1'}; got {array.shape}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"{name} has a value that is not finite at sample {int(np.argmin(np.isfinite(array)))}"
+        )
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSensitivity:
+    """S measured in closed loop on a machine, from reference to error.
+
+    omega_rad_s (F,) the excited lines, response (F,) mean over periods and phase draws, std (F,) standard
+    deviation of that mean (of its modulus, nearly), from the scatter between draws, or between periods of a
+    single draw. peak_command and limited_fraction say whether the command stayed within its limits: with a
+    limit active the loop is not the one of the analysis. reference_rms: size of the excitation.
+    """
+
+    omega_rad_s: Real
+    response: Complex
+    std: Real
+    reference_rms: float
+    peak_command: float
+    limited_fraction: float
+
+    def __post_init__(self) -> None:
+        for name in ("omega_rad_s", "std"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        object.__setattr__(self, "response", readonly_complex(self.response))
+        if not self.omega_rad_s.shape == self.response.shape == self.std.shape == (self.omega_rad_s.size,):
+            raise ValueError("omega_rad_s, response and std must be (F,)")
+
+    @property
+    def peak(self) -> tuple[float, float, float]:
+        """Largest |S| over the lines, its standard deviation, its frequency [rad/s]."""
+        at = int(np.argmax(np.abs(self.response)))
+        return float(np.abs(self.response[at])), float(self.std[at]), float(self.omega_rad_s[at])
+
+
+def measure_sensitivity(
+    controller: Controller,
+    machine: SampledMachine,
+    rng: np.random.Generator,
+    *,
+    rms: float,
+    band_rad_s: tuple[float, float],
+    period_samples: int,
+    periods: int = 2,
+    draws: int = 1,
+    lead_in_periods: int = 1,
+    measured_index: int = 0,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
+) -> MeasuredSensitivity:
+    """Measure S on a machine: random-phase multisines as reference, ratio of error to reference.
+
+    Every draw has phases of its own; its first `lead_in_periods` periods are left out, so that the loop has
+    come to its periodic motion. On a nonlinear machine the mean over draws is the best linear approximation
+    for this spectrum and size, and the scatter between draws holds the distortion.
+
+    Raises
+    ------
+    ValueError
+        If the band holds no line of the period, or nothing would be left to take a scatter from.
+    """
+    if periods < 1 or draws < 1 or periods * draws < 2:
+        raise ValueError(f"a scatter needs two periods or two draws; got {periods} and {draws}")
+    if not (rms > 0 and np.isfinite(rms)):
+        raise ValueError(f"rms must be positive; got {rms}")
+    lines = np.arange(1, (period_samples - 1) // 2 + 1)
+    omega = np.asarray(2 * np.pi * lines / (period_samples * controller.dt_s), dtype=np.float64)
+    inside = (omega >= band_rad_s[0]) & (omega <= band_rad_s[1])
+    lines, omega = lines[inside], omega[inside]
+    if lines.size == 0:
+        raise ValueError(f"no line of {period_samples} samples lies in {band_rad_s} rad/s")
+    found, peak, limited = [], 0.0, 0.0
+    for _ in range(draws):
+        spectrum = np.zeros(period_samples // 2 + 1, dtype=np.complex128)
+        spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
+        period = np.fft.irfft(spectrum, period_samples)
+        period *= rms / np.sqrt(np.mean(period**2))
+        run = simulate(
+            controller,
+            machine,
+            np.tile(period, lead_in_periods + periods),
+            measured_index=measured_index,
+            measurement_step=measurement_step,
+            command_step=command_step,
+        )
+        error = (run.reference - run.measured)[lead_in_periods * period_samples :]
+        by_period = np.fft.rfft(error.reshape(periods, period_samples), axis=1)[:, lines]
+        found.append(by_period / np.fft.rfft(period)[lines])
+        peak = max(peak, float(np.max(np.abs(run.command))))
+        limited += float(np.mean(run.limited)) / draws
+    ratios = np.array(found)
+    each = ratios.mean(axis=1) if draws > 1 else ratios[0]
+    # Of a complex mean's scatter half lies along the modulus.
+    variance = np.sum(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1) / len(each)
+    std = np.asarray(np.sqrt(0.5 * variance), dtype=np.float64)
+    return MeasuredSensitivity(omega, ratios.mean(axis=(0, 1)), std, rms, peak, limited)
+
+
+@dataclass(frozen=True)
+class StepMetrics:
+    """Step response in words; times in s from the step, None where the response never gets there."""
+
+    step_size: float
+    rise_time_s: float | None
+    overshoot_percent: float
+    undershoot_percent: float
+    settling_time_s: float | None
+    steady_error: float
+    peak_command: float
+    limited_fraction: float
+
+    def to_dict(self) -> dict[str, float | None]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.02) -> StepMetrics:
+    """Rise time (10-90 %), overshoot, undershoot, settling time (into +-band of the step), steady error, peak
+    command.
+
+    All relative to the reference's own step: from its first to its last value, timed from the first sample
+    that differs from the first value. Steady error is the mean error over the last tenth of the record.
+
+    Raises
+    ------
+    ValueError
+        If the reference is not a step (no change, or more than one level after the change).
+    """
+    r, y, t = trajectory.reference, trajectory.measured, trajectory.time_s
+    changed = np.flatnonzero(r != r[0])
+    at = 0 if changed.size == 0 else int(changed[0])
+    size = float(r[-1] - r[0]) if changed.size else float(r[-1])
+    if size == 0.0 or not np.all(r[at:] == r[-1]):
+        raise ValueError("step_metrics needs a reference that steps once to a new level")
+    base = float(r[0]) if changed.size else 0.0
+    progress = (y[at:] - base) / size
+    time = t[at:] - t[at]
+    ten, ninety = _first_crossing(time, progress, 0.1), _first_crossing(time, progress, 0.9)
+    outside = np.flatnonzero(np.abs(progress - 1.0) > settling_band)
+    if outside.size == 0:
+        settling: float | None = 0.0
+    elif outside[-1] + 1 < progress.size:
+        settling = float(time[outside[-1] + 1])
+    else:
+        settling = None
+    tail = max(1, progress.size // 10)
+    return StepMetrics(
+        step_size=size,
+        rise_time_s=None if ten is None or ninety is None else ninety - ten,
+        overshoot_percent=100.0 * max(0.0, float(np.max(progress)) - 1.0),
+        undershoot_percent=100.0 * max(0.0, -float(np.min(progress))),
+        settling_time_s=settling,
+        steady_error=float(np.mean(r[-tail:] - y[-tail:])),
+        peak_command=float(np.max(np.abs(trajectory.command))),
+        limited_fraction=float(np.mean(trajectory.limited[at:])),
+    )
+
+
+def _first_crossing(time: Real, value: Real, level: float) -> float | None:
+    """First time the signal reaches the level, interpolated between samples."""
+    above = np.flatnonzero(value >= level)
+    if above.size == 0:
+        return None
+    k = int(above[0])
+    if k == 0:
+        return float(time[0])
+    share = (level - value[k - 1]) / (value[k] - value[k - 1])
+    return float(time[k - 1] + share * (time[k] - time[k - 1]))

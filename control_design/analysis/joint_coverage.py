@@ -1,0 +1,386 @@
+"""Joint coverage: the ellipse level at which the certified worst case holds for whole responses.
+
+Ellipses at 95 % per frequency do not hold a whole response with 95 %, and a band that does (simultaneous
+coverage) is wider than the worst case needs: a response may leave its ellipses where nothing is at stake.
+What is calibrated here is the statement that counts: P(gamma(G) <= gamma of the ellipses) = coverage,
+gamma(G) the largest weighted value of one sampled response G. The quantile of gamma(G) over draws is met by
+the worst case of ellipses at one level, found by bisection: the worst case grows with the level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.analysis.stability import closed_loop_poles, loop_integrators
+from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.plants.first_order import Intervals
+from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.guards import Guard, different_responses, guard_grid, winds
+from control_design.plants.plant_set import Channel, Mode, UncertainPlant, modes_of
+from control_design.plants.set_expansion import FirstOrderUncertainty
+from control_design.specification import Specification
+from ident.uncertainty import ResponsePosterior
+
+_CHUNK = 250  # draws at a time: bounds the memory
+_LARGEST_RADIUS = 8.0  # standard deviations: level 1 - 1e-14
+
+Responses = Callable[[Real], Complex]
+
+
+@runtime_checkable
+class ResponseDraws(Protocol):
+    """What an uncertainty of one's own offers to have its joint coverage calibrated."""
+
+    def draw(self, rng: np.random.Generator, draws: int) -> Responses:
+        """Function of omega (F,) that gives the same `draws` whole responses (draws, F) at every call."""
+        ...
+
+
+@dataclass(frozen=True)
+class JointCoverage:
+    """Calibrated level of the ellipses.
+
+    coverage: probability asked for. gamma: its quantile of gamma(G) over the draws, which is the worst case
+    of ellipses at `level` (per frequency; near 0 where gamma hardly depends on the plant). given_level,
+    gamma_given, coverage_given: the level the plants came with, its worst case and the share of draws within
+    that. simultaneous_given: share of draws that stay inside the ellipses of the given level at all grid
+    frequencies; simultaneous_level: level at which that share is `coverage`. stable_share: draws whose 1 + K
+    G winds as a stable loop's. Sampling error of the coverage: sqrt(coverage (1 - coverage)/draws).
+    """
+
+    coverage: float
+    draws: int
+    gamma: float
+    level: float
+    given_level: float
+    gamma_given: float
+    coverage_given: float
+    simultaneous_given: float
+    simultaneous_level: float
+    stable_share: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        return {key: value if np.isfinite(value) else "inf" for key, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`."""
+        plain: dict[str, Any] = {k: float("inf") if v == "inf" else v for k, v in data.items()}
+        return cls(**plain)
+
+    def sentence(self) -> str:
+        """One line for a report."""
+        return (
+            f"joint coverage {self.coverage:.4g}, calibrated on {self.draws} sampled responses: ellipses at "
+            f"{100 * self.level:.4g} % per frequency, weighted worst case {self.gamma:.4g} (at "
+            f"{100 * self.given_level:.4g} % the worst case {self.gamma_given:.4g} holds for "
+            f"{100 * self.coverage_given:.4g} % of them); {100 * self.stable_share:.4g} % of the draws stable"
+        )
+
+
+def joint_coverage(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    *,
+    rng: np.random.Generator,
+    coverage: float = 0.95,
+    draws: int = 4000,
+    omega_min_rad_s: float = 1e-4,
+) -> JointCoverage:
+    """Calibrate the per-frequency level so that the worst case holds with probability `coverage`.
+
+    Several plants are drawn independently of one another, and so are the measured and the performance channel
+    of one plant; gamma(G) is then the largest over all of them. gamma(G) is taken on a grid of about a
+    thousand frequencies, as is the worst case it is compared with.
+
+    Raises
+    ------
+    ValueError
+        If coverage is outside (0, 1), draws is below 100 or an uncertainty cannot be drawn from (a response
+        known on its own frequencies only says nothing about their correlation).
+    """
+    if not 0 < coverage < 1:
+        raise ValueError(f"joint coverage must lie in (0, 1); got {coverage}")
+    if draws < 100:
+        raise ValueError(f"joint coverage needs at least 100 draws; got {draws}")
+    if not plants:
+        raise ValueError("joint coverage needs at least one plant")
+    for plant in plants:
+        for channel in (plant.channel, plant.performance):
+            _refuse_undrawable(channel)
+    loops = [_Sampled.build(controller, plant, specification, omega_min_rad_s) for plant in plants]
+    found = [sampled_gamma(loop, rng, draws) for loop in loops]
+    gamma = np.max([one.gamma for one in found], axis=0)
+    outside = np.max([one.distance for one in found], axis=0)
+    # The worst case at a radius is compared in standard deviations, common to all plants.
+    wanted = float(np.quantile(gamma, coverage, method="higher"))
+    given = [_radius(loop.plant.level) for loop in loops]
+    at_given = max(loop.worst(radius) for loop, radius in zip(loops, given, strict=True))
+    low, high = 1e-3, _LARGEST_RADIUS
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if max(loop.worst(middle) for loop in loops) < wanted:
+            low = middle
+        else:
+            high = middle
+        if high - low < 1e-6 * high:
+            break
+    return JointCoverage(
+        coverage=coverage,
+        draws=draws,
+        gamma=wanted,
+        level=_level(high),
+        given_level=max(loop.plant.level for loop in loops),
+        gamma_given=at_given,
+        coverage_given=float(np.mean(gamma <= at_given)),
+        simultaneous_given=float(
+            np.mean(np.all([one.distance <= r for one, r in zip(found, given, strict=True)], axis=0))
+        ),
+        simultaneous_level=_level(float(np.quantile(outside, coverage))),
+        stable_share=float(np.mean(np.all([one.stable for one in found], axis=0))),
+    )
+
+
+def at_level(plant: UncertainPlant, level: float) -> UncertainPlant:
+    """The plant with ellipses of another level, its performance channel with it."""
+    performance = plant.performance
+    if performance is not None:
+        performance = replace(performance, level=level)
+    return replace(plant, level=level, performance=performance)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledGamma:
+    """Per draw, (D,): gamma(G) (inf where 1 + K G does not wind as a stable loop's), stable, and the largest
+    normalised distance of the measured response from the centre, in standard deviations."""
+
+    gamma: Real
+    stable: npt.NDArray[np.bool_]
+    distance: Real
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """One plant on one grid, ellipses of radius 1 (standard deviation)."""
+
+    plant: UncertainPlant
+    controller: Controller
+    data: PlantData
+    unit: Ellipses
+    unit_performance: Ellipses | None
+    used: npt.NDArray[np.bool_]
+    loop: Complex
+    integrators: int
+    unstable: int
+
+    @classmethod
+    def build(
+        cls,
+        controller: Controller,
+        plant: UncertainPlant,
+        specification: Specification,
+        omega_min_rad_s: float,
+    ) -> _Sampled:
+        poles = closed_loop_poles(controller, plant)
+        modes = (*plant.modes, *modes_of(poles, plant.dt_s), *modes_of(controller.poles, plant.dt_s))
+        light = [
+            Mode(m.omega_rad_s, max(abs(m.zeta), 1e-3)) for m in modes if m.omega_rad_s < plant.nyquist_rad_s
+        ]
+        grid = frequency_grid(
+            plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=500, n_mode=80 * len(light)
+        )
+        data = PlantData.build(plant, specification, grid)
+        used = data.w4 > 0
+        performance = None
+        if plant.performance is not None and np.any(used):
+            performance = _scaled(plant.performance.at(grid[used]), 1 / _radius(plant.performance.level))
+        integrators, unstable = loop_integrators(controller, plant)
+        return cls(
+            plant,
+            controller,
+            data,
+            _scaled(data.ellipses, 1 / _radius(plant.level)),
+            performance,
+            used,
+            controller.response(grid, with_delay=False),
+            integrators,
+            unstable,
+        )
+
+    def worst(self, radius: float) -> float:
+        """Largest weighted worst case over ellipses of a radius in standard deviations."""
+        gp_max = self.data.gp_max
+        if self.unit_performance is not None and gp_max is not None:
+            gp_max = gp_max.copy()
+            gp_max[self.used] = _scaled(self.unit_performance, radius).farthest()
+        data = replace(self.data, ellipses=_scaled(self.unit, radius), gp_max=gp_max)
+        return float(np.max(worst_of(data.weighted(self.loop))))
+
+    def gamma_of(self, members: Complex, performance: Complex | None) -> Real:
+        """Largest weighted value (D,) of responses (D, F) of the measured and (D, F') of the performance
+        channel."""
+        data = self.data
+        inverse = 1.0 / np.maximum(np.abs(1.0 + members * (self.loop * data.delay)), 1e-300)
+        weight = np.maximum(np.maximum(data.w1, data.modulus), data.w3 * np.abs(self.loop))
+        largest = np.max(weight * inverse, axis=1)
+        if np.any(self.used):
+            moved = members[:, self.used] if performance is None else performance
+            damping = np.max(data.w4[self.used] * np.abs(moved) * inverse[:, self.used], axis=1)
+            largest = np.maximum(largest, damping)
+        return np.asarray(largest, dtype=np.float64)
+
+    def distance_of(self, members: Complex) -> Real:
+        """Largest normalised distance (D,) from the centre."""
+        turned = (members - self.unit.centre) * np.conj(self.unit.direction)
+        major, minor = np.maximum(self.unit.semi_major, 1e-300), np.maximum(self.unit.semi_minor, 1e-300)
+        # An axis of zero length (a frequency where the response is real) says nothing by itself.
+        thin = self.unit.semi_minor <= 1e-6 * self.unit.semi_major
+        second = np.where(thin, 0.0, turned.imag / minor)
+        return np.asarray(np.max(np.hypot(turned.real / major, second), axis=1), dtype=np.float64)
+
+    def stable_of(self, responses: Responses, members: Complex) -> npt.NDArray[np.bool_]:
+        """Whether 1 + K G winds as it must, (D,); on a ten times finer grid where a step is wide."""
+        omega = self.unit.omega_rad_s
+        stable, wide = self._winds(members * (self.loop * self.data.delay))
+        if np.any(wide):
+            share = np.linspace(0, 1, 11)[:-1]
+            fine = np.append((omega[:-1, None] + np.diff(omega)[:, None] * share).ravel(), omega[-1])
+            loop = self.controller.response(fine)
+            again, _ = self._winds(responses(fine)[wide] * loop)
+            stable[wide] = again
+        return stable
+
+    def _winds(self, loop: Complex) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        return winds(loop, integrators=self.integrators, unstable_poles=self.unstable)
+
+
+def sampled_gamma(loop: _Sampled, rng: np.random.Generator, draws: int) -> SampledGamma:
+    """Draw whole responses and evaluate them, a chunk at a time."""
+    gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
+    omega = loop.unit.omega_rad_s
+    for start in range(0, draws, _CHUNK):
+        here = slice(start, min(start + _CHUNK, draws))
+        count = here.stop - here.start
+        responses = _responses(loop.plant.channel, rng, count)
+        members = responses(omega)
+        performance = None
+        if loop.plant.performance is not None and np.any(loop.used):
+            performance = _responses(loop.plant.performance, rng, count)(omega[loop.used])
+        stable[here] = loop.stable_of(responses, members)
+        gamma[here] = np.where(stable[here], loop.gamma_of(members, performance), np.inf)
+        distance[here] = loop.distance_of(members)
+    return SampledGamma(gamma, stable, distance)
+
+
+def unstable_draws(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    *,
+    rng: np.random.Generator,
+    draws: int,
+    most: int,
+    omega_min_rad_s: float = 1e-4,
+) -> tuple[int, list[Guard]]:
+    """How many of `draws` sampled responses (of every plant) are unstable, and up to `most` different ones
+    of each plant, as guards for another synthesis.
+
+    Raises
+    ------
+    ValueError
+        If an uncertainty cannot be drawn from.
+    """
+    unstable = np.zeros(draws, dtype=bool)
+    guards: list[Guard] = []
+    for number, plant in enumerate(plants):
+        _refuse_undrawable(plant.channel)
+        loop = _Sampled.build(controller, plant, specification, omega_min_rad_s)
+        grid, found = guard_grid(plant, omega_min_rad_s), list[Complex]()
+        for start in range(0, draws, _CHUNK):
+            here = slice(start, min(start + _CHUNK, draws))
+            responses = _responses(plant.channel, rng, here.stop - here.start)
+            bad = ~loop.stable_of(responses, responses(loop.unit.omega_rad_s))
+            unstable[here] |= bad
+            if np.any(bad):
+                found.append(responses(grid)[bad])
+        if found:
+            together = np.concatenate(found)
+            guards += [Guard(number, grid, together[at]) for at in different_responses(together, most)]
+    return int(np.count_nonzero(unstable)), guards
+
+
+def gamma_of_draws(
+    controller: Controller,
+    plant: UncertainPlant,
+    specification: Specification,
+    rng: np.random.Generator,
+    draws: int,
+    *,
+    omega_min_rad_s: float = 1e-4,
+) -> SampledGamma:
+    """gamma(G), stability and distance of sampled responses of one plant (a Monte Carlo check)."""
+    return sampled_gamma(_Sampled.build(controller, plant, specification, omega_min_rad_s), rng, draws)
+
+
+def _refuse_undrawable(channel: Channel | None) -> None:
+    uncertainty: Any = None if channel is None else channel.uncertainty
+    known = (ResponsePosterior, ResponseDraws, FirstOrderUncertainty)
+    if uncertainty is not None and not isinstance(uncertainty, known):
+        raise ValueError(
+            "joint coverage needs draws of whole responses: the uncertainty must be a ResponsePosterior or "
+            f"have a method draw(rng, draws); got {type(uncertainty).__name__}"
+        )
+
+
+def _responses(channel: Channel, rng: np.random.Generator, draws: int) -> Responses:
+    uncertainty: Any = channel.uncertainty
+    if isinstance(uncertainty, ResponsePosterior):
+        posterior, drawn = uncertainty, uncertainty.sample(rng, draws)
+        return lambda omega: posterior.response_of(drawn, omega)
+    if isinstance(uncertainty, ResponseDraws):
+        return uncertainty.draw(rng, draws)
+    if isinstance(uncertainty, FirstOrderUncertainty):
+        return linear_responses(uncertainty, channel.dt_s, rng, draws)
+    return lambda omega: np.broadcast_to(channel.nominal_response(omega), (draws, omega.size))
+
+
+def linear_responses(
+    uncertainty: FirstOrderUncertainty, dt_s: float, rng: np.random.Generator, draws: int
+) -> Responses:
+    """Gaussian draws on the generators of an uncertainty: the linear model whose ellipses they are."""
+    kept: list[Real] = []
+
+    def at(omega: Real) -> Complex:
+        centre, generators = uncertainty.first_order(Intervals(omega, np.zeros(omega.size), dt_s), 0)
+        if not kept:
+            kept.append(rng.standard_normal((draws, generators.value.shape[1])))
+        return np.asarray(centre.value + kept[0] @ generators.value.T, dtype=np.complex128)
+
+    return at
+
+
+def _scaled(ellipses: Ellipses, factor: float) -> Ellipses:
+    return Ellipses(
+        ellipses.omega_rad_s,
+        ellipses.centre,
+        factor * ellipses.semi_major,
+        factor * ellipses.semi_minor,
+        ellipses.direction,
+    )
+
+
+def _radius(level: float) -> float:
+    return float(np.sqrt(-2.0 * np.log1p(-level)))
+
+
+def _level(radius: float) -> float:
+    return float(min(-np.expm1(-0.5 * radius**2), 1 - 1e-15))

@@ -1,0 +1,123 @@
+"""Nominal stability two ways: closed-loop poles of the full state space, and the Nyquist count of the
+uncertainty centre."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.plant_set import UncertainPlant, count_integrators
+
+
+def closed_loop_matrix(controller: Controller, plant: UncertainPlant) -> Real:
+    """State matrix of the feedback of plant and controller, delay states included.
+
+    Raises
+    ------
+    ValueError
+        If the loop is algebraic (1 + D_K D_G = 0) or the sampling times differ.
+    """
+    if not np.isclose(controller.dt_s, plant.dt_s, rtol=1e-9, atol=0):
+        raise ValueError(
+            f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}"
+        )
+    k = controller.to_control(include_delay=True)
+    g = plant.nominal
+    ak, bk, ck, dk = (np.asarray(getattr(k, m), dtype=np.float64) for m in "ABCD")
+    a, b, c, d = (np.asarray(getattr(g, m), dtype=np.float64) for m in "ABCD")
+    loop = 1.0 + float(dk[0, 0] * d[0, 0])
+    if abs(loop) < 1e-12:
+        raise ValueError(f"plant {plant.name!r}: algebraic loop, 1 + D_K D_G = 0")
+    # u = (ck xk - dk c x)/loop, e = -(c x + d u)
+    u_x, u_k = -dk @ c / loop, ck / loop
+    e_x, e_k = -(c + d @ u_x), -(d @ u_k)
+    return np.block([[a + b @ u_x, b @ u_k], [bk @ e_x, ak + bk @ e_k]])
+
+
+def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
+    """Eigenvalues of `closed_loop_matrix`, (n,)."""
+    return np.asarray(np.linalg.eigvals(closed_loop_matrix(controller, plant)), dtype=np.complex128)
+
+
+@dataclass(frozen=True)
+class NyquistCount:
+    """Half turns of 1 + L from zero frequency to Nyquist.
+
+    half_turns: phase change / pi, counted anticlockwise. required: unstable poles + integrators/2 for a
+    stable loop. largest_step_rad: largest phase step between neighbouring points (below pi/2 the count is
+    trustworthy). matches: they agree.
+    """
+
+    half_turns: float
+    required: float
+    largest_step_rad: float
+    points: int
+    matches: bool
+
+
+def nyquist_count(
+    loop_gain: Callable[[Real], Complex],
+    start: Real,
+    *,
+    integrators: int,
+    unstable_poles: int,
+    refinable: bool = True,
+) -> NyquistCount:
+    """Count the half turns of F = 1 + L on the upper half of the circle.
+
+    F has as many zeros as poles (L is proper and F(infinity) is not 0). With the contour indented outside z =
+    1 the i integrators lie inside, so a stable loop turns by 2 pi P over the whole contour, P the unstable
+    poles of L; by symmetry pi P over the upper half, of which the quarter of the indentation takes -i pi/2.
+    Hence arg F(pi/dt) - arg F(0+) = pi P + i pi/2, where arg F(0+) = -i pi/2 (mod pi). With i = 0, 1, 2 and P
+    = 0 the phase therefore starts at 0, -pi/2, -pi and ends at 0.
+
+    start (F,): first grid, ascending, ending at Nyquist. If refinable, points are added until every phase
+    step is below pi/8 and the lowest frequency is lowered until F is within 0.1 rad of its limit direction
+    there.
+    """
+    omega = np.asarray(start, dtype=np.float64)
+    value = 1.0 + loop_gain(omega)
+    if refinable:
+        for _ in range(8):
+            off_axis = np.angle(value[0] * 1j**integrators)
+            if abs(np.sin(off_axis)) < 0.1:
+                break
+            lower = np.geomspace(omega[0] / 10.0, omega[0], 21)[:-1]
+            omega = np.concatenate([lower, omega])
+            value = np.concatenate([1.0 + loop_gain(lower), value])
+        for _ in range(30):
+            wide = np.flatnonzero(np.abs(np.angle(value[1:] / _nonzero(value[:-1]))) > np.pi / 8)
+            wide = wide[(omega[wide + 1] - omega[wide]) > 1e-12 * omega[wide + 1]]
+            if wide.size == 0 or omega.size > 200_000:
+                break
+            middle = 0.5 * (omega[wide] + omega[wide + 1])
+            omega = np.insert(omega, wide + 1, middle)
+            value = np.insert(value, wide + 1, 1.0 + loop_gain(middle))
+    steps = np.angle(value[1:] / _nonzero(value[:-1]))
+    turns = float(np.sum(steps) / np.pi)
+    # The remainders to the limit directions at both ends, known up to half turns, close the count to a
+    # multiple of 1/2.
+    first = np.angle(value[0] * 1j**integrators)
+    turns += (first - np.pi * np.round(first / np.pi)) / np.pi
+    last = np.angle(value[-1])
+    turns -= (last - np.pi * np.round(last / np.pi)) / np.pi
+    required = unstable_poles + integrators / 2.0
+    largest = float(np.max(np.abs(steps))) if steps.size else np.pi
+    matches = bool(abs(turns - required) < 0.25 and largest < np.pi / 2 and np.all(np.isfinite(value)))
+    return NyquistCount(turns, required, largest, int(omega.size), matches)
+
+
+def loop_integrators(controller: Controller, plant: UncertainPlant) -> tuple[int, int]:
+    """(integrators, unstable poles) of the loop gain L = G K."""
+    poles = controller.poles
+    own = count_integrators(poles)
+    others = poles[np.argsort(np.abs(poles - 1.0), kind="stable")][own:]
+    return plant.n_integrators + own, plant.unstable_poles + int(np.sum(np.abs(others) >= 1.0))
+
+
+def _nonzero(value: Complex) -> Complex:
+    return np.where(value == 0, 1e-300, value)

@@ -1,0 +1,1 @@
+"""Controllers: second-order sections, state space, export to C."""

@@ -1,0 +1,1 @@
+"""Convex problems beside the synthesis: bound over all stabilising controllers (Youla), reference filter."""

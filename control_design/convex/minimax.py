@@ -1,0 +1,307 @@
+"""Smallest worst ratio of a convex over a concave function, many rows at once: the convex core of bound and
+prefilter.
+
+Every row looks at one complex number y_k = sum_i basis_ki x_i, taken as a vector of the plane, and asks
+    |A y + a| <= gamma (e + E y - |C y + c|).
+For fixed gamma that is convex in x, so the smallest feasible gamma has no local minima. Dinkelbach's
+iteration solves it: gamma_j = worst ratio at x_j, then x_{j+1} minimises the largest (|A y + a| - gamma_j
+m(y))/m(y_j), a convex programme, by an interior point. gamma falls in every step, superlinearly near the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+
+from control_design.plants.ellipses import Complex, Real
+
+# Radii of the rounding of |.| at its kink. An active numerator is as large as gamma m, of which the rounding
+# is a thousandth: it changes the row by 5e-7. Sharper kinks of inactive rows only slow Newton down.
+_ROUND_NUMERATOR = 1e-3
+_ROUND_REACH = 1e-4
+_ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
+_GAP = 1e-5  # relative accuracy of gamma
+_MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
+_KEPT = 1e-10  # singular values of the scaled basis below this fraction are no directions of the search
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneRows:
+    """R rows on F plane vectors: at (R,) position k of each row; A (R, 2, 2), a (R, 2) numerator; e (R,),
+    E (R, 2), C (R, 2, 2), c (R, 2) denominator."""
+
+    at: npt.NDArray[np.int64]
+    A: Real
+    a: Real
+    e: Real
+    E: Real
+    C: Real
+    c: Real
+
+    def stacked(self, other: PlaneRows) -> PlaneRows:
+        """Both sets of rows."""
+        return PlaneRows(
+            *(
+                np.concatenate([getattr(self, name), getattr(other, name)])
+                for name in ("at", "A", "a", "e", "E", "C", "c")
+            )
+        )
+
+    def numerator(self, y: Real) -> Real:
+        """|A y + a| for y (F, 2): (R,)."""
+        vector = np.einsum("rij,rj->ri", self.A, y[self.at]) + self.a
+        return np.asarray(np.hypot(vector[:, 0], vector[:, 1]))
+
+    def denominator(self, y: Real) -> Real:
+        """e + E y - |C y + c| for y (F, 2): (R,)."""
+        vector = np.einsum("rij,rj->ri", self.C, y[self.at]) + self.c
+        return np.asarray(
+            self.e + np.einsum("rj,rj->r", self.E, y[self.at]) - np.hypot(vector[:, 0], vector[:, 1])
+        )
+
+
+def turning(factor: Complex) -> Real:
+    """Multiplication by complex factors (R,) as matrices (R, 2, 2) on (real, imaginary)."""
+    return np.stack(
+        [np.stack([factor.real, -factor.imag], -1), np.stack([factor.imag, factor.real], -1)], axis=-2
+    )
+
+
+def plane(value: Complex) -> Real:
+    """(R,) complex as (R, 2) real."""
+    return np.stack([value.real, value.imag], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class MinimaxPoint:
+    """x (n,) of the original basis, gamma = largest ratio there, y (F,) complex; steps: Newton steps spent.
+
+    gamma is infinite if no x was found for which every denominator is positive.
+    """
+
+    x: Real
+    gamma: float
+    y: Complex
+    steps: int
+
+
+def smallest_ratio(
+    basis: Complex, rows: PlaneRows, start: Real | None = None, *, most_rounds: int = 30
+) -> MinimaxPoint:
+    """Minimise the largest numerator/denominator over real x (n,).
+
+    basis (F, n): y = basis x. start: x (n,) to begin from, None = the least-squares solution of the
+    numerators, shortened until the denominators are positive; where that fails, the denominators are made
+    positive first.
+    """
+    step = _Scaled(basis, rows)
+    z = step.least_squares() if start is None else step.coordinates(start)
+    if start is None:
+        for _ in range(30):
+            if np.min(rows.denominator(step.y(z))) > 0.05:
+                break
+            z = 0.7 * z
+    spent = 0
+    if not np.min(rows.denominator(step.y(z))) > 0:
+        z, spent = step.lower(z, 0.0, np.ones(rows.at.size), stop_below=-1e-3, feasibility=True)
+        if not np.min(rows.denominator(step.y(z))) > 0:
+            y = step.y(z)
+            return MinimaxPoint(step.original(z), float("inf"), y[:, 0] + 1j * y[:, 1], spent)
+    gamma = step.ratio(z)
+    for _ in range(most_rounds):
+        scale = rows.denominator(step.y(z))
+        new, used = step.lower(z, gamma, scale)
+        spent += used
+        reached = step.ratio(new)
+        if not reached < gamma:
+            break
+        gain, z, gamma = gamma - reached, new, reached
+        if gain < _GAP * gamma or step.constant:
+            break
+    y = step.y(z)
+    return MinimaxPoint(step.original(z), gamma, y[:, 0] + 1j * y[:, 1], spent)
+
+
+class _Scaled:
+    """The rows in coordinates z of the basis that are orthonormal as seen by the rows."""
+
+    def __init__(self, basis: Complex, rows: PlaneRows) -> None:
+        self.rows = rows
+        planar = np.stack([basis.real, basis.imag], axis=1)  # (F, 2, n)
+        seen = np.concatenate(
+            [np.matmul(matrix, planar[rows.at]).reshape(-1, basis.shape[1]) for matrix in (rows.A, rows.C)]
+        )
+        _, sizes, directions = np.linalg.svd(np.linalg.qr(seen, mode="r"))
+        keep = sizes > _KEPT * sizes[0]
+        self._map = directions[keep].T / sizes[keep] * np.sqrt(rows.at.size)
+        self._back = (directions[keep] * sizes[keep][:, None]) / np.sqrt(rows.at.size)
+        self._planar = planar @ self._map  # (F, 2, m)
+        by_row = self._planar[rows.at]  # (R, 2, m)
+        self._numerators = np.matmul(rows.A, by_row)
+        self._reaches = np.matmul(rows.C, by_row)
+        self._levels = np.einsum("rj,rjm->rm", rows.E, by_row)
+        self.constant = not (np.any(rows.C) or np.any(rows.E))
+        self._reach_rounding = _ROUND_REACH
+        self._fixed_reach = np.hypot(rows.c[:, 0], rows.c[:, 1])
+
+    def coordinates(self, x: Real) -> Real:
+        return np.asarray(self._back @ x)
+
+    def original(self, z: Real) -> Real:
+        return np.asarray(self._map @ z)
+
+    def y(self, z: Real) -> Real:
+        return np.asarray(self._planar @ z)
+
+    def least_squares(self) -> Real:
+        seen = self._numerators.reshape(-1, self._numerators.shape[2])
+        return np.asarray(np.linalg.lstsq(seen, -self.rows.a.reshape(-1), rcond=None)[0])
+
+    def ratio(self, z: Real) -> float:
+        y = self.y(z)
+        below = self.rows.denominator(y)
+        return float(np.max(self.rows.numerator(y) / below)) if np.min(below) > 0 else float("inf")
+
+    def lower(
+        self, z: Real, gamma: float, scale: Real, *, stop_below: float = -np.inf, feasibility: bool = False
+    ) -> tuple[Real, int]:
+        """Minimise max h, h = (|A y + a| - gamma m(y))/scale; for feasibility h = -m(y).
+
+        Primal-dual interior point for min v, h - v + slack = 0, with predictor and corrector. The slacks are
+        variables of their own: with h < v kept throughout, one early row at its boundary stopped all others.
+        Ends when the gap is below a twentieth of what was gained (the next round begins from there anyway) or
+        at full accuracy.
+        """
+        weight = 0.0 if feasibility else 1.0
+        factor = 1.0 if feasibility else gamma
+        self._reach_rounding = _ROUND_FEASIBILITY if feasibility else _ROUND_REACH
+        n = z.size
+        h = self._values(z, weight, factor, scale)
+        begin = float(np.max(h))
+        v = begin + 0.1 * factor
+        slack = v - h
+        dual = 1.0 / slack
+        dual /= np.sum(dual)
+        best, best_value, spent = z, begin, 0
+        final = feasibility or self.constant
+        while spent < _MOST_STEPS:
+            spent += 1
+            by_row, hessian = self._derivatives(z, weight, factor, scale, dual)
+            miss = h - v + slack
+            ratio = dual / slack
+            weighted = by_row * ratio[:, None]
+            matrix = np.empty((n + 1, n + 1))
+            matrix[:n, :n] = hessian + by_row.T @ weighted
+            matrix[:n, n] = matrix[n, :n] = -np.sum(weighted, axis=0)
+            matrix[n, n] = np.sum(ratio)
+            matrix[np.diag_indices(n + 1)] *= 1.0 + 1e-13
+            factored = scipy.linalg.lu_factor(matrix, check_finite=False)
+            gap = float(np.mean(dual * slack))
+            target: Real | float = 0.0
+            for corrector in (False, True):
+                pull = target / slack + ratio * miss
+                right = np.append(by_row.T @ pull, 1.0 - np.sum(pull))
+                step = -scipy.linalg.lu_solve(factored, right, check_finite=False)
+                change = by_row @ step[:n] - step[n]
+                slack_step = -miss - change
+                dual_step = pull - dual + ratio * change
+                primal_length = _to_boundary(slack, slack_step)
+                dual_length = _to_boundary(dual, dual_step)
+                if not corrector:
+                    ahead = slack + min(1.0, primal_length) * slack_step
+                    reached = float(np.mean(ahead * (dual + min(1.0, dual_length) * dual_step)))
+                    share = min(1.0, max(reached / gap, 0.0)) ** 3
+                    target = max(share, 1e-3) * gap - slack_step * dual_step
+            if not np.all(np.isfinite(step)):
+                break  # the system has become singular to working precision: the best point stands
+            length = min(1.0, 0.99 * min(primal_length, dual_length))
+            # Rows are convex: what they lie above their linearisation after the step is its error. Far from
+            # the kinks the model is nearly flat and steps would run away.
+            allowed, rise = float(np.max(slack)), by_row @ step[:n]
+            h_new = self._values(z + length * step[:n], weight, factor, scale)
+            while np.max(h_new - h - length * rise) > allowed and length > 1e-8:
+                length *= 0.5
+                h_new = self._values(z + length * step[:n], weight, factor, scale)
+            z, v = z + length * step[:n], v + length * float(step[n])
+            slack, dual = slack + length * slack_step, dual + length * dual_step
+            h = h_new
+            largest = float(np.max(h))
+            if largest < best_value:
+                best, best_value = z, largest
+            gained = max(begin - best_value, 0.0)
+            enough = 0.3 * _GAP * factor if final else max(0.05 * gained, 0.1 * _GAP * factor)
+            if best_value < stop_below or (
+                float(dual @ slack) < enough
+                and largest - best_value < enough
+                and np.max(h - v + slack) < enough
+            ):
+                break
+        return best, spent
+
+    def _parts(self, z: Real, rounding: Real) -> tuple[Real, Real, Real, Real, Real]:
+        """Vectors A y + a and C y + c, their rounded sizes, and e + E y."""
+        r = self.rows
+        p = self._numerators @ z + r.a
+        size_p = np.sqrt(p[:, 0] ** 2 + p[:, 1] ** 2 + rounding**2)
+        if self.constant:
+            return p, p, size_p, self._fixed_reach, r.e
+        q = self._reaches @ z + r.c
+        return (
+            p,
+            q,
+            size_p,
+            np.sqrt(q[:, 0] ** 2 + q[:, 1] ** 2 + self._reach_rounding**2),
+            r.e + self._levels @ z,
+        )
+
+    def _values(self, z: Real, weight: float, gamma: float, scale: Real) -> Real:
+        _, _, size_p, size_q, level = self._parts(z, _ROUND_NUMERATOR * gamma * scale)
+        return np.asarray((weight * size_p - gamma * (level - size_q)) / scale)
+
+    def _derivatives(
+        self, z: Real, weight: float, gamma: float, scale: Real, dual: Real
+    ) -> tuple[Real, Real]:
+        """Gradient of h by row (R, m), and sum of dual times the Hessians of h (m, m).
+
+        The Hessian of sqrt(|p|^2 + r^2) is (w w^T + (r/size)^2 u u^T)/size, u along p and w across it.
+        """
+        rounding = _ROUND_NUMERATOR * gamma * scale
+        p, q, size_p, size_q, _ = self._parts(z, rounding)
+        share = dual / scale
+        gradient, hessian = _norm_derivatives(self._numerators, p, size_p, rounding, weight * share)
+        gradient *= (weight / scale)[:, None]
+        if not self.constant:
+            reach, curved = _norm_derivatives(
+                self._reaches,
+                q,
+                size_q,
+                np.full(size_q.size, self._reach_rounding),
+                gamma * share,
+            )
+            gradient += (gamma / scale)[:, None] * (reach - self._levels)
+            hessian += curved
+        return gradient, hessian
+
+
+def _to_boundary(value: Real, step: Real) -> float:
+    """Largest length of the step for which all values stay positive, at most a long way."""
+    falling = step < 0
+    return float(np.min(-value[falling] / step[falling], initial=1e3))
+
+
+def _norm_derivatives(
+    forms: Real, vector: Real, size: Real, rounding: Real, weight: Real
+) -> tuple[Real, Real]:
+    """Gradient (R, m) of the rounded norms of vector = forms z, and sum of weight times their Hessians (m,
+    m)."""
+    length = np.hypot(vector[:, 0], vector[:, 1])
+    u = np.where(length[:, None] > 0, vector, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
+    along = u[:, 0, None] * forms[:, 0] + u[:, 1, None] * forms[:, 1]
+    gradient = along * (length / size)[:, None]
+    across = u[:, 0, None] * forms[:, 1] - u[:, 1, None] * forms[:, 0]
+    hessian = (across * (weight / size)[:, None]).T @ across
+    hessian += (along * (weight * (rounding / size) ** 2 / size)[:, None]).T @ along
+    return gradient, hessian

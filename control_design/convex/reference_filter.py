@@ -1,0 +1,440 @@
+"""Second degree of freedom: u = K (F r - y), F chosen so that every member of the ellipses follows a model.
+
+The error of a member G is W (F T - T_ref), T = G K/(1 + G K), affine in F: with chosen poles the coefficients
+that make its worst case smallest are a convex minimax. T maps each ellipse (free of poles by robust
+stability) to a region whose worst point lies on the boundary, so boundary samples suffice for the design; the
+certified error is exact at every frequency of a dense grid: |a G + b| <= h |1 + k G| is a disc or the outside
+of one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import scipy.io
+import scipy.optimize
+import scipy.signal
+from pydantic import BaseModel, ConfigDict, Field
+
+from control_design.analysis.stability import closed_loop_poles
+from control_design.controllers.biquads import imaginary_axis
+from control_design.controllers.controller import Controller
+from control_design.convex.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
+from control_design.convex.orthonormal_basis import basis_response, basis_state_space
+from control_design.plants.ellipses import (
+    Complex,
+    Ellipses,
+    Real,
+    distance_to_minus_one,
+    farthest_distance,
+    nearest_distance,
+    readonly_real,
+)
+from control_design.plants.frequency_grid import frequency_grid, local_maxima, plant_grid
+from control_design.plants.plant_set import UncertainPlant, frequency_response
+from control_design.plants.weights import RationalWeight
+
+_FORMAT = "flexlink-prefilter-1"
+_ACCURACY = 1e-7  # of the certified errors, which are rounded up
+
+
+class PrefilterOptions(BaseModel):
+    """Order of the prefilter and how finely it is designed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    order: int = Field(
+        default=1, ge=0, le=12, description="real poles, searched; unused if poles_rad_s is given"
+    )
+    poles_rad_s: tuple[float, ...] | None = Field(
+        default=None, description="decay rates of the real poles, rad/s; none = searched"
+    )
+    unit_gain: bool = Field(
+        default=True, description="F(1) = 1: what the loop does with constant references stays as it is"
+    )
+    boundary_samples: int = Field(default=24, ge=8, le=500, description="samples of every ellipse's boundary")
+    grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
+    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
+    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
+    exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")
+
+
+@dataclass(frozen=True, eq=False)
+class Prefilter:
+    """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable.
+
+    A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. error_before, error_after: largest weighted
+    model-matching error over all plants and their ellipses with F = 1 and with F, exact at every frequency of
+    the dense grid; worst_rad_s: where the second occurs.
+    """
+
+    A: Real
+    B: Real
+    C: Real
+    D: Real
+    dt_s: float
+    error_before: float
+    error_after: float
+    worst_rad_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("A", "B", "C", "D"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        n = self.A.shape[0]
+        shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
+        if shapes != {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}:
+            raise ValueError(f"prefilter needs A (n, n), B (n, 1), C (1, n), D (1, 1); got {shapes}")
+        for name in ("A", "B", "C", "D"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise ValueError(f"prefilter matrix {name} has a value that is not finite")
+        if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
+            raise ValueError(f"dt_s must be positive; got {self.dt_s}")
+        if n and not np.max(np.abs(np.linalg.eigvals(self.A))) < 1:
+            raise ValueError("the prefilter is not stable")
+        for name in ("error_before", "error_after", "worst_rad_s"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"prefilter {name} must not be negative; got {getattr(self, name)}")
+
+    @property
+    def order(self) -> int:
+        return int(self.A.shape[0])
+
+    def to_control(self) -> control.StateSpace:
+        """As `control.StateSpace`."""
+        return control.ss(np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D), self.dt_s)
+
+    def response(self, omega_rad_s: Real) -> Complex:
+        """F(e^{j omega dt}), (F,)."""
+        return frequency_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
+
+    def filtered(self, reference: Real) -> Real:
+        """The reference (T,) behind the prefilter, from rest: what `closed_loop.simulate` takes as
+        reference."""
+        reference = np.asarray(reference, dtype=np.float64)
+        if reference.ndim != 1:
+            raise ValueError(f"reference must be (T,); got {reference.shape}")
+        state, out = np.zeros(self.order), np.empty(reference.size)
+        b, c, d = self.B[:, 0], self.C[0], float(self.D[0, 0])
+        for index, value in enumerate(reference):
+            out[index] = c @ state + d * value
+            state = self.A @ state + b * value
+        return out
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` restores it exactly."""
+        matrices = {name: getattr(self, name).tolist() for name in ("A", "B", "C", "D")}
+        numbers = {n: getattr(self, n) for n in ("dt_s", "error_before", "error_after", "worst_rad_s")}
+        return {
+            "format": _FORMAT,
+            "law": "x+ = A x + B r; filtered reference = C x + D r",
+            **matrices,
+            **numbers,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Prefilter:
+        """Inverse of `to_dict`; ValueError naming the missing key."""
+        if data.get("format") != _FORMAT:
+            raise ValueError(f"not a prefilter file: format is {data.get('format')!r}, expected {_FORMAT!r}")
+        try:
+            n = np.array(data["C"], dtype=float).size
+            return cls(
+                np.array(data["A"], dtype=float).reshape(n, n),
+                np.array(data["B"], dtype=float).reshape(n, 1),
+                np.array(data["C"], dtype=float).reshape(1, n),
+                np.array(data["D"], dtype=float).reshape(1, 1),
+                float(data["dt_s"]),
+                float(data["error_before"]),
+                float(data["error_after"]),
+                float(data["worst_rad_s"]),
+            )
+        except KeyError as error:
+            raise ValueError(f"prefilter file lacks the key {error.args[0]!r}") from error
+
+    def to_json(self) -> str:
+        """Readable JSON text."""
+        return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Prefilter:
+        """Inverse of `to_json`; ValueError with one line on bad input."""
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"prefilter JSON: {error.msg} at line {error.lineno}") from error
+        if not isinstance(data, dict):
+            raise ValueError(f"prefilter JSON must be an object; got {type(data).__name__}")
+        return cls.from_dict(data)
+
+    def save_mat(self, path: str | PathLike[str]) -> None:
+        """MATLAB 5 file with A, B, C, D, dt_s and the certified errors."""
+        data = self.to_dict()
+        scipy.io.savemat(Path(path), {key: data[key] for key in data if key not in ("format", "law")})
+
+
+def worst_matching_error(
+    loop_gain: Complex, follow: Complex, model: Complex, ellipses: Ellipses, *, iterations: int = 60
+) -> Real:
+    """max over G in E of |F G k/(1 + G k) - T_ref| at every frequency, (F,); inf where a member puts the loop
+    on -1.
+
+    loop_gain k, follow F, model T_ref: (F,). Exact: with alpha = (F - T_ref) k and beta = -T_ref the error is
+    |alpha G + beta|/|1 + k G|; it is <= h on the disc |G - g0| <= r for |alpha| > h |k| and outside it
+    otherwise, g0 = (h^2 conj(k) - conj(alpha) beta)/A, r = h |alpha - k beta|/|A|, A = |alpha|^2 - h^2 |k|^2.
+    h by bisection between the centre's error and (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G|.
+    """
+    k = np.asarray(loop_gain, dtype=np.complex128)
+    alpha, beta = (follow - model) * k, -np.asarray(model)
+    e = ellipses
+    distance = distance_to_minus_one(k, e)
+    blocked = distance <= 0
+    safe = np.where(blocked, 1.0, distance)
+    low = np.abs(alpha * e.centre + beta) / np.maximum(np.abs(1.0 + k * e.centre), 1e-300)
+    reach = np.abs(alpha) * e.semi_major
+    high = np.maximum((np.abs(alpha * e.centre + beta) + reach) / safe, low) * (1 + 1e-12) + 1e-300
+    low = np.minimum(low, high)
+    for _ in range(iterations):
+        mid = 0.5 * (low + high)
+        a = np.abs(alpha) ** 2 - (mid * np.abs(k)) ** 2
+        tiny = 1e-13 * (np.abs(alpha) ** 2 + (mid * np.abs(k)) ** 2) + 1e-300
+        a = np.where(np.abs(a) < tiny, tiny, a)  # a half-plane is the limit of both cases
+        middle = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / a
+        radius = mid * np.abs(alpha - k * beta) / np.abs(a)
+        turned = (middle - e.centre) * np.conj(e.direction)
+        inside = np.where(
+            a > 0,
+            farthest_distance(turned, e.semi_major, e.semi_minor) <= radius,
+            nearest_distance(turned, e.semi_major, e.semi_minor) >= radius,
+        )
+        high, low = np.where(inside, mid, high), np.where(inside, low, mid)
+        if np.all(high - low <= _ACCURACY * high):
+            break
+    return np.asarray(np.where(blocked, np.inf, high))
+
+
+def design_prefilter(
+    controller: Controller,
+    plants: UncertainPlant | Sequence[UncertainPlant],
+    model: RationalWeight,
+    options: PrefilterOptions | None = None,
+    *,
+    weight: RationalWeight | None = None,
+) -> Prefilter:
+    """Prefilter with the smallest worst-case |W (F T - T_ref)| over all plants and their ellipses.
+
+    model: T_ref(s), weight: W(s) or None for 1, both on the circle at the Tustin frequency. Poles of F as in
+    the options; searched ones start spread around the model's and follow a simplex search on their
+    logarithms.
+
+    Raises
+    ------
+    ValueError
+        If an ellipse reaches -1 (no prefilter helps), sampling times differ, or a pole is not in (0,
+        Nyquist).
+    """
+    options = options or PrefilterOptions()
+    listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)
+    if not listed:
+        raise ValueError("no plant given: the prefilter needs at least one uncertain plant")
+    for plant in listed:
+        if not np.isclose(plant.dt_s, controller.dt_s, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}"
+            )
+    return _Matching(controller, listed, model, weight, options).solve()
+
+
+class _Matching:
+    """Grids and loops of one prefilter design."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        plants: tuple[UncertainPlant, ...],
+        model: RationalWeight,
+        weight: RationalWeight | None,
+        options: PrefilterOptions,
+    ) -> None:
+        self.controller, self.plants, self.options = controller, plants, options
+        self.model, self.weight, self.dt_s = model, weight, controller.dt_s
+        self.grids: list[Real] = []
+        self.dense: list[Ellipses] = []
+        for plant in plants:
+            grid = frequency_grid(
+                plant.nyquist_rad_s,
+                plant.modes,
+                omega_min_rad_s=options.omega_min_rad_s,
+                n_log=options.grid_points,
+                n_mode=options.mode_points,
+            )
+            dense = frequency_grid(
+                plant.nyquist_rad_s,
+                plant.modes,
+                omega_min_rad_s=options.omega_min_rad_s,
+                n_log=int(0.7 * options.dense_points),
+                n_mode=int(0.3 * options.dense_points),
+            )
+            self.grids.append(plant_grid(plant, grid))
+            # The check stands on frequencies of its own, not on the programme's.
+            self.dense.append(plant.at(plant_grid(plant, dense)))
+        for plant, ellipses in zip(plants, self.dense, strict=True):
+            if not np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1:
+                raise ValueError(f"plant {plant.name!r}: the nominal loop is unstable; no prefilter helps")
+            gap = distance_to_minus_one(self.controller.response(ellipses.omega_rad_s), ellipses)
+            if not np.all(gap > 0):
+                raise ValueError(
+                    f"plant {plant.name!r}: at {ellipses.omega_rad_s[np.argmin(gap)]:.4g} rad/s a member "
+                    "of the ellipse puts the loop on -1; a prefilter needs a robustly stable loop"
+                )
+
+    def solve(self) -> Prefilter:
+        poles = self._given_poles()
+        if poles is None:
+            poles = self._searched_poles()
+        _, before, _ = self._errors(np.zeros(0, complex), np.ones(1))
+        best: tuple[float, float, Real] | None = None
+        for _ in range(self.options.exchange_rounds + 1):
+            point = self._coefficients(poles, self.grids, self.options.boundary_samples)
+            full = self._full(poles, point.x)
+            errors, worst, where = self._errors(poles, full)
+            if best is None or worst < best[0]:
+                best = worst, where, full
+            limit = point.gamma * (1 + 5e-4)
+            if worst <= limit:
+                break
+            for number, (ellipses, error) in enumerate(zip(self.dense, errors, strict=True)):
+                index = [i for i in local_maxima(error) if error[i] > limit][:12]
+                self.grids[number] = np.union1d(self.grids[number], ellipses.omega_rad_s[index])
+        assert best is not None
+        worst, where, full = best
+        a, b = basis_state_space(poles)
+        return Prefilter(a, b, full[None, 1:], np.array([[full[0]]]), self.dt_s, before, worst, where)
+
+    def _given_poles(self) -> Complex | None:
+        rates = self.options.poles_rad_s
+        if rates is None:
+            return np.zeros(0, complex) if self.options.order == 0 else None
+        if not all(0 < rate < np.pi / self.dt_s for rate in rates):
+            raise ValueError(
+                f"poles_rad_s must lie between 0 and the Nyquist frequency {np.pi / self.dt_s:.4g}; "
+                f"got {rates}"
+            )
+        return np.exp(-self.dt_s * np.array(rates)).astype(complex)
+
+    def _searched_poles(self) -> Complex:
+        """Simplex search of the logarithmic decay rates on thinned grids, half the samples."""
+        thin = [grid[::3] for grid in self.grids]
+        samples = max(8, self.options.boundary_samples // 2)
+        nyquist = np.pi / self.dt_s
+        low, high = np.log(1e-5 * nyquist), np.log(0.95 * nyquist)
+
+        def cost(logs: Real) -> float:
+            outside = float(np.sum(np.maximum(low - logs, 0) + np.maximum(logs - high, 0)))
+            poles = np.exp(-self.dt_s * np.exp(np.clip(np.sort(logs), low, high))).astype(complex)
+            return self._coefficients(poles, thin, samples).gamma + outside
+
+        corner = self._model_corner()
+        spread = np.log(corner) + np.log(4.0) * (np.arange(self.options.order) - (self.options.order - 1) / 2)
+        best: tuple[float, Real] | None = None
+        for shift in np.log([0.3, 1.0, 4.0]):
+            start = np.clip(spread + shift, low + 0.1, high - 0.1)
+            answer = scipy.optimize.minimize(
+                cost,
+                start,
+                method="Nelder-Mead",
+                options={"maxfev": 30 * self.options.order, "xatol": 1e-2, "fatol": 1e-4},
+            )
+            if best is None or float(answer.fun) < best[0]:
+                best = float(answer.fun), np.clip(np.sort(answer.x), low, high)
+        assert best is not None
+        return np.exp(-self.dt_s * np.exp(best[1])).astype(complex)
+
+    def _model_corner(self) -> float:
+        """Frequency where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency."""
+        omega = self.grids[0]
+        size = np.abs(self._model_at(omega))
+        below = np.flatnonzero(size < size[0] / np.sqrt(2))
+        return float(omega[below[0]] if below.size else 0.1 * omega[-1])
+
+    def _model_at(self, omega: Real) -> Complex:
+        return self.model.at(imaginary_axis(omega, self.dt_s))
+
+    def _weight_at(self, omega: Real) -> Complex:
+        if self.weight is None:
+            return np.ones(omega.size, complex)
+        return self.weight.at(imaginary_axis(omega, self.dt_s))
+
+    def _basis(self, poles: Complex, omega: Real) -> Complex:
+        return basis_response(poles, omega, self.dt_s)
+
+    def _at_zero(self, poles: Complex) -> Real:
+        """Values of all basis functions at z = 1."""
+        return np.asarray(np.real(basis_response(poles, np.zeros(1), self.dt_s)[0]))
+
+    def _coefficients(self, poles: Complex, grids: Sequence[Real], samples: int) -> MinimaxPoint:
+        """Best free coefficients; with unit gain F = 1 + sum c_i (L_i - L_i(1)), else all of them."""
+        angle = 2 * np.pi * np.arange(samples) / samples
+        parts, bases, count = [], [], 0
+        for plant, omega in zip(self.plants, grids, strict=True):
+            ellipses = plant.at(omega)
+            k = self.controller.response(omega)
+            loop = ellipses.points(np.cos(angle)[:, None], np.sin(angle)[:, None]) * k
+            tracking = loop / (1 + loop)
+            w, target = self._weight_at(omega), self._model_at(omega)
+            basis = self._basis(poles, omega)
+            offset = np.zeros_like(tracking)
+            if self.options.unit_gain:
+                offset, basis = tracking, basis[:, 1:] - self._at_zero(poles)[1:]
+            at = np.tile(np.arange(omega.size) + count, samples)
+            size, zero = at.size, np.zeros((at.size, 2))
+            parts.append(
+                PlaneRows(
+                    at,
+                    turning((w * tracking).ravel()),
+                    plane((w * (offset - target)).ravel()),
+                    np.ones(size),
+                    zero,
+                    np.zeros((size, 2, 2)),
+                    zero,
+                )
+            )
+            bases.append(basis)
+            count += omega.size
+        rows = parts[0]
+        for part in parts[1:]:
+            rows = rows.stacked(part)
+        whole = np.concatenate(bases)
+        if whole.shape[1] == 0:
+            nothing = np.zeros(whole.shape[0], complex)
+            return MinimaxPoint(np.zeros(0), float(np.max(rows.numerator(plane(nothing)))), nothing, 0)
+        return smallest_ratio(whole, rows)
+
+    def _full(self, poles: Complex, x: Real) -> Real:
+        """Coefficients of the constant and all functions."""
+        if not self.options.unit_gain:
+            return x
+        return np.concatenate([[1.0 - float(x @ self._at_zero(poles)[1:])], x])
+
+    def _errors(self, poles: Complex, full: Real) -> tuple[list[Real], float, float]:
+        """Exact weighted errors of F on the dense grids; the largest and its frequency."""
+        errors, worst, where = [], -1.0, 0.0
+        for ellipses in self.dense:
+            omega = ellipses.omega_rad_s
+            error = np.abs(self._weight_at(omega)) * worst_matching_error(
+                self.controller.response(omega),
+                self._basis(poles, omega) @ full,
+                self._model_at(omega),
+                ellipses,
+            )
+            errors.append(error)
+            if np.max(error) > worst:
+                worst, where = float(np.max(error)), float(omega[np.argmax(error)])
+        return errors, worst, where

@@ -1,0 +1,434 @@
+"""What any controller could reach: bounds on the worst case over the ellipses that know no order.
+
+Every controller that stabilises the nominal plant is K = (X + M Q)/(Y - N Q) with Q stable, and K S, S are
+affine in Q. For a member G = G_0 + D of the ellipse, S_G = S/(1 + D K S) and K S_G = K S/(1 + D K S), so with
+q = K S of the centre the worst case is at most gamma where
+
+    |W1 S| <= gamma m,  |W3 q| <= gamma m,  m = smallest |1 + D q| over the ellipse.
+
+For a disc of radius r, m = 1 - r |q| and the problem is convex: the disc inscribed in the ellipse gives a
+value that no controller goes below, the enclosing one a value some controller reaches. For the ellipse itself
+m = max over t of Re(e^{-jt}) - |half-axes of e^{-jt} q|: convex in Q for fixed t. From the enclosing disc's
+answer, t and Q in turn lead down to a local optimum, which is a controller's value again. All three minimise
+over the same basis, so inscribed <= ellipse <= enclosing; a larger basis lowers all three a little (0.1 % on
+the example link from 57 to 91 functions): that is how far the lower bound of a finite basis can be trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import control
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.convex.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
+from control_design.convex.orthonormal_basis import basis_response
+from control_design.convex.youla_basis import (
+    AffineLoop,
+    Factors,
+    chosen_poles,
+    coprime_factors,
+    stable_loop,
+)
+from control_design.convex.youla_hull import hull_bound
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.frequency_grid import local_maxima
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
+from control_design.synthesis.problem import Problem
+from control_design.synthesis.synthesis_options import SynthesisOptions
+
+Region = Literal["inscribed", "ellipse", "enclosing"]
+
+
+class YoulaOptions(BaseModel):
+    """How fine the basis and the grids are; the defaults take about two seconds a plant."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
+    pairs_per_mode: int = Field(
+        default=12, ge=1, le=50, description="pole pairs of the basis at every mode and light zero"
+    )
+    grid_points: int = Field(default=200, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(
+        default=100, ge=0, le=1000, description="points spread around the flexible modes"
+    )
+    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
+    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
+    exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
+    hull: bool = Field(
+        default=False,
+        description="also bound from below by hulls of what every frequency allows; some seconds",
+    )
+    ellipse_rounds: int = Field(default=20, ge=1, le=100, description="turns of angles and Q for the ellipse")
+
+
+@dataclass(frozen=True)
+class PlantBracket:
+    """Values for one plant, each the largest on the dense grid; inf where nothing was found to be robustly
+    stable.
+
+    inscribed_grid: value of the inscribed problem on the programme's own grid, a lower bound within the basis
+    however coarse the grid. coarse_enclosing: the enclosing value with about half the basis; close to
+    `enclosing` means that the basis is large enough. exact_centre: the parametrisation is about the ellipses'
+    centres themselves (stable plants, or centre = nominal); otherwise `inscribed` is a local optimum too.
+    hull: the tighter lower bound of `youla_hull`, None if not asked for or without exact_centre.
+    """
+
+    plant: str
+    inscribed: float
+    ellipse: float
+    enclosing: float
+    inscribed_grid: float
+    coarse_enclosing: float
+    functions: int
+    exact_centre: bool
+    hull: float | None = None
+
+
+@dataclass(frozen=True)
+class YoulaBracket:
+    """What any controller could reach, the worst over the plants.
+
+    With several plants no single controller needs to reach these values: each plant may have its own Q. They
+    are then lower bounds of what one controller for all can do.
+    """
+
+    plants: tuple[PlantBracket, ...]
+
+    @property
+    def inscribed(self) -> float:
+        return max(plant.inscribed for plant in self.plants)
+
+    @property
+    def ellipse(self) -> float:
+        return max(plant.ellipse for plant in self.plants)
+
+    @property
+    def enclosing(self) -> float:
+        return max(plant.enclosing for plant in self.plants)
+
+    @property
+    def floor(self) -> float:
+        """The best lower bound: of the hulls where they were asked for, else of the inscribed discs."""
+        return max(plant.inscribed if plant.hull is None else plant.hull for plant in self.plants)
+
+    def excess(self, gamma: float) -> float:
+        """How far gamma lies above the ellipse value, relative: 0.02 = a higher order could buy about 2 %."""
+        return gamma / self.ellipse - 1.0
+
+    def sentence(self, gamma: float, order: int) -> str:
+        """One line for a design of this gamma and order."""
+        floor = f"none goes below about {self.floor:.3g}"
+        if not (np.isfinite(self.ellipse) and np.isfinite(gamma)):
+            return (
+                f"order {order}: gamma {gamma:.4g}, any order is known to reach {self.ellipse:.4g}; {floor}"
+            )
+        share = 100.0 * self.excess(gamma)
+        if len(self.plants) > 1:
+            reach = f"the hardest plant alone allows {self.ellipse:.4g}"
+        else:
+            reach = f"a controller of any order is known to reach {self.ellipse:.4g}"
+        word = f"{share:.2g} % above" if share >= 0 else f"{-share:.2g} % below"
+        return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; {floor}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; inf as None."""
+        return {
+            "plants": [
+                {key: None if value == float("inf") else value for key, value in asdict(plant).items()}
+                for plant in self.plants
+            ]
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> YoulaBracket:
+        """Inverse of `to_dict`."""
+        read: list[PlantBracket] = []
+        for plant in data["plants"]:
+            known: dict[str, Any] = {
+                k: float("inf") if value is None else value for k, value in plant.items()
+            }
+            read.append(PlantBracket(**known))
+        return cls(tuple(read))
+
+
+def youla_bracket(
+    plants: UncertainPlant | Sequence[UncertainPlant],
+    specification: Specification,
+    options: YoulaOptions | None = None,
+    *,
+    progress: Callable[[float, str], None] | None = None,
+) -> YoulaBracket:
+    """Bracket of the smallest possible worst case over the ellipses, whatever the controller's order.
+
+    Of the specification count tracking, modulus margin, effort and damping of the modes; structure, order,
+    controller damping and the delay margin do not, so the values stay lower bounds for designs that are asked
+    for these as well. Damping (W4 G S of the measured output) enters the inscribed value by the centre alone
+    and the other two by the largest |G|: on its safe side in each.
+
+    Raises
+    ------
+    SpecificationError
+        If specification and plants contradict each other.
+    """
+    options = options or YoulaOptions()
+    listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)
+    specification.check_against(listed)
+    tell = progress or (lambda fraction, message: None)
+    results = []
+    for number, plant in enumerate(listed):
+        tell(number / len(listed), f"Youla bracket of {plant.name}")
+        results.append(BracketProblem(plant, specification, options).solve())
+    tell(1.0, "Youla bracket")
+    return YoulaBracket(tuple(results))
+
+
+class BracketProblem:
+    """One plant: parametrisation, grids and the three problems."""
+
+    def __init__(self, plant: UncertainPlant, specification: Specification, options: YoulaOptions) -> None:
+        self.plant, self.spec, self.options = plant, specification, options
+        self.problem = Problem(
+            (plant,),
+            specification,
+            SynthesisOptions(
+                grid_points=options.grid_points,
+                mode_points=options.mode_points,
+                dense_points=options.dense_points,
+                omega_min_rad_s=options.omega_min_rad_s,
+            ),
+        )
+        self.factors: Factors | None = None
+        if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
+            self.factors = coprime_factors(_delayed(plant.nominal, specification.computational_delay_samples))
+        self.poles = chosen_poles(plant, self.problem.scale, options.real_poles, options.pairs_per_mode)
+        self.dense = self.problem.dense[0]
+        self.dense_loop = self._loop(self.dense)
+        self.dense_basis = self._basis(self.dense, self.poles)
+
+    def solve(self) -> PlantBracket:
+        coarse = chosen_poles(
+            self.plant,
+            self.problem.scale,
+            max(2, self.options.real_poles // 2),
+            max(1, self.options.pairs_per_mode // 2),
+        )
+        enclosing, _, x = self._exchanged("enclosing", None)
+        # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
+        # inscribed.
+        inscribed, grid_value, x_inscribed = self._exchanged("inscribed", None)
+        ellipse, _, _ = self._exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
+        lean = self.problem.lean()[0]  # with all frequencies that the exchange has added
+        half = smallest_ratio(self._basis(lean, coarse), self._rows(lean, "enclosing"))
+        offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
+        exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
+        ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
+        return PlantBracket(
+            self.plant.name,
+            min(inscribed, ellipse),
+            ellipse,
+            enclosing,
+            grid_value,
+            half.gamma,
+            int(self.dense_basis.shape[1]),
+            exact,
+            self._hull(inscribed_grid=grid_value, ellipse=ellipse) if self.options.hull and exact else None,
+        )
+
+    def _hull(self, *, inscribed_grid: float, ellipse: float) -> float:
+        if not np.isfinite(ellipse):
+            return inscribed_grid
+        lean = self.problem.lean()[0]
+        return hull_bound(lean, self._loop(lean), self._basis(lean, self.poles), inscribed_grid, ellipse)
+
+    def other_ellipse_values(self, shares: Sequence[float]) -> list[float]:
+        """Ellipse values from other starts: a share of the inscribed answer, the rest of the enclosing one.
+
+        A check of the one problem that is not convex: values that differ are different local optima.
+        """
+        _, _, outer = self._exchanged("enclosing", None)
+        _, _, inner = self._exchanged("inscribed", None)
+        return [self._exchanged("ellipse", (1 - f) * outer + f * inner)[0] for f in shares]
+
+    def _exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
+        """Optimum with violated frequencies added: (value on the dense grid, on the programme's, x)."""
+        best, best_x, grid_value = float("inf"), start, 0.0
+        for _ in range(self.options.exchange_rounds + 1):
+            lean = self.problem.lean()[0]
+            point = self._ellipse(lean, start) if region == "ellipse" else self._disc(lean, region, start)
+            if not np.isfinite(point.gamma):
+                break
+            start, grid_value = point.x, point.gamma
+            values = self._dense_values(point.x, region)
+            worst = float(np.max(values))
+            if worst < best:
+                best, best_x = worst, point.x
+            limit = point.gamma * (1.0 + self.problem.options.exchange_tolerance)
+            if worst <= limit:
+                break
+            index = [i for i in local_maxima(values) if values[i] > limit][:24]
+            grid = self.problem.grids[0]
+            self.problem.grids[0] = np.union1d(grid, self.dense.ellipses.omega_rad_s[index])
+        x = np.zeros(self.dense_basis.shape[1]) if best_x is None else best_x
+        return best, grid_value, x
+
+    def _disc(self, data: PlantData, region: Region, start: Real | None) -> MinimaxPoint:
+        basis = self._basis(data, self.poles)
+        if start is not None and not np.min(self._rows(data, region).denominator(plane(basis @ start))) > 0:
+            start = None
+        return smallest_ratio(basis, self._rows(data, region), start)
+
+    def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
+        basis = self._basis(data, self.poles)
+        loop = self._loop(data)
+        point: MinimaxPoint | None = None
+        for _ in range(self.options.ellipse_rounds):
+            angles = (
+                np.zeros(data.ellipses.omega_rad_s.size)
+                if start is None
+                else _best_angles(loop, data, basis @ start)
+            )
+            rows = self._rows(data, "ellipse", angles)
+            if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
+                start = None
+            new = smallest_ratio(basis, rows, start)
+            before = np.inf if point is None else point.gamma
+            if new.gamma < before:
+                point, start = new, new.x
+            if not new.gamma < before * (1 - 1e-4):
+                break
+        assert point is not None or not np.isfinite(new.gamma)
+        return new if point is None else point
+
+    def _loop(self, data: PlantData) -> AffineLoop:
+        if self.factors is None:
+            return stable_loop(data.ellipses.centre * data.delay)
+        return self.factors.loop(data.ellipses.omega_rad_s)
+
+    def _basis(self, data: PlantData, poles: Complex) -> Complex:
+        return basis_response(poles, data.ellipses.omega_rad_s, self.plant.dt_s)
+
+    def _rows(self, data: PlantData, region: Region, angles: Real | None = None) -> PlaneRows:
+        """Rows of one region on a grid, in the plane of Q = basis x."""
+        loop, e = self._loop(data), data.ellipses
+        size = e.omega_rad_s.size
+        turn = np.exp(-1j * (np.zeros(size) if angles is None else angles))
+        offset = e.centre * data.delay - loop.base
+        if np.max(np.abs(offset * loop.effort_slope), initial=0.0) < 1e-12:
+            offset = np.zeros(size, complex)
+        major, minor = e.semi_major, e.semi_minor
+        if region != "ellipse":
+            major = minor = minor if region == "inscribed" else major
+        # e^{-jt} q u in the ellipse's own axes: Re * major, Im * minor.
+        along = turn * e.direction * data.delay
+        axes = np.stack([major, minor], axis=-1)[:, :, None]
+        reach = axes * turning(along * loop.effort_slope)
+        reach_0 = axes[:, :, 0] * plane(along * loop.effort)
+        lift = turn * offset * loop.effort_slope
+        level = np.real(turn * (1.0 + offset * loop.effort))
+        slope = np.stack([lift.real, -lift.imag], axis=-1)
+        at = np.arange(size)
+        w1 = np.maximum(data.w1, data.modulus)
+        own_damping: Real | None = None
+        if np.any(data.w4 > 0):
+            if data.gp_max is not None:
+                w1 = np.maximum(w1, data.w4 * data.gp_max)
+            elif region == "inscribed":
+                own_damping = data.w4 * np.abs(e.centre)
+            else:
+                w1 = np.maximum(
+                    w1, data.w4 * (np.abs(e.centre) + major if region == "enclosing" else e.farthest())
+                )
+        tracking = PlaneRows(
+            at,
+            turning(w1 * loop.sensitivity_slope),
+            plane(w1 * loop.sensitivity),
+            level,
+            slope,
+            reach,
+            reach_0,
+        )
+        rows = tracking
+        if np.any(data.w3 > 0):
+            use = data.w3 > 0
+            rows = rows.stacked(
+                PlaneRows(
+                    at[use],
+                    turning(data.w3 * loop.effort_slope)[use],
+                    plane(data.w3 * loop.effort)[use],
+                    level[use],
+                    slope[use],
+                    reach[use],
+                    reach_0[use],
+                )
+            )
+        if own_damping is not None:
+            use = own_damping > 0
+            rows = rows.stacked(
+                PlaneRows(
+                    at[use],
+                    turning(own_damping * loop.sensitivity_slope)[use],
+                    plane(own_damping * loop.sensitivity)[use],
+                    level[use],
+                    slope[use],
+                    0.0 * reach[use],
+                    0.0 * reach_0[use],
+                )
+            )
+        return rows
+
+    def _dense_values(self, x: Real, region: Region) -> Real:
+        """Worst case per frequency of the dense grid: exact geometry for the ellipse, the rows for discs."""
+        y = self.dense_basis @ x
+        if region == "ellipse":
+            loop = self.dense_loop
+            sensitivity = loop.sensitivity + loop.sensitivity_slope * y
+            k = (loop.effort + loop.effort_slope * y) / np.where(sensitivity == 0, 1e-300, sensitivity)
+            return worst_of(self.dense.weighted(k))
+        rows = self._rows(self.dense, region)
+        below = rows.denominator(plane(y))
+        with np.errstate(divide="ignore"):
+            ratio = np.where(below > 0, rows.numerator(plane(y)) / np.maximum(below, 1e-300), np.inf)
+        values = np.zeros(y.size)
+        np.maximum.at(values, rows.at, ratio)
+        return values
+
+
+def _best_angles(loop: AffineLoop, data: PlantData, y: Complex) -> Real:
+    """Angle t of the supporting normal that gives the exact distance, (F,): largest m(t) by refined
+    search."""
+    e = data.ellipses
+    q = loop.effort + loop.effort_slope * y
+    c = 1.0 + (e.centre * data.delay - loop.base) * q
+    v = q * e.direction * data.delay
+    best, width = np.angle(c), np.pi / 2
+    for _ in range(6):
+        trial = best[:, None] + width * np.linspace(-1, 1, 21)
+        turned = np.exp(-1j * trial)
+        reach = turned * v[:, None]
+        margin = np.real(turned * c[:, None]) - np.hypot(
+            e.semi_major[:, None] * reach.real, e.semi_minor[:, None] * reach.imag
+        )
+        best = np.take_along_axis(trial, np.argmax(margin, axis=1)[:, None], axis=1)[:, 0]
+        width /= 8.0
+    return np.asarray(best)
+
+
+def _delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
+    """The plant behind a delay of whole samples."""
+    if samples == 0:
+        return system
+    line = control.ss(
+        np.eye(samples, k=-1),
+        np.eye(samples, 1),
+        np.eye(1, samples, k=samples - 1),
+        np.zeros((1, 1)),
+        system.dt,
+    )
+    return control.series(line, system)

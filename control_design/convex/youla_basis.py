@@ -1,0 +1,98 @@
+"""All controllers that stabilise one plant: K = (X + M Q)/(Y - N Q), Q stable; poles to expand Q in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import control
+import numpy as np
+import scipy.linalg
+
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.plant_set import UncertainPlant, frequency_response, modes_of
+
+
+def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Complex:
+    """Poles that reach everywhere the answer may need them.
+
+    Real ones spread logarithmically from the slowest corner of the plant to the Nyquist frequency; pairs at
+    every flexible mode and at every lightly damped zero (where Q inverts the plant), damping from their own
+    to 0.7. pairs: for each; more than three of them share three times as many.
+    """
+    dt = plant.dt_s
+    decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt
+    slow = decay[(decay > 1e-3 * scale_rad_s)]
+    lowest = min(float(np.min(slow, initial=np.inf)), 0.02 * scale_rad_s)
+    poles = [np.exp(-dt * np.geomspace(lowest, 0.95 * plant.nyquist_rad_s, real_poles)).astype(complex)]
+    resonances = [*plant.modes, *modes_of(plant.zeros, dt)]
+    resonances = [each for each in resonances if each.omega_rad_s < plant.nyquist_rad_s]
+    count = max(2, min(pairs, 3 * pairs // max(len(resonances), 1)))
+    for each in resonances:
+        least = np.clip(1.3 * abs(each.zeta), 0.005, 0.3)
+        zeta = np.geomspace(least, 0.7, count)
+        poles.append(np.exp(dt * each.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+    return np.concatenate(poles)
+
+
+@dataclass(frozen=True, eq=False)
+class AffineLoop:
+    """K S and S as they depend on the free function Q at F frequencies, for the base plant G (F,):
+    K S = effort + effort_slope Q, S = sensitivity + sensitivity_slope Q, all (F,), K without its delay."""
+
+    base: Complex
+    effort: Complex
+    effort_slope: Complex
+    sensitivity: Complex
+    sensitivity_slope: Complex
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """Coprime factors of a plant: control systems with N X + M Y = 1, G = N/M, all stable."""
+
+    N: control.StateSpace
+    M: control.StateSpace
+    X: control.StateSpace
+    Y: control.StateSpace
+
+    def loop(self, omega_rad_s: Real) -> AffineLoop:
+        """K S = M (X + M Q), S = M (Y - N Q)."""
+        n, m, x, y = (frequency_response(part, omega_rad_s) for part in (self.N, self.M, self.X, self.Y))
+        return AffineLoop(n / m, m * x, m * m, m * y, -m * n)
+
+
+def stable_loop(response: Complex) -> AffineLoop:
+    """The same for a stable plant with response (F,): M = Y = 1, X = 0, hence K S = Q and S = 1 - G Q."""
+    one, zero = np.ones_like(response), np.zeros_like(response)
+    return AffineLoop(response, zero, one, one, -response)
+
+
+def coprime_factors(plant: control.StateSpace) -> Factors:
+    """Factors of a discrete SISO plant by state feedback F and observer gain L, both linear-quadratic.
+
+    M = 1 + F(zI - A_F)^-1 B, N = D + (C + D F)(zI - A_F)^-1 B, X = F(zI - A_L)^-1 L,
+    Y = 1 - F(zI - A_L)^-1 (B + L D), with A_F = A + B F, A_L = A + L C. Any stabilising pair gives all
+    controllers; this one weighs output against an input that moves it equally.
+
+    Raises
+    ------
+    ValueError
+        If an unstable or marginal mode cannot be moved by the input or seen at the output.
+    """
+    a, b, c, d = (np.asarray(getattr(plant, name), dtype=np.float64) for name in "ABCD")
+    n, dt = a.shape[0], plant.dt
+    small = 1e-6 * np.eye(n)
+    try:
+        p = scipy.linalg.solve_discrete_are(a, b, c.T @ c + small * np.trace(c.T @ c), np.eye(1))
+        q = scipy.linalg.solve_discrete_are(a.T, c.T, b @ b.T + small * np.trace(b @ b.T), np.eye(1))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError("the plant has a mode on or outside the circle that no controller moves") from error
+    f = -np.linalg.solve(1.0 + b.T @ p @ b, b.T @ p @ a)
+    gain = -np.linalg.solve(1.0 + c @ q @ c.T, c @ q @ a.T).T
+    a_f, a_l, one = a + b @ f, a + gain @ c, np.ones((1, 1))
+    return Factors(
+        N=control.ss(a_f, b, c + d @ f, d, dt),
+        M=control.ss(a_f, b, f, one, dt),
+        X=control.ss(a_l, gain, f, 0 * one, dt),
+        Y=control.ss(a_l, -(b + gain @ d), f, one, dt),
+    )

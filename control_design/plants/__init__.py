@@ -1,0 +1,1 @@
+"""The uncertain plant: ellipses, plant sets, weights, frequency grid."""

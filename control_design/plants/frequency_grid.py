@@ -1,0 +1,77 @@
+"""Frequency grids: a lean one for the optimiser, a dense one for its checks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.plants.ellipses import Real
+from control_design.plants.plant_set import Mode, UncertainPlant
+
+
+def mode_points(mode: Mode, count: int, half_widths: float = 20.0) -> Real:
+    """Frequencies spaced like sinh within +-half_widths half-bandwidths (zeta omega) of a mode, densest at
+    its peak."""
+    width = max(mode.zeta, 1e-6) * mode.omega_rad_s
+    reach = np.arcsinh(half_widths)
+    points = mode.omega_rad_s + width * np.sinh(np.linspace(-reach, reach, count))
+    return np.asarray(points[points > 0], dtype=np.float64)
+
+
+def frequency_grid(
+    nyquist_rad_s: float,
+    modes: Sequence[Mode],
+    *,
+    omega_min_rad_s: float,
+    n_log: int,
+    n_mode: int,
+    extra: npt.ArrayLike = (),
+) -> Real:
+    """Ascending grid from omega_min to Nyquist inclusive; `n_mode` points are shared out over the modes (at
+    least 20 each)."""
+    parts = [np.geomspace(omega_min_rad_s, nyquist_rad_s, n_log), np.asarray(extra, dtype=np.float64)]
+    if modes:
+        each = max(20, n_mode // len(modes))
+        parts += [mode_points(mode, each) for mode in modes]
+    grid = np.concatenate(parts)
+    grid = np.unique(grid[(grid >= omega_min_rad_s) & (grid <= nyquist_rad_s)])
+    grid[-1] = nyquist_rad_s
+    # Points closer than 1e-9 relative carry no information and make unwrapping rows singular.
+    keep = np.concatenate([[True], np.diff(grid) > 1e-9 * grid[1:]])
+    return np.asarray(grid[keep], dtype=np.float64)
+
+
+def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
+    """`wanted` where the uncertainty is known everywhere; else the nearest of its own frequencies, and
+    `wanted` outside their range, where `Channel.at` has the nominal response only."""
+    own = plant.own_grid
+    if own is None:
+        return wanted
+    inside = wanted[(wanted >= own[0]) & (wanted <= own[-1])]
+    index = np.unique(np.clip(np.searchsorted(own, inside), 0, own.size - 1))
+    index = np.union1d(index, np.array([0, own.size - 1]))
+    outside = wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
+    return np.asarray(np.unique(np.concatenate([own[index], outside])), dtype=np.float64)
+
+
+def local_maxima(value: Real) -> npt.NDArray[np.int64]:
+    """Positions of local maxima of (F,), ends included, largest value first."""
+    padded = np.concatenate([[-np.inf], value, [-np.inf]])
+    peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
+    index = np.flatnonzero(peak)
+    return np.asarray(index[np.argsort(-value[index], kind="stable")], dtype=np.int64)
+
+
+def starting_edges(
+    nyquist_rad_s: float, modes: Sequence[Mode], *, omega_min_rad_s: float, extra: npt.ArrayLike = ()
+) -> Real:
+    """Edges of a first partition of [0, Nyquist] for bounds on intervals: logarithmic, finer around modes."""
+    count = max(60, int(40 * np.log10(nyquist_rad_s / omega_min_rad_s)))
+    inner = frequency_grid(
+        nyquist_rad_s, modes, omega_min_rad_s=omega_min_rad_s, n_log=count, n_mode=40 * len(modes)
+    )
+    more = np.asarray(extra, dtype=np.float64)
+    more = more[(more > 0) & (more < nyquist_rad_s)]
+    return np.asarray(np.unique(np.concatenate([[0.0], inner, more])), dtype=np.float64)

@@ -1,0 +1,114 @@
+"""Single responses that must stay stable, nothing more: draws that the ellipses do not describe.
+
+Ellipses propagate parameter spreads to first order. A lightly damped mode that moves by several of its
+half-widths leaves them by far (its response turns around a circle, the ellipse goes off along the tangent),
+and a loop that is stable over ellipses of any level may be unstable for such a draw. A guard is one of these
+responses, known on its own grid: the search keeps 1 + K G winding as a stable loop's, at a modest distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.plants.ellipses import Complex, Ellipses, Real, readonly_complex, readonly_real
+from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.plant_set import UncertainPlant
+
+GUARD_MODULUS = 0.1  # distance from -1 asked of a guard: stability with something to spare
+
+
+@dataclass(frozen=True, eq=False)
+class Guard:
+    """One response of one plant: number of the plant, omega (F,) ending at Nyquist, response (F,).
+
+    The response is taken to have the integrators and unstable poles of the nominal.
+    """
+
+    plant: int
+    omega_rad_s: Real
+    response: Complex
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "omega_rad_s", readonly_real(self.omega_rad_s))
+        object.__setattr__(self, "response", readonly_complex(self.response))
+        omega = self.omega_rad_s
+        if omega.ndim != 1 or self.response.shape != omega.shape or omega.size < 2:
+            raise ValueError(
+                f"a guard needs omega and response of one shape (F,); got {omega.shape} and "
+                f"{self.response.shape}"
+            )
+        if not (np.all(np.diff(omega) > 0) and np.all(np.isfinite(self.response))):
+            raise ValueError("a guard needs ascending frequencies and a finite response")
+
+    def ellipses(self, wanted: Real) -> Ellipses:
+        """Points (ellipses of no size) at those of its own frequencies nearest to `wanted`."""
+        own = self.omega_rad_s
+        above = np.clip(np.searchsorted(own, wanted), 1, own.size - 1)
+        index = np.unique(np.where(wanted - own[above - 1] < own[above] - wanted, above - 1, above))
+        zero = np.zeros(index.size)
+        return Ellipses(
+            self.omega_rad_s[index], self.response[index], zero, zero, np.ones(index.size, np.complex128)
+        )
+
+
+def guard_grid(plant: UncertainPlant, omega_min_rad_s: float) -> Real:
+    """Frequencies fine enough to count the winding of a response whose modes have moved."""
+    return frequency_grid(
+        plant.nyquist_rad_s,
+        plant.modes,
+        omega_min_rad_s=omega_min_rad_s,
+        n_log=1200,
+        n_mode=400 * len(plant.modes),
+    )
+
+
+def winds(
+    loop_gain: Complex, *, integrators: int, unstable_poles: int
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """(1 + L turns as a stable loop's, some phase step is wider than pi/3), each (D,), for L (D, F) from
+    near zero frequency to Nyquist; see `stability.nyquist_count`."""
+    value = 1.0 + loop_gain
+    steps = np.angle(value[:, 1:] * np.conj(value[:, :-1]))
+    first = np.angle(value[:, 0] * 1j**integrators)
+    last = np.angle(value[:, -1])
+    total = np.sum(steps, axis=1) + (first - np.pi * np.round(first / np.pi))
+    total -= last - np.pi * np.round(last / np.pi)
+    required = unstable_poles + integrators / 2.0
+    return np.abs(total / np.pi - required) < 0.25, np.max(np.abs(steps), axis=1) > np.pi / 3
+
+
+def different_responses(responses: Complex, most: int) -> npt.NDArray[np.int64]:
+    """Positions of up to `most` of the responses (D, F), each as far as can be from those before it: largest
+    mean of |difference|/(sum of sizes), from the first one on."""
+    chosen = [0]
+    size = np.abs(responses)
+
+    def apart(index: int) -> Real:
+        difference = np.abs(responses - responses[index])
+        return np.asarray(np.mean(difference / np.maximum(size + size[index], 1e-300), axis=1))
+
+    nearest = apart(0)
+    while len(chosen) < min(most, responses.shape[0]):
+        farthest = int(np.argmax(nearest))
+        if nearest[farthest] <= 1e-9:
+            break
+        chosen.append(farthest)
+        nearest = np.minimum(nearest, apart(farthest))
+    return np.array(chosen, dtype=np.int64)
+
+
+def sorted_by_plant(guards: Sequence[Guard]) -> list[tuple[int, Real, Complex]]:
+    """Guards of one plant on one grid together: (number of the plant, omega (F,), responses (D, F))."""
+    together: list[tuple[int, Real, list[Complex]]] = []
+    for guard in guards:
+        for number, omega, found in together:
+            if number == guard.plant and np.array_equal(omega, guard.omega_rad_s):
+                found.append(guard.response)
+                break
+        else:
+            together.append((guard.plant, guard.omega_rad_s, [guard.response]))
+    return [(number, omega, np.array(found)) for number, omega, found in together]

@@ -1,0 +1,234 @@
+"""Uncertainty ellipses between frequencies: centre and generators as first-order expansions with remainder.
+
+The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, generators scaled to the level. A
+posterior over coefficients is linear in them, so its generators are rational with known poles and everything
+between two frequencies can be bounded. A response known on its own frequencies only says nothing between
+them; the one assumption offered here is stated in `OwnGridSet`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.first_order import (
+    FirstOrder,
+    Intervals,
+    cleared_integrators,
+    constant,
+    pole_factor,
+    shift_factor,
+    zero_factor,
+)
+from control_design.plants.plant_set import Channel
+from control_design.plants.rational_response import RationalResponse
+from ident.uncertainty import ResponsePosterior
+
+
+@dataclass(frozen=True, eq=False)
+class SetExpansion:
+    """centre (F,); groups: generators (F, Q) each, every group with a unit ball of its own (sets add up)."""
+
+    centre: FirstOrder
+    groups: tuple[FirstOrder, ...]
+
+    def times(self, factor: FirstOrder) -> SetExpansion:
+        """The set times a response (F,)."""
+        return SetExpansion(factor.times(self.centre), tuple(factor.times(group) for group in self.groups))
+
+    def support(self, direction: Complex, side: int) -> Real:
+        """Largest Re(conj(direction) (member - centre)) of the linear part at one end, (F,)."""
+        total = np.zeros(direction.size)
+        for group in self.groups:
+            turned = np.real(np.conj(direction)[:, None] * group.end(side))
+            total = total + np.sqrt(np.einsum("fq,fq->f", turned, turned))
+        return total
+
+    def remainder(self) -> Real:
+        """Everything beyond the linear part, centre and groups together, (F,)."""
+        return np.asarray(
+            self.centre.remainder + sum(group.remainder for group in self.groups), dtype=np.float64
+        )
+
+    def gram(self) -> Real:
+        """Shape matrix P (F, 2, 2) at the centres: the ellipse e^T P^-1 e <= 1, which encloses the sum of
+        several groups."""
+        total = np.zeros((self.centre.value.size, 2, 2))
+        for group in self.groups:
+            rows = np.stack([group.value.real, group.value.imag], axis=1)
+            total += rows @ np.swapaxes(rows, 1, 2) * len(self.groups)
+        return total
+
+
+class ExpandableSet(Protocol):
+    """Ellipses that can be bounded between frequencies."""
+
+    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion: ...
+
+
+@runtime_checkable
+class FirstOrderUncertainty(Protocol):
+    """What an uncertainty of one's own offers beside `at` to have it certified between frequencies.
+
+    generators: columns whose Gram matrix of real and imaginary parts is the covariance that `at` gives.
+    """
+
+    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+        """(centre (F,), generators (F, Q)), both times (z - 1)^cleared."""
+        ...
+
+
+def expandable(channel: Channel, integrators: int, between_own_points: str) -> ExpandableSet | None:
+    """The channel's ellipses in expandable form, or None if nothing can be said between frequencies."""
+    uncertainty = channel.uncertainty
+    if uncertainty is None:
+        return ExactSet(RationalResponse.from_state_space(channel.nominal, integrators))
+    if channel.own_grid is not None:
+        if between_own_points != "linear":
+            return None
+        return OwnGridSet(channel, RationalResponse.from_state_space(channel.nominal, integrators))
+    radius = float(np.sqrt(-2.0 * np.log1p(-channel.level)))
+    if isinstance(uncertainty, ResponsePosterior):
+        return PosteriorSet(uncertainty, radius)
+    if isinstance(uncertainty, FirstOrderUncertainty):
+        return GivenSet(uncertainty, radius)
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class ExactSet:
+    """A plant without uncertainty."""
+
+    response: RationalResponse
+
+    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
+        return SetExpansion(self.response.expand(intervals, cleared), ())
+
+
+@dataclass(frozen=True, eq=False)
+class GivenSet:
+    """An uncertainty that expands itself."""
+
+    uncertainty: FirstOrderUncertainty
+    radius: float
+
+    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
+        centre, generators = self.uncertainty.first_order(intervals, cleared)
+        return SetExpansion(centre, (generators.scaled(self.radius),))
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorSet:
+    """A Gaussian over coefficients of basis functions and impulse response: every column is rational."""
+
+    posterior: ResponsePosterior
+    radius: float
+
+    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
+        posterior = self.posterior
+        value, slope, remainder = self._columns(intervals)
+        factor = np.array(posterior.covariance_factor)
+        mean = np.array(posterior.mean)
+        h = intervals.half_width
+        centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), h)
+        spread = FirstOrder(value @ factor, slope @ factor, remainder @ np.linalg.norm(factor, axis=1), h)
+        # 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i
+        common = shift_factor(posterior.integrators - posterior.input_delay_samples, intervals)
+        common = common.times(cleared_integrators(cleared - posterior.integrators, intervals))
+        return SetExpansion(common.times(centre), (common.times(spread).scaled(self.radius),))
+
+    def _columns(self, intervals: Intervals) -> tuple[Complex, Complex, Real]:
+        """Value, slope and remainder (F, P) of the columns of `ResponsePosterior.frequency_rows`, without
+        integrators and delay."""
+        posterior = self.posterior
+        columns: list[FirstOrder] = []
+        all_pass = constant(1.0, intervals)
+        for a in posterior.poles.real:
+            driven = all_pass.times(pole_factor(complex(a - 1.0), intervals))
+            columns.append(driven.scaled(float(np.sqrt((1 - a) * (1 + a)))))
+            all_pass = driven.times(_reflected_zero(complex(a), intervals))
+        for p in posterior.poles.pairs:
+            gamma = abs(p) ** 2
+            beta = 2 * p.real / (1 + gamma)
+            one_minus_gamma = (1 - abs(p.real)) * (1 + abs(p.real)) - p.imag**2
+            gain = float(np.sqrt(one_minus_gamma * (1 + gamma)))
+            other = float(np.sqrt(one_minus_gamma**2 + 4 * p.imag**2) / (1 + gamma))
+            driven = all_pass.times(pole_factor(p - 1.0, intervals))
+            driven = driven.times(pole_factor(p.conjugate() - 1.0, intervals))
+            columns.append(driven.times(zero_factor(complex(beta - 1.0), intervals)).scaled(gain))
+            columns.append(driven.scaled(gain * other))
+            all_pass = driven.times(_reflected_zero(p, intervals))
+            all_pass = all_pass.times(_reflected_zero(p.conjugate(), intervals))
+        if posterior.has_feedthrough:
+            columns.append(constant(1.0, intervals))
+        columns += [shift_factor(-lag, intervals) for lag in range(1, posterior.fir_length + 1)]
+        return (
+            np.stack([column.value for column in columns], axis=1),
+            np.stack([column.slope for column in columns], axis=1),
+            np.stack([column.remainder for column in columns], axis=1),
+        )
+
+
+def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
+    """1 - conj(p) z."""
+    q = p.conjugate()
+    factor = zero_factor(0.0, intervals).scaled(-q)
+    return FirstOrder(factor.value + (1.0 - q), factor.slope, factor.remainder, factor.half_width)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnGridSet:
+    """Ellipses on a user's own frequencies, with an assumption between them.
+
+    Assumed: between neighbouring frequencies, at fraction x of the way, the response lies in (1 - x) E_k + x
+    E_{k+1} (Minkowski sum): on a straight line between a member of one ellipse and a member of the next.
+    Outside the range the nominal response stands alone.
+    """
+
+    channel: Channel
+    nominal: RationalResponse
+
+    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
+        own = self.channel.own_grid
+        assert own is not None
+        low, high = intervals.centre - intervals.half_width, intervals.centre + intervals.half_width
+        inside = (low >= own[0] * (1 - 1e-9)) & (high <= own[-1] * (1 + 1e-9))
+        left = np.clip(np.searchsorted(own, intervals.centre) - 1, 0, own.size - 2)
+        gap = own[left + 1] - own[left]
+        share = (intervals.centre - own[left]) / gap
+        ellipses = self.channel.at(own)
+        h = intervals.half_width
+        none = np.zeros(h.size)
+        clear = cleared_integrators(cleared, intervals)
+        c0, c1 = ellipses.centre[left], ellipses.centre[left + 1]
+        between = clear.times(FirstOrder(c0 + share * (c1 - c0), (c1 - c0) / gap, none, h))
+        alone = self.nominal.expand(intervals, cleared)
+        centre = FirstOrder(
+            np.where(inside, between.value, alone.value),
+            np.where(inside, between.slope, alone.slope),
+            np.where(inside, between.remainder, alone.remainder),
+            h,
+        )
+        axes = ellipses.direction[:, None] * np.stack(
+            [ellipses.semi_major + 0j, 1j * ellipses.semi_minor], axis=1
+        )
+        groups = []
+        for index, weight, rate in ((left, 1.0 - share, -1.0 / gap), (left + 1, share, 1.0 / gap)):
+            here = axes[index] * inside[:, None]
+            groups.append(clear.times(FirstOrder(here * weight[:, None], here * rate[:, None], none, h)))
+        return SetExpansion(centre, tuple(groups))
+
+
+def stacked(columns: Sequence[FirstOrder]) -> FirstOrder:
+    """Q expansions (F,) as one (F, Q)."""
+    squares: Any = sum(column.remainder**2 for column in columns)
+    return FirstOrder(
+        np.stack([column.value for column in columns], axis=1),
+        np.stack([column.slope for column in columns], axis=1),
+        np.sqrt(squares),
+        columns[0].half_width,
+    )

@@ -1,0 +1,1 @@
+"""Structured synthesis over ellipses (CasADi/IPOPT)."""

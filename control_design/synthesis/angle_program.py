@@ -1,0 +1,227 @@
+"""The nonlinear programme of the synthesis: angle form of the exact conditions on the ellipses, CasADi and
+IPOPT.
+
+Distance from -1 to the convex set K E is the largest value over unit normals e^{jt} of
+    m(t) = Re(e^{-jt} c) - sqrt(s1^2 Re(q)^2 + s2^2 Im(q)^2 + eps),   c = 1 + G K,  q = e^{-jt} K u1,
+so |W1 S| <= 1/g for every G in E  <=>  there is t with m(t) >= g |W1|, likewise g |W3 K| and g |W4 Gp| with
+an independent Gp. W4 of the measured output itself (Gp = G) has no row here: the descent takes it up.
+Variables: controller parameters, g, one t per frequency. Maximise log g.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from control_design.controllers.biquads import Cascade, tustin_frequency
+from control_design.plants.ellipses import Complex, Ellipses, Real
+
+Symbol = Any  # casadi.SX; its stubs disagree with its own arithmetic on numpy arrays
+
+_EPS = 1e-10  # under the root, relative to the row: errs on the safe side by at most 1e-5 of |1 + L|
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Everything the programme needs of one plant (or delayed copy) on its grid; all arrays (F,).
+
+    delay : z^-d times a delay copy, multiplies K. w1, w3, w4 : weight magnitudes, 0 = no row. gp_max :
+    largest |Gp| of an independent performance channel; None with w4 > 0 means Gp = G, a row of the descent
+    only. start_window : range of the first angle for a stable loop.
+    """
+
+    ellipses: Ellipses
+    delay: Complex
+    w1: Real
+    w3: Real
+    w4: Real
+    gp_max: Real | None
+    row_scale: Real
+    start_window: tuple[float, float]
+    reaches_nyquist: bool
+
+
+@dataclass(frozen=True, eq=False)
+class NlpPoint:
+    """A solution or start of the programme: controller parameters, g = 1/gamma, angles per plant
+    (unwrapped)."""
+
+    parameters: Real
+    g: float
+    angles: tuple[Real, ...]
+    status: str = ""
+    iterations: int = 0
+
+
+class AngleProgram:
+    """One NLP for fixed structure and grid; `solve` may be called from many starts."""
+
+    def __init__(
+        self,
+        cascade: Cascade,
+        plants: Sequence[Rows],
+        *,
+        controller_damping: float | None = None,
+        max_iterations: int = 250,
+        tolerance: float = 1e-6,
+    ) -> None:
+        self.cascade = cascade
+        self.plants = tuple(plants)
+        x = ca.SX.sym("x", cascade.parameters)
+        g = ca.SX.sym("g")
+        variables, lower, upper = (
+            [x, g],
+            [-np.inf] * cascade.parameters + [1e-4],
+            [np.inf] * cascade.parameters + [1e4],
+        )
+        bound = parameter_bounds(cascade)
+        lower[: cascade.parameters], upper[: cascade.parameters] = list(bound[0]), list(bound[1])
+        rows: list[Symbol] = []
+        row_lower: list[Real] = []
+        row_upper: list[Real] = []
+
+        def add(expression: Symbol, low: float, high: float) -> None:
+            rows.append(expression)
+            row_lower.append(np.full(expression.numel(), low))
+            row_upper.append(np.full(expression.numel(), high))
+
+        if controller_damping is not None:
+            # p^2 + e^a p + e^b has damping e^(a - b/2)/2: a straight line in the parameters.
+            for at in cascade.pair_positions:
+                add(x[at] - 0.5 * x[at + 1], float(np.log(2 * controller_damping)), np.inf)
+
+        for plant in self.plants:
+            e = plant.ellipses
+            n = e.omega_rad_s.size
+            k_re, k_im = self._response(x, e.omega_rad_s)
+            d = plant.delay
+            k_re, k_im = k_re * d.real - k_im * d.imag, k_re * d.imag + k_im * d.real
+            t: Symbol = ca.SX.sym("t", n)
+            variables.append(t)
+            low, high = np.full(n, -np.inf), np.full(n, np.inf)
+            low[0], high[0] = plant.start_window
+            if plant.reaches_nyquist:
+                low[-1], high[-1] = -0.6, 0.6
+            lower += list(low)
+            upper += list(high)
+            if n > 1:
+                add(t[1:] - t[:-1], -1.0, 1.0)
+            cos_t, sin_t = ca.cos(t), ca.sin(t)
+            c_re = 1 + e.centre.real * k_re - e.centre.imag * k_im
+            c_im = e.centre.real * k_im + e.centre.imag * k_re
+            v_re = e.direction.real * k_re - e.direction.imag * k_im
+            v_im = e.direction.real * k_im + e.direction.imag * k_re
+            q_re = cos_t * v_re + sin_t * v_im
+            q_im = cos_t * v_im - sin_t * v_re
+            scale = plant.row_scale
+            eps = _EPS / scale**2
+            reach = ca.sqrt(e.semi_major**2 * q_re**2 + e.semi_minor**2 * q_im**2 + eps)
+            margin = scale * (cos_t * c_re + sin_t * c_im - reach)
+            add(margin - g * (scale * plant.w1), 0.0, np.inf)
+            if np.any(plant.w3 > 0):
+                use = np.flatnonzero(plant.w3 > 0).tolist()
+                size = ca.sqrt(k_re**2 + k_im**2 + 1e-16)
+                add((margin - g * (scale * plant.w3) * size)[use], 0.0, np.inf)
+            if plant.gp_max is not None and np.any(plant.w4 > 0):
+                use = np.flatnonzero(plant.w4 > 0).tolist()
+                add((margin - g * (scale * plant.w4 * plant.gp_max))[use], 0.0, np.inf)
+        nlp: dict[str, Any] = {
+            "x": ca.vertcat(*variables),
+            "f": -ca.log(g),
+            "g": ca.vertcat(*rows),
+        }
+        self._bounds = np.array(lower), np.array(upper)
+        self._row_bounds = np.concatenate(row_lower), np.concatenate(row_upper)
+        options: dict[str, Any] = {
+            "ipopt": {
+                "print_level": 0,
+                "sb": "yes",
+                "max_iter": max_iterations,
+                "tol": tolerance,
+                "acceptable_tol": 1e-4,
+                "acceptable_iter": 8,
+                "mu_strategy": "adaptive",
+            },
+            "print_time": False,
+            "error_on_fail": False,
+        }
+        self._solver = ca.nlpsol("angle_program", "ipopt", nlp, options)
+
+    def _response(self, x: Symbol, omega: Real) -> tuple[Symbol, Symbol]:
+        """Real and imaginary part of K on the grid; sections in p or, above |p| = 1, in 1/p."""
+        v = tustin_frequency(omega, self.cascade.dt_s) / self.cascade.scale_rad_s
+        v = np.minimum(v, 1e12)
+        size = np.maximum(1.0, v)
+        re: Symbol = ca.SX.ones(omega.size)
+        im: Symbol = ca.SX.zeros(omega.size)
+        num: tuple[Symbol, Symbol]
+        den: tuple[Symbol, Symbol]
+        at = 0
+        for kind in self.cascade.sections:
+            if kind == "second_order":
+                n2, n1, n0, a, b = (x[at + i] for i in range(5))
+                at += 5
+                w2, w1, w0 = (v / size) ** 2, v / size**2, 1 / size**2
+                num = -n2 * w2 + n0 * w0, n1 * w1
+                den = -w2 + ca.exp(b) * w0, ca.exp(a) * w1
+            elif kind == "notch":
+                c, a, b = x[at], x[at + 1], x[at + 2]
+                at += 3
+                w2, w1, w0 = (v / size) ** 2, v / size**2, 1 / size**2
+                num = -w2 + ca.exp(b) * w0, ca.exp(c) * w1
+                den = -w2 + ca.exp(b) * w0, ca.exp(a) * w1
+            else:
+                n1, n0 = x[at], x[at + 1]
+                at += 2
+                w1, w0 = v / size, 1 / size
+                num = n0 * w0, n1 * w1
+                if kind == "first_order":
+                    den = ca.exp(x[at]) * w0, ca.SX(w1)
+                    at += 1
+                else:
+                    den = ca.SX(np.zeros(omega.size)), ca.SX(w1)
+            square = den[0] ** 2 + den[1] ** 2
+            f_re = (num[0] * den[0] + num[1] * den[1]) / square
+            f_im = (num[1] * den[0] - num[0] * den[1]) / square
+            re, im = re * f_re - im * f_im, re * f_im + im * f_re
+        return re, im
+
+    def solve(self, start: NlpPoint) -> NlpPoint:
+        """Maximise log g from a start."""
+        initial = np.concatenate([start.parameters, [start.g], *start.angles])
+        initial = np.clip(initial, self._bounds[0], self._bounds[1])
+        answer = self._solver(
+            x0=initial,
+            lbx=self._bounds[0],
+            ubx=self._bounds[1],
+            lbg=self._row_bounds[0],
+            ubg=self._row_bounds[1],
+        )
+        values = np.asarray(answer["x"]).ravel()
+        stats = self._solver.stats()
+        n = self.cascade.parameters
+        angles, at = [], n + 1
+        for plant in self.plants:
+            size = plant.ellipses.omega_rad_s.size
+            angles.append(values[at : at + size])
+            at += size
+        return NlpPoint(
+            values[:n], float(values[n]), tuple(angles), str(stats["return_status"]), int(stats["iter_count"])
+        )
+
+
+def parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:
+    """Logarithms kept within a few decades of the scale: exp() never overflows in a wild step."""
+    low: list[float] = []
+    for kind in cascade.sections:
+        low += {
+            "integrator": [-np.inf] * 2,
+            "first_order": [-np.inf] * 2 + [-12.0],
+            "second_order": [-np.inf] * 3 + [-12.0, -20.0],
+            "notch": [-12.0, -12.0, -20.0],
+        }[kind]
+    return np.array(low), -np.array(low)

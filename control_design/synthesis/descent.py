@@ -1,0 +1,404 @@
+"""Descent on the worst case itself: from any stable controller to a local minimum, stable at every step.
+
+gamma(x) is a maximum of smooth functions, one per frequency and requirement. Each step models their
+logarithms at the worst member of the ellipse: slopes by the envelope theorem (that member may be held
+fixed), one common curvature, that of the sum weighted by the multipliers of the step before. It solves
+"smallest largest row within a box" (`minimax_step`) and accepts only where the true value falls and all
+nominal loops stay stable. With curvature, convergence near the end is that of Newton's method also where
+fewer rows are active than there are parameters.
+
+Worst members are looked for on `_BOUNDARY` points of each ellipse's boundary, refined by a parabola and
+Newton's method: good for a direction, not for a certificate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.controllers.biquads import Cascade, tustin_frequency
+from control_design.plants.ellipses import Complex, Real
+from control_design.synthesis.angle_program import Rows, parameter_bounds
+from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
+
+_BOUNDARY = 40
+_FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
+_PATIENCE, _SLOW = 15, 1e-3  # give up where so many steps gain less than this share
+_LEAST_GAIN = 1e-7  # predicted gain of a step, in the logarithm, not worth taking
+_FAR_BELOW = 2.5  # rows this far (in log) below the worst cannot become it within one step and are left out
+_REFINEMENTS = 2  # Newton steps from the vertex of the parabola to the worst member
+
+
+@dataclass(frozen=True, eq=False)
+class Descended:
+    """Where the descent ended: parameters, the worst case it saw (boundary points, its grid), steps taken."""
+
+    parameters: Real
+    gamma: float
+    steps: int
+
+
+class MinimaxDescent:
+    """Descent for one cascade and one set of rows (as the angle programme has them)."""
+
+    def __init__(
+        self,
+        cascade: Cascade,
+        plants: Sequence[Rows],
+        stable: Callable[[Real], bool],
+        *,
+        controller_damping: float | None = None,
+    ) -> None:
+        self.cascade, self.stable = cascade, stable
+        self._plants = [_Boundary(cascade, rows) for rows in plants]
+        self._low, self._high = parameter_bounds(cascade)
+        slack = [] if controller_damping is None else list(cascade.pair_positions)
+        self._damping_rows = np.zeros((len(slack), cascade.parameters))
+        for row, at in enumerate(slack):
+            self._damping_rows[row, at], self._damping_rows[row, at + 1] = -1.0, 0.5
+        limit = 0.0 if controller_damping is None else -float(np.log(2 * controller_damping))
+        self._damping_limit = np.full(len(slack), limit)
+
+    def value(self, parameters: Real) -> float:
+        """Worst case on the boundary points; inf for an unstable nominal loop or an ellipse over -1."""
+        logs = self._logs(parameters)
+        return float("inf") if logs is None else float(np.exp(np.max(logs)))
+
+    def run(self, start: Real, steps: int) -> Descended:
+        """At most `steps` steps from a start with stable nominal loops."""
+        x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
+        logs = self._logs(x)
+        if logs is None:
+            return Descended(x, float("inf"), 0)
+        best, box, taken = float(np.max(logs)), _FIRST_BOX, 0
+        local: _Local | None = None
+        multipliers: Real | None = None
+        earlier = best
+        for number in range(steps):
+            if number % _PATIENCE == 0 and number > 0:
+                if best > earlier - _SLOW:
+                    break
+                earlier = best
+            if local is None:
+                local = self._local(x, multipliers)
+            taken += 1
+            step = self._step(x, local, local.log, box)
+            if step is None:
+                break
+            move = step.step * local.unit
+            predicted = best - step.level - 0.5 * float(move @ local.curvature @ move)
+            if predicted < _LEAST_GAIN:
+                break
+            trial, after = x + move, self._logs(x + move)
+            if after is not None and best - float(np.max(after)) < 0.25 * predicted:
+                # The rows bend more than their common curvature says: once more, with the rows as they are
+                # at the trial point (second-order correction).
+                again = self._step(x, local, after - local.slope @ move, box)
+                if again is not None:
+                    second = x + again.step * local.unit
+                    corrected = self._logs(second)
+                    if corrected is not None and np.max(corrected) < np.max(after):
+                        step, trial, after = again, second, corrected
+            actual = -np.inf if after is None else best - float(np.max(after))
+            if after is not None and actual > 0.02 * predicted:
+                x, best, local, multipliers = trial, float(np.max(after)), None, step.multipliers
+            if actual > 0.7 * predicted:
+                box = min(2.0 * box, _LARGEST_BOX)
+            elif actual < 0.25 * predicted:
+                box *= 0.35
+            if box < _SMALLEST_BOX:
+                break
+        return Descended(x, float(np.exp(best)), taken)
+
+    def _logs(self, x: Real) -> Real | None:
+        """Logarithms (R,) of all weighted values; None for an unstable loop or an ellipse over -1."""
+        if not self.stable(x) or any(plant.covers_minus_one(x) for plant in self._plants):
+            return None
+        return np.concatenate([plant.rows(x, gradient=False)[0] for plant in self._plants])
+
+    def _local(self, x: Real, multipliers: Real | None) -> _Local:
+        """Rows, slopes and (with multipliers of the rows) their common curvature, made semi-definite."""
+        log, slope, curvature, at = [], [], np.zeros((x.size, x.size)), 0
+        for plant in self._plants:
+            part = plant.rows(x, gradient=True)
+            log.append(part[0])
+            slope.append(part[1])
+            if multipliers is not None:
+                curvature += plant.curvature(x, multipliers[at : at + part[0].size])
+            at += part[0].size
+        unit = natural_units(self.cascade, x)
+        if multipliers is not None:
+            size, axes = np.linalg.eigh(curvature * np.outer(unit, unit))
+            curvature = (axes * np.maximum(size, 0.0)) @ axes.T / np.outer(unit, unit)
+        return _Local(np.concatenate(log), np.concatenate(slope), curvature, unit)
+
+    def _step(self, x: Real, local: _Local, log: Real, box: float) -> MinimaxStep | None:
+        """Smallest largest row, |d| <= box in natural units; multipliers of all rows; None where it fails."""
+        unit = local.unit
+        near = log > np.max(log) - _FAR_BELOW
+        step = minimax_step(
+            log[near],
+            local.slope[near] * unit,
+            local.curvature * np.outer(unit, unit),
+            np.maximum(-box, (self._low - x) / unit),
+            np.minimum(box, (self._high - x) / unit),
+            self._damping_rows * unit,
+            self._damping_limit - self._damping_rows @ x,
+        )
+        if step is None:
+            return None
+        multipliers = np.zeros(log.size)
+        multipliers[near] = step.multipliers
+        return MinimaxStep(step.step, step.level, multipliers)
+
+
+@dataclass(frozen=True, eq=False)
+class _Local:
+    """Model at a point: log (R,), slope (R, n), curvature (n, n), natural unit of each parameter (n,)."""
+
+    log: Real
+    slope: Real
+    curvature: Real
+    unit: Real
+
+
+class _Boundary:
+    """Members of every ellipse of one plant, fixed once."""
+
+    def __init__(self, cascade: Cascade, rows: Rows) -> None:
+        e = rows.ellipses
+        self._cascade, self._rows, self._ellipses = cascade, rows, e
+        self._omega, self._delay = e.omega_rad_s, rows.delay
+        angle = 2 * np.pi * np.arange(_BOUNDARY) / _BOUNDARY
+        self._members = (
+            e.centre[:, None]
+            + e.direction[:, None] * e.semi_major[:, None] * np.cos(angle)
+            + 1j * e.direction[:, None] * e.semi_minor[:, None] * np.sin(angle)
+        )
+        self._powers = 1j * tustin_frequency(self._omega, cascade.dt_s) / cascade.scale_rad_s
+        self._powers = np.where(np.abs(self._powers) > 1e6, 1e6j, self._powers)
+        joint = rows.w1
+        if rows.gp_max is not None:
+            joint = np.maximum(joint, rows.w4 * rows.gp_max)
+        with np.errstate(divide="ignore"):
+            self._log_joint, self._log_w3 = np.log(joint), np.log(rows.w3)
+        self._effort = np.flatnonzero(rows.w3 > 0)
+        self._damped = np.flatnonzero(rows.w4 > 0) if rows.gp_max is None else np.zeros(0, dtype=np.int64)
+
+    def covers_minus_one(self, x: Real) -> bool:
+        """Whether some ellipse contains -1/K; its boundary alone would not show it."""
+        e = self._ellipses
+        k = self._cascade.response(x, self._omega) * self._delay
+        turned = (1.0 + k * e.centre) * np.conj(k * e.direction)
+        size = np.abs(k) ** 2
+        major, minor = turned.real * e.semi_minor, turned.imag * e.semi_major
+        return bool(np.any(np.hypot(major, minor) < size * e.semi_major * e.semi_minor))
+
+    def rows(self, x: Real, *, gradient: bool) -> tuple[Real, Real]:
+        """Logarithms (R,) of all weighted values and, if asked, their slopes (R, n)."""
+        bare = self._cascade.response(x, self._omega)
+        k = bare * self._delay
+        at, _, _ = self._nearest(k)
+        back = 1.0 + at * k
+        distance = -np.log(np.maximum(np.abs(back), 1e-300))
+        effort = self._effort
+        size = np.log(np.maximum(np.abs(bare[effort]), 1e-300))
+        logs = [self._log_joint + distance, self._log_w3[effort] + size + distance[effort]]
+        damped = self._damped
+        worst = np.zeros(0, dtype=np.complex128)
+        if damped.size:
+            worst, _, _ = self._loudest(k[damped])
+            gain = np.abs(worst) / np.maximum(np.abs(1.0 + worst * k[damped]), 1e-300)
+            logs.append(np.log(self._rows.w4[damped] * gain))
+        if not gradient:
+            return np.concatenate(logs), np.zeros((0, 0))
+        relative = self._relative_slope(x)  # dK/K
+        turned = -(at * k / back)[:, None] * relative
+        slopes = [turned.real, (turned[effort] + relative[effort]).real]
+        if damped.size:
+            slopes.append((-(worst * k[damped] / (1.0 + worst * k[damped]))[:, None] * relative[damped]).real)
+        return np.concatenate(logs), np.concatenate(slopes)
+
+    def curvature(self, x: Real, multipliers: Real) -> Real:
+        """Second derivative (n, n) of the rows' sum weighted by multipliers (R,).
+
+        A row is the largest over the boundary angle of psi(x, angle), so its second derivative is psi_xx -
+        psi_xa psi_xa' / psi_aa: a long ellipse bends the row although its worst member moves only along it.
+        """
+        k = self._cascade.response(x, self._omega) * self._delay
+        count, effort, damped = self._omega.size, self._effort, self._damped
+        shared = multipliers[:count].copy()
+        shared[effort] += multipliers[count : count + effort.size]
+        of_effort = np.zeros(count)
+        of_effort[effort] = multipliers[count : count + effort.size]
+        relative = self._relative_slope(x)
+        total, second = self._bent(relative, k, shared, self._nearest(k), np.zeros(count))
+        second = second + of_effort
+        if damped.size:
+            more, own = self._bent(
+                relative[damped],
+                k[damped],
+                multipliers[count + effort.size :],
+                self._loudest(k[damped]),
+                np.ones(damped.size),
+            )
+            total = total + more
+            second[damped] += own
+        return total + self._section_curvature(x, relative, second)
+
+    @staticmethod
+    def _bent(
+        relative: Complex, k: Complex, share: Real, member: tuple[Complex, Complex, Complex], open_loop: Real
+    ) -> tuple[Real, Complex]:
+        """Curvature of sum share (open_loop log|g| - log|1 + g K|) but for that of log K, and the factor of
+        the latter, (F,)."""
+        g, g1, g2 = member
+        back = 1.0 + g * k
+        back = np.where(np.abs(back) < 1e-300, 1e-300, back)
+        w = g * k / back
+        total = -np.real((relative * (share * (w - w**2))[:, None]).T @ relative)
+        mixed = -np.real((g1 * k / back**2)[:, None] * relative)
+        safe = np.where(np.abs(g) > 0, g, 1.0)
+        bend = np.real(open_loop * (g2 / safe - (g1 / safe) ** 2) - g2 * k / back + (g1 * k / back) ** 2)
+        use = (bend < -1e-12) & (share > 0)
+        total = total + (mixed[use] * (share[use] / -bend[use])[:, None]).T @ mixed[use]
+        return total, np.asarray(-share * w, dtype=np.complex128)
+
+    def _nearest(self, k: Complex) -> tuple[Complex, Complex, Complex]:
+        """Members (F,) with the smallest |1 + g K|, and their first and second derivative along the
+        boundary."""
+        everywhere = np.arange(k.size)
+
+        def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
+            back = 1.0 + g * k
+            first = (back.conj() * g1 * k).real
+            return -np.abs(back), -first, -(np.abs(g1 * k) ** 2 + (back.conj() * g2 * k).real)
+
+        return self._worst(everywhere, -np.abs(1.0 + self._members * k[:, None]), newton)
+
+    def _loudest(self, k: Complex) -> tuple[Complex, Complex, Complex]:
+        """The same for the largest |g/(1 + g K)| at the damped frequencies; k (D,)."""
+        members = self._members[self._damped]
+        ratio = np.abs(members) / np.maximum(np.abs(1.0 + members * k[:, None]), 1e-300)
+
+        def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
+            back, safe = 1.0 + g * k, np.where(np.abs(g) > 0, g, 1.0)
+            back = np.where(np.abs(back) < 1e-300, 1e-300, back)
+            first = (g1 / safe - g1 * k / back).real
+            second = (g2 / safe - (g1 / safe) ** 2 - g2 * k / back + (g1 * k / back) ** 2).real
+            return np.abs(g) / np.abs(back), first, second
+
+        return self._worst(self._damped, ratio, newton)
+
+    def _worst(
+        self,
+        index: npt.NDArray[np.int64],
+        value: Real,
+        newton: Callable[[Complex, Complex, Complex], tuple[Real, Real, Real]],
+    ) -> tuple[Complex, Complex, Complex]:
+        """Largest member: best boundary point, vertex of the parabola through it, Newton from there.
+
+        newton: (value, slope, bend) along the boundary from a member and its derivatives. A point that does
+        not gain on the boundary's best is not taken.
+        """
+        e = self._ellipses
+        centre, turn = e.centre[index], e.direction[index]
+        major, minor = e.semi_major[index], e.semi_minor[index]
+
+        def member(angle: Real) -> tuple[Complex, Complex, Complex]:
+            cos, sin = np.cos(angle), np.sin(angle)
+            away = turn * (major * cos + 1j * minor * sin)
+            return centre + away, turn * (-major * sin + 1j * minor * cos), -away
+
+        row = np.arange(index.size)
+        top = np.argmax(value, axis=1)
+        here, before, after = (value[row, (top + step) % _BOUNDARY] for step in (0, -1, 1))
+        bend = before - 2 * here + after
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+        width = 2 * np.pi / _BOUNDARY
+        best = width * top
+        angle = best + width * np.clip(shift, -0.5, 0.5)
+        for _ in range(_REFINEMENTS + 1):
+            found, slope, curve = newton(*member(angle))
+            better = found > here
+            best, here = np.where(better, angle, best), np.where(better, found, here)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                change = np.where(curve < 0, -slope / np.where(curve < 0, curve, -1.0), 0.0)
+            angle = angle + np.clip(change, -0.5 * width, 0.5 * width)
+        return member(best)
+
+    def _section_curvature(self, x: Real, relative: Complex, factor: Complex) -> Real:
+        """Real part of sum factor (F,) times the second derivative of log K, (n, n): block by section."""
+        p = self._powers
+        total = np.zeros((x.size, x.size))
+        at = 0
+        for kind, (numerator, denominator) in zip(
+            self._cascade.sections, self._cascade.split(x), strict=True
+        ):
+            if kind == "notch":
+                top, bottom = np.polyval(numerator, p), np.polyval(denominator, p)
+                top = np.where(np.abs(top) < 1e-300, 1e-300, top)
+                in_top = np.stack([np.exp(x[at]) * p / top, 0 * p, denominator[2] / top], axis=1)
+                in_bottom = np.stack([0 * p, denominator[1] * p / bottom, denominator[2] / bottom], axis=1)
+                block = np.real(
+                    (in_bottom * factor[:, None]).T @ in_bottom - (in_top * factor[:, None]).T @ in_top
+                )
+                block += np.diag(np.real(factor @ (in_top - in_bottom)))
+                total[at : at + 3, at : at + 3] = block
+                at += 3
+                continue
+            n = numerator.size
+            tops = relative[:, at : at + n]
+            total[at : at + n, at : at + n] = -np.real((tops * factor[:, None]).T @ tops)
+            at += n
+            m = 0 if kind == "integrator" else n - 1
+            if m:
+                bottoms = relative[:, at : at + m]
+                block = np.real((bottoms * factor[:, None]).T @ bottoms)
+                total[at : at + m, at : at + m] = block + np.diag(np.real(factor @ bottoms))
+                at += m
+        return total
+
+    def _relative_slope(self, x: Real) -> Complex:
+        """(dK/dx)/K, (F, n)."""
+        p = self._powers
+        columns: list[Complex] = []
+        at = 0
+        for kind, (numerator, denominator) in zip(
+            self._cascade.sections, self._cascade.split(x), strict=True
+        ):
+            top, bottom = np.polyval(numerator, p), np.polyval(denominator, p)
+            top = np.where(np.abs(top) < 1e-300, 1e-300, top)
+            if kind == "notch":
+                columns.append(np.exp(x[at]) * p / top)
+                columns.append(-denominator[1] * p / bottom)
+                columns.append(denominator[2] * (1.0 / top - 1.0 / bottom))
+                at += 3
+                continue
+            degree = numerator.size - 1
+            columns += [p ** (degree - power) / top for power in range(degree + 1)]
+            at += degree + 1
+            if kind != "integrator":
+                columns += [-denominator[1 + j] * p ** (degree - 1 - j) / bottom for j in range(degree)]
+                at += degree
+        return np.stack(columns, axis=1)
+
+
+def natural_units(cascade: Cascade, x: Real) -> Real:
+    """A substantial change of each parameter: numerators relative to their section's gain and corner."""
+    units: list[float] = []
+    for kind, (numerator, denominator) in zip(cascade.sections, cascade.split(x), strict=True):
+        degree = numerator.size - 1
+        corner = 1.0 if kind == "integrator" else float(denominator[-1] ** (1.0 / degree))
+        powers = corner ** np.arange(degree + 1)
+        if kind == "notch":
+            units += [1.0, 1.0, 1.0]
+            continue
+        gain = max(float(np.max(np.abs(numerator) / powers)), 1e-9)
+        units += (gain * powers).tolist()
+        units += [] if kind == "integrator" else [1.0] * degree
+    return np.array(units)

@@ -1,0 +1,267 @@
+"""Search for the best controller of one order: starts, descent, exchange of frequencies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+
+import numpy as np
+
+from control_design.controllers.biquads import Cascade
+from control_design.plants.ellipses import Real
+from control_design.synthesis.descent import MinimaxDescent, natural_units
+from control_design.synthesis.search_tasks import StartEnd, StartTask, Workshop
+from control_design.synthesis.starts import StartMaker, with_gain
+from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
+from control_design.synthesis.work_pool import WorkPool
+
+Told = Callable[[float, str], None]
+
+_DRAWS = 200  # shaped loops drawn; each costs 1 ms
+_EASED = 4  # with tracking: low-gain starts given to the interior point first
+_SHAPED_TRACKING = 3
+_STEPS = 100
+_CARRIED = 3  # candidates carried through the exchange
+_HOPS, _LATER_HOPS = 4, 2
+_HALVINGS = 20  # natural units of a section far from the loop's crossover are far too large
+_RETRIEVALS = 3  # rounds for ends that are good on the grid and not robustly stable between its points
+_RETREAT, _RETREATS = 0.8, 20  # factor on their gain, and how often, until they are stable on the finer grid
+_FINISHING = 10  # rounds for the best alone, until dense check and grid agree
+_AGREE = 1.001
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A stable controller: parameters, worst case on the lean grid it came from, and on the dense grid."""
+
+    parameters: Real
+    gamma_grid: float
+    gamma: float
+
+
+@dataclass(frozen=True, eq=False)
+class OrderResult:
+    """Best candidate of one order (None: nothing stable), how the starts did, gamma after every round.
+
+    nearest: without a best, the parameters of the end that came nearest to a robustly stable loop.
+    """
+
+    best: Candidate | None
+    reports: tuple[StartReport, ...]
+    history: tuple[float, ...]
+    nearest: Real | None = None
+
+
+class OrderSearch:
+    """One cascade on one problem; `given` are parameter vectors that are good already, from a lower order."""
+
+    def __init__(
+        self,
+        workshop: Workshop,
+        pool: WorkPool,
+        cascade: Cascade,
+        rng: np.random.Generator,
+        tell: Told,
+        given: Sequence[Real] = (),
+    ) -> None:
+        self.workshop, self.pool, self.problem = workshop, pool, workshop.problem
+        self.cascade, self.rng, self.tell, self.given = cascade, rng, tell, given
+        self.options, self.spec = self.problem.options, self.problem.spec
+        self.reports: list[StartReport] = []
+
+    def run(self) -> OrderResult:
+        """Starts, descent from each, exchange with hops."""
+        found = [self._as_given(x) for x in self.given[:1]]
+        if self._enough(found):
+            return OrderResult(found[0], (), (found[0].gamma,))
+        tasks = self._starts()
+        drawn = len(tasks) - len(self.given)
+        least = len(self.given) + max((drawn + 1) // 2, min(drawn, 3))
+        ends: list[Candidate] = []
+        for number, end in enumerate(self.pool.do(tasks)):
+            self.tell(0.5 * (number + 1) / len(tasks), f"start {number + 1} of {len(tasks)}")
+            ends.append(self._taken(end))
+            found.append(ends[-1])
+            if self._enough(found):
+                best = min(found, key=lambda c: c.gamma)
+                return OrderResult(best, tuple(self.reports), (best.gamma,))
+            if number + 1 >= least and self._agree(found):
+                break  # not before half of the starts: the first ones are of one kind
+        found = self._retrieved(found)
+        if not found:
+            return OrderResult(None, tuple(self.reports), (), self._nearest(ends))
+        return self._exchange(found)
+
+    def _nearest(self, ends: Sequence[Candidate]) -> Real:
+        """Parameters that are stable on the grid, the smallest worst case first; else nearest to the
+        circle."""
+
+        def radius(parameters: Real) -> float:
+            poles = self.problem.closed_loop_poles(self.cascade, parameters)
+            return max(float(np.max(np.abs(z), initial=0.0)) for z in poles)
+
+        key = [(c.gamma_grid, radius(c.parameters)) for c in ends]
+        return ends[min(range(len(ends)), key=lambda at: key[at])].parameters
+
+    def _retrieved(self, found: Sequence[Candidate]) -> list[Candidate]:
+        """What is stable on the dense grid, best first, enlarged by what can be saved of the rest.
+
+        An end that is better on the grid than the best, and reaches -1 between its points, has found a valley
+        worth having: with its violated frequencies on the grid it goes on, with less gain at first.
+        """
+        kept = [c for c in found if np.isfinite(c.gamma)]
+        lost = [c for c in found if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
+        for _ in range(_RETRIEVALS):
+            best = min((c.gamma for c in kept), default=np.inf)
+            limit = best * (1 - self.options.exchange_tolerance)
+            lost = different([c for c in lost if c.gamma_grid < limit], _CARRIED, on_grid=True)
+            if not lost or self._enough(kept):
+                break
+            for c in lost:
+                self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
+            retreats = [self._retreat(c.parameters) for c in lost]
+            tasks = [self._task(x) for x in retreats if x is not None]
+            lost = [self._taken(end) for end in self.pool.do(tasks)]
+            kept += [c for c in lost if np.isfinite(c.gamma)]
+            lost = [c for c in lost if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
+        return sorted(kept, key=lambda c: c.gamma)
+
+    def _retreat(self, parameters: Real) -> Real | None:
+        """The same with less gain, until it is stable on the grids as they are now; None if it never is."""
+        for number in range(1, _RETREATS + 1):
+            trial = with_gain(self.cascade, parameters, _RETREAT**number)
+            if np.isfinite(self._descent().value(trial)):
+                return trial
+        return None
+
+    def _agree(self, found: Sequence[Candidate]) -> bool:
+        """Enough descents ended at the best value: more of them would hardly find another."""
+        stable = [c.gamma_grid for c in found if np.isfinite(c.gamma_grid)]
+        return sum(g <= min(stable) * _AGREE for g in stable) >= self.options.agreeing_starts
+
+    def _enough(self, found: Sequence[Candidate]) -> bool:
+        best = min((c.gamma for c in found), default=np.inf)
+        return best <= self.options.sufficient_gamma
+
+    def _task(self, parameters: Real, *, eased: bool = False) -> StartTask:
+        return StartTask(self.cascade, parameters, tuple(self.problem.grids), _STEPS, eased)
+
+    def _taken(self, end: StartEnd) -> Candidate:
+        """A start's end as a candidate (infinite gamma where it is unstable), reported."""
+        last = len(end.stages) - 1
+        for number, stage in enumerate(end.stages):
+            dense = end.gamma_dense if number == last and np.isfinite(end.gamma_dense) else None
+            at = len(self.reports) + 1
+            gamma = min(stage.gamma, LARGEST_GAMMA)
+            self.reports.append(StartReport(at, stage.status, stage.iterations, gamma, dense))
+        return Candidate(end.parameters, end.gamma, end.gamma_dense)
+
+    def _as_given(self, parameters: Real) -> Candidate:
+        return Candidate(
+            parameters, self._descent().value(parameters), self.problem.gamma(self.cascade, parameters)
+        )
+
+    def _descent(self) -> MinimaxDescent:
+        return self.workshop.descent(self.cascade, tuple(self.problem.grids))
+
+    def _starts(self) -> list[StartTask]:
+        maker = StartMaker(
+            self.cascade,
+            self.problem.lean(),
+            self.problem.integrators,
+            self._descent().value,
+            self.rng,
+            controller_damping=self.spec.controller_damping,
+            keeps_sign=self.problem.asks_tracking or self.problem.integrators > 0,
+        )
+        tracking = self.problem.asks_tracking
+        shaped = [self._task(x) for x, _ in maker.shaped(_DRAWS, self.options.starts)]
+        random = [self._task(maker.low_gain(), eased=tracking) for _ in range(self.options.starts)]
+        given = [self._task(x) for x in self.given]
+        if tracking:
+            # The interior point finds valleys the descent alone does not: its starts come first, so that no
+            # agreement of the others ends the search before them.
+            return [*given, *random[:_EASED], *shaped[:_SHAPED_TRACKING]]
+        mixed = [start for pair in zip_longest(shaped, random) for start in pair if start is not None]
+        return [*given, *mixed]
+
+    def _exchange(self, found: list[Candidate]) -> OrderResult:
+        """Add violated frequencies of the best candidates, improve them on the finer grid, and again.
+
+        Several are carried along at first: the best on a coarse grid is often not the best on a finer one.
+        In between, hops from the best look for a better valley.
+        """
+        history, tolerance = [found[0].gamma], self.options.exchange_tolerance
+        pool, fresh = different(found, _CARRIED), list[Candidate]()
+        for number in range(self.options.exchange_rounds):
+            self.tell(0.5 + 0.5 * number / self.options.exchange_rounds, f"exchange {number + 1}")
+            if self._enough(pool):
+                break
+            # Also of what lost: better on the grid and worse between its points, it may yet win.
+            added = sum(
+                self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
+                for c in different([*pool, *fresh], _CARRIED)
+            )
+            if added == 0 and number > 0:
+                break
+            starts = [c.parameters for c in pool]
+            if fresh and min(c.gamma_grid for c in fresh) < pool[0].gamma * (1 - tolerance):
+                starts.append(min(fresh, key=lambda c: c.gamma_grid).parameters)
+            hops = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts)
+            starts += [self._hop(pool[0].parameters) for _ in range(hops)]
+            fresh = []
+            for at, end in enumerate(self.pool.do([self._task(x) for x in starts])):
+                fresh.append(self._taken(end))
+                if number == 0 and at >= len(pool) and self._agree(fresh):
+                    break
+            fresh = [c for c in self._retrieved([pool[0], *fresh]) if c is not pool[0]]
+            pool = different([*pool, *fresh], max(1, _CARRIED - 1 - number))
+            history.append(pool[0].gamma)
+            settled = min([c.gamma_grid for c in fresh], default=np.inf) > pool[0].gamma * (1 - tolerance)
+            if number > 0 and settled and history[-1] > history[-2] * (1 - tolerance):
+                break
+        best = self._finished(pool[0])
+        if best.gamma < history[-1]:
+            history.append(best.gamma)
+        return OrderResult(best, tuple(self.reports), tuple(history))
+
+    def _finished(self, best: Candidate) -> Candidate:
+        """The best alone, violated frequencies added and improved until dense check and grid agree."""
+        current = best
+        for _ in range(_FINISHING):
+            agreed = current.gamma <= current.gamma_grid * (1 + self.options.exchange_tolerance)
+            if agreed or self._enough([best]):
+                break
+            self.problem.add_violated(self.cascade, current.parameters, current.gamma_grid)
+            current = self._taken(self.workshop.do(self._task(current.parameters)))
+            if not np.isfinite(current.gamma):
+                break
+            best = min(best, current, key=lambda c: c.gamma)
+        return best
+
+    def _hop(self, parameters: Real) -> Real:
+        """A stable neighbour: every parameter moved by up to a natural unit, less until it is stable."""
+        size = 10 ** self.rng.uniform(-1.0, 0.0)
+        direction = self.rng.standard_normal(parameters.size) * natural_units(self.cascade, parameters)
+        for _ in range(_HALVINGS):
+            if np.isfinite(self._descent().value(parameters + size * direction)):
+                break
+            size *= 0.5
+        return np.asarray(parameters + size * direction, dtype=np.float64)
+
+
+def different(candidates: Sequence[Candidate], most: int, *, on_grid: bool = False) -> list[Candidate]:
+    """Best candidates that differ in gamma (on_grid: of their lean grid) by more than 0.1 %: the same optimum
+    twice teaches nothing."""
+
+    def gamma(candidate: Candidate) -> float:
+        return candidate.gamma_grid if on_grid else candidate.gamma
+
+    kept: list[Candidate] = []
+    for candidate in sorted(candidates, key=gamma):
+        if all(abs(gamma(candidate) / gamma(other) - 1) > _AGREE - 1 for other in kept):
+            kept.append(candidate)
+        if len(kept) == most:
+            break
+    return kept

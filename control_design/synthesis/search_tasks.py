@@ -1,0 +1,106 @@
+"""What the search spends its time on, as independent tasks: one start each, a function of its fields alone.
+
+So it does not matter which process does which, nor in which order: `work_pool` deals them out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from control_design.analysis.worst_case import KINDS
+from control_design.controllers.biquads import Cascade
+from control_design.plants.ellipses import Real
+from control_design.synthesis.angle_program import AngleProgram
+from control_design.synthesis.descent import MinimaxDescent
+from control_design.synthesis.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class StartTask:
+    """One start: controller parameters, the lean grids of all plants, and how it is improved.
+
+    eased: first the interior point without W4 of the measured output, which crosses steep tracking weights
+    better than the descent; the descent goes on from there, or from the start itself where that is unstable.
+    """
+
+    cascade: Cascade
+    parameters: Real
+    grids: tuple[Real, ...]
+    steps: int
+    eased: bool = False
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Status, iterations and worst case on the lean grid of one solver run (inf: unstable)."""
+
+    status: str
+    iterations: int
+    gamma: float
+
+
+@dataclass(frozen=True, eq=False)
+class StartEnd:
+    """Where a start ended: parameters, worst case on the lean and on the dense grid, what was run."""
+
+    parameters: Real
+    gamma: float
+    gamma_dense: float
+    stages: tuple[Stage, ...]
+
+
+class Workshop:
+    """A problem with the tools for its tasks; the last cascade's and grids' are kept between tasks."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._for: tuple[Cascade, tuple[Real, ...]] | None = None
+        self._descent: MinimaxDescent | None = None
+        self._program: AngleProgram | None = None
+
+    def descent(self, cascade: Cascade, grids: tuple[Real, ...]) -> MinimaxDescent:
+        """Descent for a cascade on given grids."""
+        self._turn_to(cascade, grids)
+        if self._descent is None:
+            problem = self.problem
+            self._descent = MinimaxDescent(
+                cascade,
+                problem.rows(grids),
+                lambda x: problem.stable(cascade, x),
+                controller_damping=problem.spec.controller_damping,
+            )
+        return self._descent
+
+    def do(self, task: StartTask) -> StartEnd:
+        """Improve one start."""
+        descent = self.descent(task.cascade, task.grids)
+        start, stages = task.parameters, []
+        if task.eased:
+            program = self._eased_program(task)
+            gamma = self.problem.gamma(task.cascade, start, kinds=KINDS[:3])
+            point = program.solve(self.problem.at(task.cascade, start, program.plants, gamma))
+            stages.append(Stage(point.status, point.iterations, 1.0 / point.g))
+            if np.isfinite(descent.value(point.parameters)):
+                start = point.parameters
+        end = descent.run(start, task.steps)
+        stages.append(Stage("descent", end.steps, end.gamma))
+        dense = self.problem.gamma(task.cascade, end.parameters) if np.isfinite(end.gamma) else float("inf")
+        return StartEnd(end.parameters, end.gamma, dense, tuple(stages))
+
+    def _eased_program(self, task: StartTask) -> AngleProgram:
+        if self._program is None:
+            self._program = AngleProgram(
+                task.cascade,
+                self.problem.rows(task.grids),
+                controller_damping=self.problem.spec.controller_damping,
+                max_iterations=self.problem.options.iterations,
+            )
+        return self._program
+
+    def _turn_to(self, cascade: Cascade, grids: tuple[Real, ...]) -> None:
+        known = self._for
+        if known is not None and known[0] == cascade and all(map(np.array_equal, known[1], grids)):
+            return
+        self._for, self._descent, self._program = (cascade, grids), None, None

@@ -1,0 +1,163 @@
+"""Structured robust synthesis: the orders below the asked one first, then the asked one from their
+results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from control_design.analysis.worst_case import KINDS
+from control_design.controllers.biquads import Cascade, SectionKind
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Real
+from control_design.plants.frequency_grid import local_maxima
+from control_design.plants.guards import Guard
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
+from control_design.synthesis.order_search import Candidate, OrderResult, OrderSearch
+from control_design.synthesis.problem import Problem
+from control_design.synthesis.search_tasks import Workshop
+from control_design.synthesis.shortfall import what_destabilises
+from control_design.synthesis.starts import with_cancelling_section
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
+from control_design.synthesis.work_pool import WorkPool
+
+__all__ = ["Progress", "SynthesisOptions", "synthesise"]
+
+Progress = Callable[[float, str], None]
+
+_STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
+_MEANINGLESS = 1e4  # a weighted worst case above it is a loop on the edge of stability, whatever its digits
+_EMBEDDINGS = 3  # ways to add a cancelling section to the result of the order below
+_LOWEST_ORDER, _LOWEST_TRACKING = 2, 3  # first rung of the ladder; two states rarely track and damp
+
+
+def synthesise(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: SynthesisOptions | None = None,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    guards: Sequence[Guard] = (),
+) -> SynthesisResult:
+    """Design one controller for all plants: smallest gamma over every ellipse.
+
+    Parameters
+    ----------
+    plants : at least one; several loads, operating points or identified models at once.
+    rng : the starts are drawn from it; same generator state, same result.
+    progress : called with (fraction, message).
+    guards : single responses that must be stable as well, whatever the weights say of them.
+
+    Raises
+    ------
+    SpecificationError
+        If specification and plants contradict each other (before optimising).
+
+    Notes
+    -----
+    Every controller of order n - 2 is one of order n with a section whose zeros cancel its poles. The orders
+    n - 2, n - 4, ... are therefore solved first, each with its own generator derived from `rng`, and handed
+    upwards: with the same rng, plants and options two states more never give a larger gamma (from order 3 on
+    with a tracking requirement, else from order 2). See `order_search` for one order.
+    """
+    options = options or SynthesisOptions()
+    specification.check_against(plants)
+    tell = progress or (lambda fraction, message: None)
+    problem = Problem(tuple(plants), specification, options, tuple(guards))
+    own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
+    root = int(rng.integers(2**63))
+    ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)
+    cascade: Cascade | None = None
+    result = OrderResult(None, (), ())
+    reports: list[StartReport] = []
+    workshop = Workshop(problem)
+    with WorkPool(workshop, options.jobs) as pool:
+        for number, sections in enumerate(ladder):
+            lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale)
+            own = np.random.default_rng([root, cascade.order])
+            given: list[Real] = []
+            if lower is not None and result.best is not None:
+                given = [
+                    with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
+                    for _ in range(_EMBEDDINGS)
+                ]
+            part = _part(tell, number, len(ladder), cascade.order)
+            result = OrderSearch(workshop, pool, cascade, own, part, given).run()
+            reports += result.reports
+    assert cascade is not None
+    numbered = tuple(
+        StartReport(number + 1, r.status, r.iterations, r.gamma_grid, r.gamma_dense)
+        for number, r in enumerate(reports)
+    )
+    best = result.best
+    if best is None or best.gamma >= _MEANINGLESS:
+        nearest = result.nearest if best is None else best.parameters
+        return _nothing_stable(problem, cascade, nearest, best, numbered)
+    tell(1.0, f"gamma {best.gamma:.4g}")
+    return SynthesisResult(
+        outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
+        controller=problem.controller(cascade, best.parameters),
+        gamma=best.gamma,
+        blocking=_blocking(problem, cascade, best),
+        starts=numbered,
+        gamma_history=result.history,
+        grid_points=sum(grid.size for grid in problem.grids),
+    )
+
+
+def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[SectionKind, ...]]:
+    """Section lists from the lowest order (at least `lowest`) to the asked one, one section more each."""
+    rungs = [sections]
+    while rungs[0][-1] in ("second_order", "notch"):
+        shorter = rungs[0][:-1]
+        if Cascade(shorter, 1.0, 1.0).order < lowest:
+            break
+        rungs.insert(0, shorter)
+    return rungs
+
+
+def _part(tell: Progress, number: int, count: int, order: int) -> Progress:
+    """Progress of one order as part of the whole."""
+    return lambda fraction, message: tell((number + fraction) / count, f"order {order}: {message}")
+
+
+def _nothing_stable(
+    problem: Problem,
+    cascade: Cascade,
+    nearest: Real | None,
+    edge: Candidate | None,
+    reports: tuple[StartReport, ...],
+) -> SynthesisResult:
+    """No controller, and where the search came nearest to one: which requirement fails there."""
+    zero = np.zeros((1, 1))
+    nothing = Controller(
+        np.zeros((0, 0)),
+        np.zeros((0, 1)),
+        np.zeros((1, 0)),
+        zero,
+        problem.dt_s,
+        computational_delay_samples=problem.spec.computational_delay_samples,
+        name="none: no stable design found",
+    )
+    points = sum(grid.size for grid in problem.grids)
+    blocking = () if nearest is None else what_destabilises(problem, cascade, nearest)
+    if not blocking and edge is not None:
+        blocking = _blocking(problem, cascade, edge)
+    return SynthesisResult(Outcome.NOT_CONVERGED, nothing, float("inf"), blocking, reports, (), points)
+
+
+def _blocking(problem: Problem, cascade: Cascade, best: Candidate) -> tuple[BlockingPoint, ...]:
+    points = []
+    for _, data in problem.checks(cascade, best.parameters):
+        omega = data.ellipses.omega_rad_s
+        values = data.weighted(cascade.response(best.parameters, omega))
+        for kind in KINDS:
+            for index in local_maxima(values[kind])[:10]:
+                value = float(values[kind][index])
+                if value >= _STILL_BLOCKING * best.gamma:
+                    points.append(BlockingPoint(data.plant.name, kind, float(omega[index]), value))
+    return tuple(sorted(points, key=lambda p: -p.value))

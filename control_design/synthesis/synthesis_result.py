@@ -1,0 +1,143 @@
+"""What a synthesis returns: the controller, how good it is, and what blocks it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from control_design.controllers.controller import Controller
+
+
+class Outcome(Enum):
+    MET_ON_GRID = "every requirement is met at every frequency of the dense grid for every plant"
+    NOT_MET = "the solver converged to a stable loop, but some requirement is exceeded"
+    NOT_CONVERGED = "no start led to a stable loop; the controller means nothing"
+
+
+class SynthesisError(Exception):
+    """The synthesis did not meet the specification; `result` holds the best point found."""
+
+    def __init__(self, message: str, result: SynthesisResult) -> None:
+        super().__init__(message)
+        self.result = result
+
+
+@dataclass(frozen=True)
+class BlockingPoint:
+    """A frequency at which a requirement keeps gamma from getting smaller.
+
+    weight: one of `worst_case.KINDS`; without a stable design, one of the words of `shortfall`. value:
+    weighted worst case there, inf where the loop or a member of the ellipse is unstable.
+    """
+
+    plant: str
+    weight: str
+    omega_rad_s: float
+    value: float
+
+
+LARGEST_GAMMA = 1e300
+"""What a descent that found no stable loop reports in place of infinity."""
+
+
+@dataclass(frozen=True)
+class StartReport:
+    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid.
+
+    gamma_dense None: unstable, or (status "descent") not checked on the dense grid.
+    """
+
+    start: int
+    status: str
+    iterations: int
+    gamma_grid: float
+    gamma_dense: float | None
+
+    @property
+    def stable(self) -> bool:
+        """Whether it ended in a stable loop; a descent never leaves stability: a finite gamma says it did."""
+        return self.gamma_dense is not None or (self.status == "descent" and self.gamma_grid < LARGEST_GAMMA)
+
+
+@dataclass(frozen=True)
+class SynthesisResult:
+    """Best controller found and how good it is.
+
+    gamma: largest weighted worst case over plants, ellipses and the dense grid (<= 1: met; 1.2: requirements
+    exceeded by 20 %). blocking: where and which weight, worst first. gamma_history: dense gamma of the best
+    point after the starts and each exchange round. grid_points: final size of the programme's grids. outcome
+    says what gamma means; certify with `certificate.certify` before use.
+    """
+
+    outcome: Outcome
+    controller: Controller
+    gamma: float
+    blocking: tuple[BlockingPoint, ...]
+    starts: tuple[StartReport, ...]
+    gamma_history: tuple[float, ...]
+    grid_points: int
+
+    def explain(self) -> str:
+        """One line: met, or how far and which frequency and requirement block it."""
+        first = self.blocking[0] if self.blocking else None
+        if self.outcome is Outcome.NOT_CONVERGED:
+            nearest = (
+                ""
+                if first is None
+                else f"; where it came nearest, {first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} "
+                "rad/s blocks"
+            )
+            return f"{self.outcome.value}{nearest}"
+        where = (
+            ""
+            if first is None
+            else f"; {first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} rad/s blocks"
+        )
+        if self.outcome is Outcome.MET_ON_GRID:
+            return f"{self.outcome.value} (gamma {self.gamma:.4g}{where} more)"
+        return (
+            f"{self.outcome.value} (gamma {self.gamma:.4g}, {100 * (self.gamma - 1):.3g} % too much{where})"
+        )
+
+    def controller_or_raise(self) -> Controller:
+        """The controller if the specification is met on the grid.
+
+        Raises
+        ------
+        SynthesisError
+            Otherwise, with this result attached.
+        """
+        if self.outcome is not Outcome.MET_ON_GRID:
+            raise SynthesisError(self.explain(), self)
+        return self.controller
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        data = asdict(self) | {"outcome": self.outcome.name, "controller": self.controller.to_dict()}
+        data["gamma"] = self.gamma if np.isfinite(self.gamma) else None
+        data["gamma_history"] = [g if np.isfinite(g) else None for g in self.gamma_history]
+        data["blocking"] = [
+            asdict(b) | {"value": b.value if np.isfinite(b.value) else None} for b in self.blocking
+        ]
+        data["starts"] = [asdict(start) for start in self.starts]
+        return data
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> SynthesisResult:
+        """Inverse of `to_dict`."""
+
+        def number(value: float | None) -> float:
+            return float("inf") if value is None else value
+
+        return cls(
+            outcome=Outcome[data["outcome"]],
+            controller=Controller.from_dict(data["controller"]),
+            gamma=number(data["gamma"]),
+            blocking=tuple(BlockingPoint(**(b | {"value": number(b["value"])})) for b in data["blocking"]),
+            starts=tuple(StartReport(**start) for start in data["starts"]),
+            gamma_history=tuple(number(g) for g in data["gamma_history"]),
+            grid_points=int(data["grid_points"]),
+        )

@@ -1,0 +1,131 @@
+"""Tasks of the search done here or in processes of their own; the answers come in the order of the tasks.
+
+Processes are spawned, not forked: BLAS and IPOPT keep threads and locks that do not survive a fork. Each has
+one BLAS thread, leaves interrupts from the keyboard to its parent and ends when the parent does.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing.reduction import ForkingPickler
+from types import TracebackType
+from typing import Any
+
+import control
+import numpy as np
+
+from control_design.plants.guards import Guard
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
+from control_design.synthesis.problem import Problem
+from control_design.synthesis.search_tasks import StartEnd, StartTask, Workshop
+from control_design.synthesis.synthesis_options import SynthesisOptions
+
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def _parts(system: control.StateSpace) -> tuple[Any, tuple[Any, ...]]:
+    """How a state space travels to another process: python-control keeps a local function in its own."""
+    matrices = (np.asarray(getattr(system, name)) for name in "ABCD")
+    return control.StateSpace, (*matrices, system.dt)
+
+
+ForkingPickler.register(control.StateSpace, _parts)  # for transport between our processes only
+
+
+class WorkPool:
+    """Does start tasks with `jobs` processes (1: in this one); use as a context manager.
+
+    Raises
+    ------
+    ValueError
+        If jobs > 1 and the plants cannot be sent to another process (an uncertainty made of local functions).
+    """
+
+    def __init__(self, workshop: Workshop, jobs: int) -> None:
+        self._workshop = workshop
+        self._pool: ProcessPoolExecutor | None = None
+        if jobs == 1:
+            return
+        problem = workshop.problem
+        parts = problem.plants, problem.spec, problem.options, problem.guards
+        try:
+            ForkingPickler.dumps(parts)
+        except Exception as error:  # what a plant made of local functions raises differs between versions
+            raise ValueError(
+                f"jobs = {jobs} needs plants that can be sent to another process: {error}; use jobs = 1"
+            ) from error
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=parts)
+        before = {name: os.environ.get(name) for name in _ONE_THREAD}
+        os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+        try:
+            pool.submit(_ready)  # the first task starts all processes, with these variables
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
+        self._pool = pool
+
+    def do(self, tasks: Sequence[StartTask]) -> Iterator[StartEnd]:
+        """Answers in the order of the tasks. Whoever stops asking leaves the rest undone."""
+        if self._pool is None:
+            for task in tasks:
+                yield self._workshop.do(task)
+            return
+        waiting: list[Future[StartEnd]] = [self._pool.submit(_do, task) for task in tasks]
+        try:
+            for future in waiting:
+                yield future.result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+    def __enter__(self) -> WorkPool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends the processes; a task that is running takes a second at most."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+_own: Workshop | None = None  # of a worker process
+
+
+def _begin(
+    plants: tuple[UncertainPlant, ...],
+    specification: Specification,
+    options: SynthesisOptions,
+    guards: tuple[Guard, ...],
+) -> None:
+    """First thing in a worker process."""
+    global _own
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    _own = Workshop(Problem(plants, specification, options, guards))
+
+
+def _ready() -> None:
+    """Nothing: a task that starts the processes."""
+
+
+def _do(task: StartTask) -> StartEnd:
+    assert _own is not None
+    return _own.do(task)

@@ -1,0 +1,1 @@
+"""Which hypotheses the records support, and how surely."""

@@ -1,0 +1,154 @@
+"""Do the held-out records confirm the answer that the estimation records gave?
+
+They are predicted from values that were fitted without them. As long as they confirm the answer they decide
+nothing. Where they leave more over than noise, solver disagreement and uncertain values explain, or where a
+rival predicts them far better, every answer that was still possible is confronted with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, disagreement_gain
+from diagnosis.fit.discrepancy import Leftover, leftover
+from diagnosis.fit.fit import Fit, difference_quotients
+from diagnosis.fit.residual import ResidualModel
+from diagnosis.fit.solver_spread import solver_spread, without_drift
+from diagnosis.machine.machine_protocol import Real
+
+# Log odds for an unknown rest that held-out records may add before the answer counts as not confirmed.
+_CONFIRMED = 2.0
+# Log weight by which a rival may lead the answer once both have predicted the held-out records.
+_CONTRADICTED = 2.0
+
+
+def confronted(
+    model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis
+) -> list[Hypothesis] | None:
+    """The hypotheses as held-out records leave them; None if these confirm the accepted one.
+
+    The log density with which each possible answer predicts them is added to its weights, and to those of an
+    unknown rest besides what such a rest gains by them. Where a machine states a model error of its
+    own nothing changes: what held-out records leave over is what that error allows.
+    """
+    case = model.case
+    if accepted.fit.weighing.model_error > 0 or not case.held_out:
+        return None
+    first = _prediction(model, accepted.fit)
+    if first.unknown_gain < _CONFIRMED and not _contradicted(model, hypotheses, accepted, first):
+        return None
+    best = max(h.largest_weight for h in hypotheses)
+    seen = {
+        k: first if h is accepted else _prediction(model, h.fit)
+        for k, h in enumerate(hypotheses)
+        if h.largest_weight > best - STILL_POSSIBLE
+    }
+    # All others stay behind the best prediction by what they were behind before.
+    least = _Prediction(max(p.gain for p in seen.values()), 0.0, 0.0)
+    return [_with(h, seen.get(k, least)) for k, h in enumerate(hypotheses)]
+
+
+def _contradicted(
+    model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis, first: _Prediction
+) -> bool:
+    """Whether a rival of no more effects is well ahead of the accepted answer once both have predicted."""
+    ahead = accepted.log_weight + first.gain + _CONTRADICTED
+    close: dict[tuple[frozenset[str], bool], Hypothesis] = {}
+    for h in sorted(hypotheses, key=lambda h: -h.weight):
+        if len(h.names) <= len(accepted.names) or not accepted.names:
+            close.setdefault((frozenset(h.names), h.is_answer), h)
+    return any(
+        h.weight + _prediction(model, h.fit).gain > ahead
+        for h in close.values()
+        if h is not accepted and h.weight > accepted.log_weight - STILL_POSSIBLE
+    )
+
+
+def _with(hypothesis: Hypothesis, seen: _Prediction) -> Hypothesis:
+    known = hypothesis.log_weight + seen.gain
+    unknown = hypothesis.unknown_weight + seen.gain
+    if hypothesis.is_answer:
+        unknown += seen.unknown_gain
+    return replace(hypothesis, log_weight=known, unknown_weight=unknown)
+
+
+@dataclass(frozen=True)
+class _Prediction:
+    """What held-out records say of a fit.
+
+    log_density : of the records given the fitted values and their uncertainty, up to a common constant.
+    allowed_gain : log evidence more if correct solvers may disagree.
+    unknown_gain : log odds that they add to an unknown rest, beyond that.
+    """
+
+    log_density: float
+    allowed_gain: float
+    unknown_gain: float
+
+    @property
+    def gain(self) -> float:
+        """What they add to the log weight of exactly these effects."""
+        return self.log_density + self.allowed_gain
+
+
+def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
+    case = model.case
+    outputs = case.noise.size
+    fitted, _ = without_drift(end.residuals, solver_spread(model, end))
+    e, log_density = _unpredicted(model, end)
+    segments = [len(record.output) for record in case.estimation]
+    both = [*segments, *(len(record.output) for record in case.held_out)]
+    before = leftover(fitted, segments, outputs)
+    after = leftover(np.concatenate([fitted, e]), both, outputs)
+    allowed = disagreement_gain(end, after) - disagreement_gain(end, before)
+    return _Prediction(log_density, allowed, _odds(end, after) - _odds(end, before))
+
+
+def _odds(end: Fit, rest: Leftover) -> float:
+    return rest.log_gain_some - disagreement_gain(end, rest)
+
+
+def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
+    """Held-out residuals (N,) without what the fitted values' uncertainty may do to them; log density.
+
+    The most probable shift of the values given both kinds of records, linearised at the fit. Where contacts
+    switch the noise includes what correct solvers disagree about.
+    """
+    case = model.case
+    e = model.of(end.deviations, end.effects, case.held_out)
+    if not end.jacobian.shape[1]:
+        return e, -0.5 * float(e @ e)
+    J = difference_quotients(model, end, e, case.held_out)
+    spread = solver_spread(model, end, case.held_out)
+    narrow, drift = without_drift(e, spread)
+    density = drift.log_gain + 0.5 * float(narrow @ narrow - e @ e)
+    if drift.size > 0:
+        e, J = narrow, J / np.sqrt(1.0 + spread)[:, None]
+    H = end.hessian
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
+    H = H + 1e-8 * np.diag(scale**2)
+    A, gradient = H + J.T @ J, J.T @ e
+    step = np.asarray(-np.linalg.solve(A, gradient))
+    # A value that would leave its range stays where it is.
+    free = np.flatnonzero(_inside(end, step))
+    step = np.zeros(step.size)
+    step[free] = -np.linalg.solve(A[np.ix_(free, free)], gradient[free])
+    cost = float(e @ e + gradient @ step)
+    determinants = (
+        np.linalg.slogdet(A / np.outer(scale, scale))[1] - (np.linalg.slogdet(H / np.outer(scale, scale))[1])
+    )
+    return np.asarray(e + J @ step), density - 0.5 * (cost + float(determinants))
+
+
+def _inside(end: Fit, step: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which of (d, x) stay in their ranges after a step (P + A,)."""
+    P = end.deviations.size
+    inside = np.ones(step.size, dtype=bool)
+    if end.candidates:
+        x = np.concatenate(end.coordinates) + step[P:]
+        low, high = (np.concatenate(ends) for ends in zip(*(c.box for c in end.candidates), strict=True))
+        inside[P:] = (low <= x) & (x <= high)
+    return inside

@@ -1,0 +1,190 @@
+"""Hypotheses about a gap, their evidence, and probabilities over none, every effect and unknown.
+
+A hypothesis is a set of effects with fitted parameters. A true one leaves white noise and what two correct
+solvers disagree about, which is small for smooth effects and larger where contacts switch. The hypothesis
+"unknown" is the best of the others with something of any size left over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.fit.discrepancy import Leftover
+from diagnosis.fit.fit import Fit, log_evidence
+from diagnosis.fit.model_error import log_evidence_with_model_error
+from diagnosis.fit.solver_spread import NO_DRIFT, Drift
+from plant.effects import EFFECTS
+
+# Solver disagreement in noise deviations (half-normal scale); with play two correct solvers differ by 0.2.
+DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "jagged": 0.25}
+# Prior probabilities by number of effects; they are shared equally among the sets of that size.
+_PRIOR_NONE, _PRIOR_UNKNOWN = 0.25, 0.1
+_PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
+_UNKNOWN = ("unknown",)
+# An unknown cause beside a set of effects, relative to that set alone.
+_UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
+# Where contacts switch, what two correct solvers disagree about is not white: further effects beside a jagged
+# one can follow some of it, so they have to gain more (in log weight) to be believed.
+BESIDE_JAGGED = 20.0
+# log prior density lost per squared deviation beyond three: no evidence pays for that.
+_CUT = 1e3
+# Something unknown may have any size over four decades; what solvers of play disagree about has one known to
+# a factor of three: the log of the ratio of these ranges (in their logarithms).
+_KNOWN_SIZE = 2.0
+# An answer this far behind the best in log weight is none any more.
+STILL_POSSIBLE = 20.0
+# An effect whose period the records never complete is that effect only by name.
+_AT_EDGE = 2.0
+# What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
+# records determine: an effect that contains another (Stribeck and Coulomb friction) costs nothing where it
+# imitates it, and the simpler name is the better one then.
+_PER_PARAMETER = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A fit, what it leaves over, and logs of (prior probability times evidence), comparable within a case.
+
+    log_weight : exactly these effects, with the disagreement their solvers are allowed; -inf for a cause
+        beyond the list, which is no answer by itself but part of what is unknown.
+    unknown_weight : these effects, none of them perhaps, and something else that no effect describes.
+    """
+
+    fit: Fit
+    log_weight: float
+    unknown_weight: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.fit.names
+
+    @property
+    def is_answer(self) -> bool:
+        return self.log_weight > -np.inf
+
+    @property
+    def largest_weight(self) -> float:
+        """Log weight of these effects, alone or with something unknown besides."""
+        return max(self.log_weight, self.unknown_weight)
+
+    @property
+    def weight(self) -> float:
+        """Log weight of these causes alone, which for one beyond the list counts as unknown."""
+        return self.log_weight if self.is_answer else self.unknown_weight
+
+    @classmethod
+    def of(cls, fit: Fit, rest: Leftover, drift: Drift = NO_DRIFT) -> Hypothesis:
+        """rest: what the fit leaves over, of residuals without the drift of correct solvers."""
+        beside = len(fit.names) - 1
+        allowed = BESIDE_JAGGED * beside if fit.jagged else 0.0
+        further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
+        prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
+        if fit.weighing.model_error > 0:
+            exactly, besides = log_evidence_with_model_error(fit)
+            return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
+        evidence = log_evidence(fit) + drift.log_gain
+        exactly = evidence + disagreement_gain(fit, rest) + prior - allowed
+        besides = evidence + rest.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
+        if any(c.at_edge(x) for c, x in zip(fit.candidates, fit.coordinates, strict=True)):
+            # Something is described well, but not by what the effect is.
+            return cls(fit, exactly - _AT_EDGE, max(besides, exactly + _UNKNOWN_BESIDE))
+        return cls(fit, exactly, besides)
+
+
+def log_prior(names: Sequence[str], n: int = len(EFFECTS)) -> float:
+    """log prior probability of exactly this set of effects out of n that are listed."""
+    if not names:
+        return float(np.log(_PRIOR_NONE))
+    count = len(names)
+    sets = np.prod([(n - i) / (i + 1) for i in range(count)])
+    return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
+
+
+def log_prior_unknown() -> float:
+    """log prior probability of a cause that is not listed, alone."""
+    return float(np.log(_PRIOR_UNKNOWN))
+
+
+def disagreement_gain(fit: Fit, rest: Leftover) -> float:
+    """log evidence gained by the disagreement that two correct solvers of these effects may have.
+
+    Its size has a half-normal prior, cut off beyond three deviations: more than that is no disagreement.
+    """
+    solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
+    z = rest.size / max(solvers)
+    expected = _KNOWN_SIZE if fit.jagged else 0.0
+    return max(0.0, rest.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
+
+
+@dataclass(frozen=True, eq=False)
+class Probabilities:
+    """What the evidence says, in three views of the same numbers.
+
+    cause : over "none", every effect and "unknown", summing to one: the main cause of the gap. The
+        probability of a set of several effects belongs to its first member, found to explain most.
+    sets : over sets of effects (sorted names; () is none, ("unknown",) unknown), summing to one.
+    presence : effect -> probability that it is there at all, as the main cause or beside another.
+    """
+
+    cause: dict[str, float]
+    sets: dict[tuple[str, ...], float]
+    presence: dict[str, float]
+
+    def beside(self, name: str, *, leads: bool) -> Probabilities:
+        """The same answers with one more effect that is certain, in every set but unknown.
+
+        leads: it explains more than whatever else there is.
+        """
+        certain = 1.0 - self.sets[_UNKNOWN]
+        cause = dict(self.cause)
+        if leads:
+            cause = {**dict.fromkeys(cause, 0.0), "unknown": cause["unknown"], name: certain}
+        else:
+            cause[name] += cause["none"]
+            cause["none"] = 0.0
+        sets = {key if key == _UNKNOWN else tuple(sorted((*key, name))): p for key, p in self.sets.items()}
+        return Probabilities(cause, sets, {**self.presence, name: certain})
+
+    @property
+    def answer(self) -> str:
+        """The most probable cause."""
+        return max(self.cause, key=self.cause.__getitem__)
+
+
+def probabilities(hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0) -> Probabilities:
+    """Probabilities from the evidence of everything that was fitted.
+
+    temperature > 1 makes the answer less sure than the bare evidence.
+
+    Raises
+    ------
+    ValueError
+        If there is no hypothesis, or the temperature is not above zero.
+    """
+    if not hypotheses:
+        raise ValueError("probabilities need at least one hypothesis")
+    if not temperature > 0:
+        raise ValueError(f"temperature must be above zero; got {temperature}")
+    best: dict[tuple[str, ...], Hypothesis] = {}
+    for hypothesis in (h for h in hypotheses if h.is_answer):
+        key = tuple(sorted(hypothesis.names))
+        if key not in best or hypothesis.log_weight > best[key].log_weight:
+            best[key] = hypothesis
+    unknown = max(h.unknown_weight for h in hypotheses)
+    keys = [*best, _UNKNOWN]
+    logs = np.array([*(h.log_weight for h in best.values()), unknown]) / temperature
+    weight = np.exp(logs - np.max(logs))
+    weight /= weight.sum()
+    sets = {key: float(p) for key, p in zip(keys, weight, strict=True)}
+    listed = hypotheses[0].fit.weighing.listed
+    cause = {"none": sets.get((), 0.0), **dict.fromkeys(listed, 0.0), "unknown": sets[_UNKNOWN]}
+    presence = dict.fromkeys(listed, 0.0)
+    for key, hypothesis in best.items():
+        for name in hypothesis.names[:1]:
+            cause[name] += sets[key]
+        for name in key:
+            presence[name] += sets[key]
+    return Probabilities(cause, sets, presence)

@@ -1,0 +1,1 @@
+"""Fits of candidate effects with uncertain nominal parameters; residual and discrepancy."""

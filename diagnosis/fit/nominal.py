@@ -1,0 +1,69 @@
+"""Nominal parameters and how far off they may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic
+
+import numpy as np
+
+from diagnosis.machine.machine_protocol import Real, Stated
+
+# Where a stated value would have to be more wrong than this many tolerances nothing is believed any more.
+LARGEST_DEVIATION = 8.0
+# Up to so many tolerances the prior is Gaussian. Beyond them it falls faster: a value that far off gets
+# noticed before it gets stated.
+_EDGE, _STIFFNESS = 2.0, 15.0
+
+
+def prior_cost(deviations: Real) -> float:
+    """-2 log of the prior density of the deviations (P,), up to a constant: |d|^2 within two tolerances."""
+    beyond = np.maximum(np.abs(deviations) - _EDGE, 0.0)
+    return float(deviations @ deviations + _STIFFNESS * (beyond @ beyond))
+
+
+def prior_slope(deviations: Real) -> Real:
+    """Half the gradient of `prior_cost` (P,)."""
+    beyond = np.maximum(np.abs(deviations) - _EDGE, 0.0)
+    return np.asarray(deviations + _STIFFNESS * np.copysign(beyond, deviations))
+
+
+def prior_curvature(deviations: Real) -> Real:
+    """Half the second derivatives of `prior_cost` (P,)."""
+    return np.where(np.abs(deviations) > _EDGE, 1.0 + _STIFFNESS, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class NominalParameters(Generic[Stated]):
+    """Deviations d (P,) of the stated values in units of their tolerances; `prior_cost` before any record.
+
+    A rig or machine with tolerances t states values that are wrong by draws of that size: stated =
+    true (1 + t d), so the true value is stated / (1 + t d).
+    """
+
+    stated: Stated
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        return tuple(self.stated.tolerances)
+
+    @property
+    def count(self) -> int:
+        return len(self.stated.tolerances)
+
+    def at(self, deviations: Real) -> Stated:
+        """The rig or machine whose stated values are off by these deviations (P,)."""
+        if not self.count:
+            return self.stated
+        return self.stated.scaled(self.factors(deviations))
+
+    def factors(self, deviations: Real) -> dict[str, float]:
+        """Key -> true value over stated value."""
+        return {
+            # A tolerance of 30 % and a deviation of -3 leave a tenth of the value: no lower than 5 %.
+            key: 1.0 / max(1.0 + tolerance * float(d), 0.05)
+            for (key, tolerance), d in zip(self.stated.tolerances.items(), deviations, strict=True)
+        }
+
+    def within(self, deviations: Real) -> Real:
+        return np.clip(deviations, -LARGEST_DEVIATION, LARGEST_DEVIATION)

@@ -1,0 +1,1 @@
+"""The machine under diagnosis: case, protocol, candidate effects."""

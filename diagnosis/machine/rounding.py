@@ -1,0 +1,61 @@
+"""A quantised sensor in the answer: certain when its values lie on a lattice, whatever else is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from plant.effects import Quantisation
+
+_TIP = 1
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """effect: with the step of the lattice; intervals: of its step; floor: pooled RMS that rounding and noise
+    leave over the noise; energy: mean square of rounding alone, over all outputs and the noise's."""
+
+    effect: Quantisation
+    intervals: dict[str, tuple[float, float]]
+    floor: float
+    energy: float
+
+    @property
+    def name(self) -> str:
+        return Quantisation.id
+
+    def joined(self, names: Sequence[str], *, leads: bool) -> tuple[str, ...]:
+        return (self.name, *names) if leads or not names else (*names, self.name)
+
+
+def rounding_effect(case: CaseOfMachine) -> Rounding | None:
+    """The quantisation of a flexible link's tip sensor, if its records lie on a lattice.
+
+    Rounding errors are taken as uniform over a step: step / sqrt(12).
+    """
+    if not isinstance(case, Case) or not case.steps[_TIP] > 0:
+        return None
+    step = float(case.steps[_TIP])
+    # Values are written with six digits at least: of the outermost one, the step inherits that share.
+    widest = max(float(np.max(np.abs(e.output[:, _TIP]))) for e in case.experiments)
+    error = 1e-6 * step + 1e-6 * widest / max(widest / step, 1.0)
+    energy = (step / case.noise[_TIP]) ** 2 / 12 / case.noise.size
+    return Rounding(
+        effect=Quantisation(step_m=step),
+        intervals={"step_m": (step - error, step + error)},
+        floor=float(np.sqrt(1 + energy)),
+        energy=float(energy),
+    )
+
+
+def leads_over(
+    case: CaseOfMachine, rounding: Rounding, refit: Mapping[str, Real], after: Mapping[str, Real]
+) -> bool:
+    """Whether rounding makes more of the gap than what the accepted effects take away."""
+    before = np.mean([np.mean(refit[e.name] ** 2) for e in case.estimation])
+    behind = np.mean([np.mean(after[e.name] ** 2) for e in case.estimation])
+    return bool(rounding.energy >= before - behind)

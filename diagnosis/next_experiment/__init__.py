@@ -1,0 +1,1 @@
+"""Which experiment separates what is still possible."""

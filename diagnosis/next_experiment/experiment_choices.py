@@ -1,0 +1,219 @@
+"""Experiments worth choosing from: excitations of the usual kinds within the limits of a machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from diagnosis.machine.case import Case, Real
+from plant.excitation import doublet, log_chirp, multisine, multisine_lines, prbs
+
+Integer = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an experiment may ask of the machine; None is no limit.
+
+    Attributes
+    ----------
+    voltage_V : float
+        Largest commanded voltage.
+    hub_angle_rad : float or None
+        Largest deviation of the hub angle from the start.
+    deflection_m : float or None
+        Largest deflection of the tip, tip_m - (r + L) hub_angle.
+    """
+
+    voltage_V: float
+    hub_angle_rad: float | None = None
+    deflection_m: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("voltage_V", "hub_angle_rad", "deflection_m"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise ValueError(f"limit {name} must be positive and finite; got {value}")
+
+    @classmethod
+    def of_records(cls, case: Case) -> Limits:
+        """What the machine has already done: the largest voltage, hub angle and deflection of the records.
+
+        The deflection is the measured one less three deviations of its noise.
+        """
+        reach = case.rig.hub.radius_m + case.rig.link.length_m
+        noise = float(np.hypot(case.noise[1], reach * case.noise[0]))
+        angle = max(float(np.max(np.abs(x.output[:, 0]))) for x in case.experiments)
+        bend = max(float(np.max(np.abs(x.output[:, 1] - reach * x.output[:, 0]))) for x in case.experiments)
+        return cls(
+            max(float(np.max(np.abs(x.voltage_V))) for x in case.experiments),
+            angle,
+            max(bend - 3 * noise, noise),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """One experiment: voltage (T,) of a kind with its parameters; `amplitude_V` is its largest value."""
+
+    kind: str
+    parameters: Mapping[str, float | int | str]
+    voltage_V: Real
+
+    def __post_init__(self) -> None:
+        voltage = np.array(self.voltage_V, dtype=np.float64)
+        voltage.setflags(write=False)
+        object.__setattr__(self, "voltage_V", voltage)
+
+    @property
+    def amplitude_V(self) -> float:
+        return float(np.max(np.abs(self.voltage_V)))
+
+    def scaled(self, factor: float) -> Excitation:
+        return replace(self, voltage_V=self.voltage_V * factor)
+
+    @property
+    def words(self) -> str:
+        parts = ", ".join(_words(name, value) for name, value in self.parameters.items())
+        return f"{self.kind} of {self.amplitude_V:.3g} V" + (f" ({parts})" if parts else "")
+
+
+def excitations(
+    voltage_V: float, n_samples: int, dt_s: float, rng: np.random.Generator
+) -> tuple[Excitation, ...]:
+    """Ten excitations (T,) of equal length and largest voltage.
+
+    Random binary (fast, slow), multisine (wide, odd lines at low frequency), doublet (short, long), slow
+    triangle through reversals, steps with rests, chirp (up, and slow alone).
+
+    Raises
+    ------
+    ValueError
+        Fewer than 100 samples, or a voltage or period that is not positive.
+    """
+    if not n_samples >= 100:
+        raise ValueError(f"an experiment needs at least 100 samples; got {n_samples}")
+    if not (0 < voltage_V < np.inf and 0 < dt_s < np.inf):
+        raise ValueError(f"need a positive voltage and sampling period; got {voltage_V} V and {dt_s} s")
+    T, nyquist, duration = n_samples, 0.5 / dt_s, n_samples * dt_s
+    return (
+        _binary(voltage_V, T, 4, rng),
+        _binary(voltage_V, T, max(T // 60, 5), rng),
+        _multisine(voltage_V, T, dt_s, 0.35 * nyquist, "full", rng),
+        _multisine(voltage_V, T, dt_s, 0.06 * nyquist, "odd_random", rng),
+        _doublet(voltage_V, T, dt_s, T // 40),
+        _doublet(voltage_V, T, dt_s, T // 6),
+        _triangle(voltage_V, T, dt_s, 3),
+        _steps(voltage_V, T, dt_s, 8, rng),
+        _chirp(voltage_V, T, dt_s, 1 / duration, 0.6 * nyquist),
+        _chirp(voltage_V, T, dt_s, 0.5 / duration, 0.05 * nyquist),
+    )
+
+
+# Kinds that are also tried at a third of what the limits allow: dry friction, play and dead zones weigh more
+# in small motions.
+ALSO_WEAK = ("random binary", "triangle")
+
+
+def _words(name: str, value: float | int | str) -> str:
+    """up_to_Hz 35.0 -> up to 35 Hz."""
+    what, _, unit = name.rpartition("_")
+    if not what or isinstance(value, str):
+        return f"{name.replace('_', ' ')} {value}"
+    return f"{what.replace('_', ' ')} {value:.3g} {unit}"
+
+
+def within(
+    excitation: Excitation, limits: Limits, respond: Callable[[Real], tuple[float, float]]
+) -> Excitation | None:
+    """The excitation, scaled down until its largest hub angle and deflection stay in the limits.
+
+    respond gives both for a voltage (T,). Five scalings at most (a nonlinear machine does not scale exactly);
+    None if the last is still outside or below a hundredth of the voltage limit.
+    """
+    if excitation.amplitude_V > limits.voltage_V * (1 + 1e-9):
+        excitation = excitation.scaled(limits.voltage_V / excitation.amplitude_V)
+    for _ in range(5):
+        angle, deflection = respond(excitation.voltage_V)
+        excess = max(
+            angle / limits.hub_angle_rad if limits.hub_angle_rad is not None else 0.0,
+            deflection / limits.deflection_m if limits.deflection_m is not None else 0.0,
+        )
+        if not np.isfinite(excess):
+            return None
+        if excess <= 1:
+            return excitation
+        excitation = excitation.scaled(0.95 / excess)
+        if excitation.amplitude_V < 0.01 * limits.voltage_V:
+            return None
+    return None
+
+
+def tailored_excitations(
+    lines: Integer, n_samples: int, dt_s: float, voltage_V: float, rng: np.random.Generator
+) -> list[Excitation]:
+    """Multisine of the given lines, two periods, and the binary signal of its signs, which has more power."""
+    period = n_samples // 2
+    signal = multisine(lines, period, 1.0, rng, periods=2, draws=20)
+    signal = np.concatenate([signal, signal[: n_samples - signal.size]])
+    parameters: dict[str, float | int | str] = {
+        "from_Hz": round(float(lines[0] / (period * dt_s)), 3),
+        "to_Hz": round(float(lines[-1] / (period * dt_s)), 3),
+        "lines": int(lines.size),
+    }
+    binary = voltage_V * np.where(signal >= 0, 1.0, -1.0)
+    return [
+        Excitation("tailored multisine", parameters, signal * (voltage_V / np.max(np.abs(signal)))),
+        Excitation("tailored binary", parameters, binary),
+    ]
+
+
+def _binary(voltage: float, T: int, hold: int, rng: np.random.Generator) -> Excitation:
+    length = int(np.clip(np.ceil(np.log2(T / hold + 1)), 4, 20))
+    return Excitation("random binary", {"hold_samples": hold}, prbs(length, hold, voltage, T, rng))
+
+
+def _multisine(
+    voltage: float, T: int, dt: float, high_Hz: float, grid: str, rng: np.random.Generator
+) -> Excitation:
+    period = T // 2
+    chosen = "odd_random" if grid == "odd_random" else "full"
+    low = 0.99 / (period * dt)
+    lines = multisine_lines(period, dt, (low, max(high_Hz, 12 * low)), chosen, rng)  # type: ignore[arg-type]
+    signal = multisine(lines, period, 1.0, rng, periods=2, draws=20)
+    signal = np.concatenate([signal, signal[: T - signal.size]])
+    parameters: dict[str, float | int | str] = {
+        "lines": grid.replace("_", " "),
+        "up_to_Hz": round(float(lines[-1] / (period * dt)), 3),
+        "periods": 2,
+    }
+    return Excitation("multisine", parameters, signal * (voltage / np.max(np.abs(signal))))
+
+
+def _doublet(voltage: float, T: int, dt: float, pulse: int) -> Excitation:
+    pulse = max(pulse, 2)
+    return Excitation("doublet", {"pulse_s": round(pulse * dt, 6)}, doublet(voltage, 0.0, pulse * dt, T, dt))
+
+
+def _triangle(voltage: float, T: int, dt: float, cycles: int) -> Excitation:
+    phase = np.arange(T) * cycles / T
+    signal = voltage * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * phase))
+    return Excitation("triangle", {"period_s": round(T * dt / cycles, 6)}, signal)
+
+
+def _steps(voltage: float, T: int, dt: float, count: int, rng: np.random.Generator) -> Excitation:
+    """Steps of different height, each one followed by its negative and a rest, so that the hub comes back."""
+    heights = voltage * rng.permutation(np.linspace(1, 0.25, count // 2))
+    length = T // (3 * heights.size)
+    pattern = np.concatenate([np.repeat([h, -h, 0.0], length) for h in heights])
+    signal = np.concatenate([pattern, np.zeros(T - pattern.size)])
+    return Excitation("step and hold", {"hold_s": round(length * dt, 6)}, signal)
+
+
+def _chirp(voltage: float, T: int, dt: float, low_Hz: float, high_Hz: float) -> Excitation:
+    high = max(high_Hz, 4 * low_Hz)
+    parameters = {"from_Hz": round(low_Hz, 4), "to_Hz": round(high, 4)}
+    return Excitation("chirp", parameters, log_chirp(low_Hz, high, voltage, T, dt))

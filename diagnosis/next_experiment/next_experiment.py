@@ -1,0 +1,344 @@
+"""Which experiment to run next: the feasible one that tells the surviving rivals apart best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from diagnosis.machine.case import Real
+from diagnosis.next_experiment.discrimination import Rival, distances, noise_of
+from diagnosis.next_experiment.experiment_choices import (
+    ALSO_WEAK,
+    Excitation,
+    Limits,
+    excitations,
+    tailored_excitations,
+    within,
+)
+from plant.rig import Rig
+from plant.simulate import simulate
+
+# A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
+_SETTLED = 20.0
+# Below this nothing is said to separate two rivals.
+_SEPARATES = 3.0
+# A runner-up with less than this share of the first rival's probability is beaten.
+_DECIDED = 0.01
+# Enough amplitudes and phases that a handful of free parameters cannot absorb them.
+_TAILORED_LINES = 12
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far an experiment parts two rivals."""
+
+    rivals: tuple[str, str]
+    standard_deviations: float
+    log_bayes_factor: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Considered:
+    """An excitation that was looked at.
+
+    `feasible`: stays in the limits at a useful size. `at_most`: its score if no free parameter absorbed
+    anything; `score`: the score, None where at_most was already too low to win.
+    """
+
+    kind: str
+    description: str
+    amplitude_V: float
+    feasible: bool
+    at_most: float
+    score: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class NextExperiment:
+    """The experiment to run next.
+
+    Attributes
+    ----------
+    kind, parameters, amplitude_V, duration_s, dt_s, voltage_V (T,)
+        The excitation.
+    separations : tuple of Separation
+        Every pair of rivals.
+    expected_log_bayes_factor : float
+        Over the pairs, weighted with the product of their probabilities.
+    hub_angle_range_rad, deflection_range_m
+        Least and largest value any of the rivals predicts.
+    separates : bool
+        Whether any pair comes apart by three standard deviations.
+    sentence : str
+    considered : tuple of Considered
+        Best first.
+    """
+
+    kind: str
+    parameters: dict[str, float | int | str]
+    amplitude_V: float
+    duration_s: float
+    dt_s: float
+    voltage_V: Real
+    separations: tuple[Separation, ...]
+    expected_log_bayes_factor: float
+    hub_angle_range_rad: tuple[float, float]
+    deflection_range_m: tuple[float, float]
+    separates: bool
+    sentence: str
+    considered: tuple[Considered, ...] = field(default=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; `json.dumps` takes it."""
+        return {
+            "kind": self.kind,
+            "parameters": dict(self.parameters),
+            "amplitude_V": self.amplitude_V,
+            "duration_s": self.duration_s,
+            "dt_s": self.dt_s,
+            "voltage_V": self.voltage_V.tolist(),
+            "separations": [
+                {
+                    "rivals": list(s.rivals),
+                    "standard_deviations": s.standard_deviations,
+                    "log_bayes_factor": s.log_bayes_factor,
+                    "sentence": s.sentence,
+                }
+                for s in self.separations
+            ],
+            "expected_log_bayes_factor": self.expected_log_bayes_factor,
+            "hub_angle_range_rad": list(self.hub_angle_range_rad),
+            "deflection_range_m": list(self.deflection_range_m),
+            "separates": self.separates,
+            "sentence": self.sentence,
+            "sentences": [self.sentence],
+            "considered": [vars(c) for c in self.considered],
+        }
+
+
+def next_experiment(
+    rivals: Sequence[Rival],
+    limits: Limits,
+    *,
+    n_samples: int = 1400,
+    choices: Sequence[Excitation] | None = None,
+    rng: np.random.Generator | None = None,
+) -> NextExperiment:
+    """Choose among excitations within the limits.
+
+    Parameters
+    ----------
+    rivals
+        Two at least, all with the same sampling period and noise.
+    choices
+        Excitations to choose from, by default `excitations` of the voltage limit and n_samples.
+    rng
+        Of the random excitations; without it a fixed sequence.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two rivals, rivals that sample differently or are noise-free, no excitation that stays in
+        the limits.
+    """
+    rivals = tuple(rivals)
+    _check(rivals)
+    weights = _pair_weights(rivals)
+    dt = rivals[0].rig.sampling.dt_s
+    if choices is None:
+        rng = np.random.default_rng(0) if rng is None else rng
+        choices = excitations(limits.voltage_V, n_samples, dt, rng)
+        own = [_Prospect.of(choice, limits, rivals) for choice in choices]
+        weak = [p.excitation.scaled(1 / 3) for p in own if p is not None and p.excitation.kind in ALSO_WEAK]
+        feasible = [p for p in own if p is not None]
+        tailored = _tailored(feasible, rivals, weights, limits, rng)
+        looked_at = own + [_Prospect.of(choice, limits, rivals) for choice in (*weak, *tailored)]
+        choices = (*choices, *weak, *tailored)
+    else:
+        looked_at = [_Prospect.of(choice, limits, rivals) for choice in choices]
+    prospects = sorted((p for p in looked_at if p is not None), key=lambda p: p.bound, reverse=True)
+    if not prospects:
+        raise ValueError(
+            f"no experiment stays within {limits.hub_angle_rad} rad and {limits.deflection_m} m at a "
+            f"hundredth of {limits.voltage_V} V or more: give wider limits"
+        )
+    best: tuple[tuple[float, float], _Prospect, Real] | None = None
+    for prospect in prospects:
+        # Absorbing parameters only lessen a difference: what cannot win without them need not be computed.
+        if best is not None and prospect.bound[0] <= best[0][0]:
+            break
+        distance, _ = prospect.distances(rivals)
+        score = _score(distance, weights)
+        prospect.score = score[0]
+        if best is None or score > best[0]:
+            best = score, prospect, distance
+    if best is None:
+        raise AssertionError("at least one prospect was computed")
+    _, chosen, distance = best
+    left_out = [c for c, p in zip(choices, looked_at, strict=True) if p is None]
+    considered = [p.considered() for p in sorted(prospects, key=lambda p: -(p.score or 0.0))]
+    considered += [Considered(c.kind, c.words, c.amplitude_V, False, 0.0, None) for c in left_out]
+    return _result(chosen, rivals, distance, weights, dt, tuple(considered))
+
+
+def _check(rivals: Sequence[Rival]) -> None:
+    if len(rivals) < 2:
+        raise ValueError(f"an experiment separates at least two rivals; got {len(rivals)}")
+    first = rivals[0].rig
+    for rival in rivals:
+        if rival.rig.sampling != first.sampling or rival.rig.sensors != first.sensors:
+            raise ValueError("all rivals need the same sampling period and sensor noise")
+    if not (first.sensors.hub_angle_noise_rad > 0 and first.sensors.tip_noise_m > 0):
+        raise ValueError("sensors need a noise level above zero to tell rivals apart by")
+
+
+def _pair_weights(rivals: Sequence[Rival]) -> Real:
+    p = np.array([a.probability * b.probability for a, b in combinations(rivals, 2)])
+    return p / p.sum() if p.sum() > 0 else np.full(p.size, 1 / p.size)
+
+
+def _score(distance: Real, weights: Real) -> tuple[float, float]:
+    """Expected log Bayes factor with settled pairs cut off, and without, to choose between equals."""
+    return float(weights @ np.minimum(distance, _SETTLED) ** 2 / 2), float(weights @ distance**2 / 2)
+
+
+class _Prospect:
+    """An excitation within the limits with every rival's prediction."""
+
+    def __init__(self, excitation: Excitation, outputs: Sequence[Real], rivals: Sequence[Rival]) -> None:
+        self.excitation = excitation
+        noise = noise_of(rivals[0].rig)
+        self._whitened = [np.asarray(y / noise).ravel() for y in outputs]
+        self.hub = tuple(_range([y[:, 0] for y in outputs]))
+        self.deflection = tuple(_range([_deflection(r.rig, y) for r, y in zip(rivals, outputs, strict=True)]))
+        self.score: float | None = None
+        plain = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
+        self.bound = _score(plain, _pair_weights(rivals))
+
+    @classmethod
+    def of(cls, choice: Excitation, limits: Limits, rivals: Sequence[Rival]) -> _Prospect | None:
+        outputs: list[Real] = []
+
+        def respond(voltage: Real) -> tuple[float, float]:
+            outputs[:] = [simulate(r.rig, voltage, r.effects).output for r in rivals]
+            angle = max(float(np.max(np.abs(y[:, 0]))) for y in outputs)
+            bend = max(
+                float(np.max(np.abs(_deflection(r.rig, y)))) for r, y in zip(rivals, outputs, strict=True)
+            )
+            return angle, bend
+
+        excitation = within(choice, limits, respond)
+        return None if excitation is None else cls(excitation, outputs, rivals)
+
+    def distances(self, rivals: Sequence[Rival]) -> tuple[Real, list[Real]]:
+        return distances(rivals, self.excitation.voltage_V, self._whitened)
+
+    def considered(self) -> Considered:
+        x = self.excitation
+        return Considered(x.kind, x.words, x.amplitude_V, True, self.bound[0], self.score)
+
+
+def _tailored(
+    prospects: Sequence[_Prospect],
+    rivals: Sequence[Rival],
+    weights: Real,
+    limits: Limits,
+    rng: np.random.Generator,
+) -> list[Excitation]:
+    """Multisine and binary signal at the lines where the rivals differ most for the voltage spent there.
+
+    Read from the first multisine among the prospects, the wide one; exact for linear rivals with nothing to
+    absorb, a good guess otherwise, and judged by simulation like every other choice.
+    """
+    wide = [p for p in prospects if p.excitation.kind == "multisine"]
+    if not wide:
+        return []
+    voltage = wide[0].excitation.voltage_V
+    period = voltage.size // 2
+    _, remains = wide[0].distances(rivals)
+    last = [rest.reshape(-1, 2)[period : 2 * period] for rest in remains]
+    power = sum(
+        w * np.sum(np.abs(np.fft.rfft(rest, axis=0)) ** 2, axis=1)
+        for w, rest in zip(weights, last, strict=True)
+    )
+    drive = np.abs(np.fft.rfft(voltage[period : 2 * period])) ** 2
+    driven = np.flatnonzero(drive > 1e-6 * drive.max())
+    gain = np.asarray(power)[driven] / drive[driven]
+    lines = np.sort(driven[np.argsort(-gain, kind="stable")[:_TAILORED_LINES]])
+    return tailored_excitations(lines, voltage.size, rivals[0].rig.sampling.dt_s, limits.voltage_V, rng)
+
+
+def _deflection(rig: Rig, output: Real) -> Real:
+    return np.asarray(output[:, 1] - (rig.hub.radius_m + rig.link.length_m) * output[:, 0])
+
+
+def _range(signals: Sequence[Real]) -> tuple[float, float]:
+    return float(min(s.min() for s in signals)), float(max(s.max() for s in signals))
+
+
+def _result(
+    chosen: _Prospect,
+    rivals: Sequence[Rival],
+    distance: Real,
+    weights: Real,
+    dt: float,
+    considered: tuple[Considered, ...],
+) -> NextExperiment:
+    x = chosen.excitation
+    pairs = []
+    for (a, b), d in zip(combinations([r.name for r in rivals], 2), distance, strict=True):
+        words = (
+            f"would separate {a} from {b} by {_number(d)} standard deviations"
+            if d >= _SEPARATES
+            else f"would not separate {a} from {b} ({_number(d)} standard deviations)"
+        )
+        pairs.append(Separation((a, b), float(d), float(d**2 / 2), words))
+    separates = bool(np.max(distance) >= _SEPARATES)
+    duration = x.voltage_V.size * dt
+    first, second = sorted(rivals, key=lambda r: -r.probability)[:2]
+    decided = (
+        f"The records already decide for {first.name}; an experiment would only confirm it. "
+        if second.probability < _DECIDED * first.probability
+        else ""
+    )
+    if separates:
+        told = "; it ".join(s.sentence for s in pairs)
+        sentence = (
+            f"{decided}Run next: {x.words}, {duration:.3g} s. It {told}. The hub stays within "
+            f"{chosen.hub[0]:.2g} to {chosen.hub[1]:.2g} rad, the deflection within "
+            f"{1e3 * chosen.deflection[0]:.2g} to {1e3 * chosen.deflection[1]:.2g} mm."
+        )
+    else:
+        names = _listed([r.name for r in rivals])
+        sentence = (
+            f"{decided}None of the {len(considered)} experiments looked at separates {names}: the best, "
+            f"{x.words}, parts them by {np.max(distance):.2g} standard deviations at most."
+        )
+    return NextExperiment(
+        x.kind,
+        dict(x.parameters),
+        x.amplitude_V,
+        float(duration),
+        dt,
+        x.voltage_V,
+        tuple(pairs),
+        _score(distance, weights)[1],
+        (chosen.hub[0], chosen.hub[1]),
+        (chosen.deflection[0], chosen.deflection[1]),
+        separates,
+        sentence,
+        considered,
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"

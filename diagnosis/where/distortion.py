@@ -1,0 +1,174 @@
+"""Records with repeated periods: frequency response against the model, distortion, what does not repeat.
+
+What comes back in every period is the machine's answer to the input (linear at excited lines; at lines that
+were not excited it is distortion: even lines of an odd input show even distortion, odd ones odd distortion).
+What changes from period to period is noise, drift, disturbances, or a transient that has not died out; it
+measures the noise without a word from the rig file. After Pintelon and Schoukens, System Identification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2
+from scipy.stats import f as fisher
+
+from diagnosis.machine.case import Case, Experiment, Real
+from diagnosis.where.where_energy import band_edges_Hz
+from diagnosis.where.where_records import SENSORS, FrequencyResponseBand, LineGroup, PeriodicFinding
+
+ComplexArray = npt.NDArray[np.complex128]
+_SHORTEST = 32
+# Lines with less than this share of the largest one are rounding of the log, not excitation.
+_EXCITED = 1e-3
+_LEAST_LINES = 4
+
+
+def period_of(voltage_V: Real) -> int:
+    """Samples after which the voltage repeats itself to the end of the record; 0 if it does not.
+
+    A period is at least 32 samples long and comes at least twice; a signal that is constant has none.
+    """
+    voltage = np.asarray(voltage_V, dtype=np.float64)
+    size = float(np.max(np.abs(voltage)))
+    if np.ptp(voltage) <= 1e-9 * max(size, 1e-300):
+        return 0
+    for period in range(_SHORTEST, voltage.size // 2 + 1):
+        # Logs are rounded; a random binary input differs by much more somewhere.
+        if np.max(np.abs(voltage[period:] - voltage[:-period])) <= 1e-6 * size:
+            return period
+    return 0
+
+
+def periodic_findings(case: Case, residuals: Mapping[str, Real], level: float) -> tuple[PeriodicFinding, ...]:
+    """One per experiment whose input repeats; together they raise a false alarm with the chance `level`."""
+    periods = [(x, period_of(x.voltage_V)) for x in case.experiments if not x.closed_loop]
+    periodic = [(x, p) for x, p in periods if p]
+    return tuple(_finding(case, x, residuals[x.name], p, level / len(periodic)) for x, p in periodic)
+
+
+def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> PeriodicFinding:
+    dt = case.rig.sampling.dt_s
+    count = x.voltage_V.size // period
+    # Orthonormal lines 1 .. below Nyquist: a mean square modulus of 1 is white noise of unit variance.
+    lines = np.arange(1, (period + 1) // 2)
+    spectra = _lines(_without_trend(e), period, count, lines)
+    model = _lines((x.output - e * case.noise) / case.noise, period, count, lines)[-1]
+    drive = np.abs(np.fft.rfft(x.voltage_V[:period])[lines])
+    excited = drive > _EXCITED * drive.max()
+    separable = bool(np.all(lines[excited] % 2 == 1))
+    # Distortion of a low order ends at a few times the highest excited line.
+    near = lines <= 3 * lines[excited].max()
+    groups = {
+        "not excited, odd": ~excited & near & (lines % 2 == 1),
+        "not excited, even": ~excited & near & (lines % 2 == 0),
+    }
+    if not separable:
+        groups = {"not excited": ~excited & near}
+    groups = {name: chosen for name, chosen in groups.items() if np.count_nonzero(chosen) >= _LEAST_LINES}
+    edges = band_edges_Hz(period * dt, dt)
+    frequency = lines / (period * dt)
+    banded = [(low, high, excited & (frequency >= low) & (frequency < high)) for low, high in pairwise(edges)]
+    banded = [(low, high, chosen) for low, high, chosen in banded if np.count_nonzero(chosen) >= _LEAST_LINES]
+    tests = len(SENSORS) * (len(groups) + len(banded))
+    bands, shown, unrepeated = [], [], []
+    for s, sensor in enumerate(SENSORS):
+        mean, rest = _split(spectra[:, :, s])
+        for low, high, chosen in banded:
+            p_value = _p_value(mean, rest, chosen, count)
+            error = float(np.sqrt(np.sum(np.abs(mean[chosen]) ** 2)))
+            size = float(np.sqrt(np.sum(np.abs(model[chosen, s]) ** 2)))
+            radius = np.sqrt(chi2.ppf(0.95, 2) / (2 * count))
+            bands.append(
+                FrequencyResponseBand(
+                    sensor,
+                    low,
+                    high,
+                    int(np.count_nonzero(chosen)),
+                    error / float(np.sqrt(np.count_nonzero(chosen)) * radius),
+                    error / size if size > 0 else np.inf,
+                    p_value,
+                    bool(p_value < level / tests),
+                )
+            )
+        for name, chosen in groups.items():
+            p_value = _p_value(mean, rest, chosen, count)
+            beyond = float(np.mean(np.abs(mean[chosen]) ** 2)) - 1 / count
+            shown.append(
+                LineGroup(
+                    sensor,
+                    name,
+                    int(np.count_nonzero(chosen)),
+                    float(np.sqrt(max(beyond, 0.0))),
+                    p_value,
+                    bool(p_value < level / tests),
+                )
+            )
+        freedom = 2 * lines.size * (count - 1)
+        unrepeated.append(float(np.sqrt(2 * np.sum(rest) / freedom)))
+    low, high = (float(np.sqrt(chi2.ppf(q, freedom) / freedom)) for q in (0.025, 0.975))
+    return PeriodicFinding(
+        x.name,
+        period,
+        count,
+        tuple(bands),
+        tuple(shown),
+        tuple(unrepeated),
+        (low, high),
+        separable,
+        _sentence(bands, shown, separable),
+    )
+
+
+def _without_trend(e: Real) -> Real:
+    """Residuals without their straight line: a drift is a ramp in every period, yet no answer."""
+    time = np.linspace(-1.0, 1.0, e.shape[0])[:, None]
+    slope = np.sum(time * e, axis=0) / np.sum(time**2)
+    return np.asarray(e - e.mean(axis=0) - time * slope)
+
+
+def _lines(signal: Real, period: int, count: int, lines: npt.NDArray[np.int64]) -> ComplexArray:
+    """(M, L, 2) orthonormal spectra of the last whole periods of a signal (T, 2)."""
+    last = signal[signal.shape[0] - count * period :].reshape(count, period, -1)
+    return np.asarray(np.fft.rfft(last, axis=1)[:, lines] / np.sqrt(period))
+
+
+def _split(spectra: ComplexArray) -> tuple[ComplexArray, Real]:
+    """Mean over the periods (L,) and summed squares of what is left (L,)."""
+    mean = spectra.mean(axis=0)
+    return mean, np.sum(np.abs(spectra - mean) ** 2, axis=0)
+
+
+def _p_value(mean: ComplexArray, rest: Real, chosen: npt.NDArray[np.bool_], count: int) -> float:
+    """Chance of the repeated part from the stated noise or from what the periods show: the larger one."""
+    n = int(np.count_nonzero(chosen))
+    repeated = 2 * count * float(np.sum(np.abs(mean[chosen]) ** 2))
+    varying = 2 * float(np.sum(rest[chosen]))
+    freedom = 2 * n * (count - 1)
+    by_stated = float(chi2.sf(repeated, 2 * n))
+    by_periods = float(fisher.sf((repeated / (2 * n)) / max(varying / freedom, 1e-300), 2 * n, freedom))
+    return max(by_stated, by_periods)
+
+
+def _sentence(bands: list[FrequencyResponseBand], groups: list[LineGroup], separable: bool) -> str:
+    parts = []
+    shown = [b for b in bands if b.found]
+    if shown:
+        worst = max(shown, key=lambda b: b.distance)
+        parts.append(
+            f"The measured frequency response leaves the model's most between {worst.low_Hz:g} and "
+            f"{worst.high_Hz:g} Hz in the {worst.sensor.replace('_', ' ')} sensor: "
+            f"{100 * worst.relative_error:.2g} % off, {worst.distance:.2g} times the 95 % noise radius."
+        )
+    strays = [g for g in groups if g.found]
+    if strays:
+        worst_group = max(strays, key=lambda g: g.repeated_rms)
+        kind = worst_group.group.rpartition(" ")[2] + " distortion" if separable else "distortion"
+        parts.append(
+            f"The machine answers at lines that were not excited ({worst_group.repeated_rms:.2g} noise "
+            f"deviations, the same in every period): {kind}, so it is not linear."
+        )
+    return " ".join(parts)

@@ -1,0 +1,276 @@
+"""Residual energy by regime: direction and size of hub speed, reversals, angle, deflection, command, time.
+
+Regime variables are those of the model (measured output minus residual times noise), not of the measurement:
+they do not depend on the noise whose energy is sorted by them. The test is by circular shifts in time of the
+energy against the regime, inside every experiment: exact when there is only noise, and for a coloured gap it
+keeps the colour, so that a slow residual is no finding just because its samples agree with each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from diagnosis.machine.case import Case, Real
+from diagnosis.where.where_records import SENSORS, RegimeBin, RegimeFinding
+
+Integer = npt.NDArray[np.int64]
+_SHIFTS = 4999
+_LEAST_SAMPLES = 60
+_REVERSAL_S = 0.03
+# A regime whose gap differs by less is beyond chance, but nothing to tell anybody.
+_LEAST_RATIO = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Regime variables of one experiment, all (T,), from the model."""
+
+    angle_rad: Real
+    speed_rad_s: Real
+    deflection_m: Real
+    position_m: Real
+    command_V: Real
+    time_s: Real
+    near_reversal: npt.NDArray[np.bool_]
+
+
+def motions(case: Case, residuals: Mapping[str, Real]) -> dict[str, Motion]:
+    """What the model did in every experiment that has residuals.
+
+    Raises
+    ------
+    ValueError
+        If an experiment of the case has no residuals, or they are not (T, 2) and finite.
+    """
+    dt = case.rig.sampling.dt_s
+    reach = case.rig.hub.radius_m + case.rig.link.length_m
+    found = {}
+    for experiment in case.experiments:
+        if experiment.name not in residuals:
+            raise ValueError(f"case {case.name}: no residuals of experiment {experiment.name}")
+        e = np.asarray(residuals[experiment.name], dtype=np.float64)
+        if e.shape != experiment.output.shape or not np.all(np.isfinite(e)):
+            raise ValueError(
+                f"case {case.name}: residuals of {experiment.name} must be finite and "
+                f"{experiment.output.shape}; got {e.shape}"
+            )
+        angle, tip = (experiment.output - e * case.noise).T
+        speed = np.gradient(angle, dt)
+        found[experiment.name] = Motion(
+            angle,
+            speed,
+            tip - reach * angle,
+            tip,
+            experiment.voltage_V,
+            np.arange(angle.size) * dt,
+            _near_reversal(speed, dt),
+        )
+    return found
+
+
+def _near_reversal(speed: Real, dt_s: float) -> npt.NDArray[np.bool_]:
+    """Samples within 30 ms of a change of sign of the hub speed between stretches that really move."""
+    moving = np.abs(speed) > 1e-3 * max(float(np.max(np.abs(speed))), 1e-12)
+    sign = np.where(moving, np.sign(speed), 0.0)
+    index = np.flatnonzero(sign)
+    near = np.zeros(speed.size, dtype=bool)
+    width = max(round(_REVERSAL_S / dt_s), 1)
+    for before, after in pairwise(index):
+        if sign[before] != sign[after]:
+            near[max(before - width + 1, 0) : after + width] = True
+    return near
+
+
+@dataclass(frozen=True, eq=False)
+class RegimeAxis:
+    """A regime variable cut into bins: label per sample (-1 outside every bin) and experiment."""
+
+    name: str
+    unit: str
+    titles: tuple[str, ...]
+    edges: tuple[tuple[float, float], ...]
+    labels: Mapping[str, Integer]
+
+
+def regime_axes(
+    moved: Mapping[str, Motion], ripple_cycles_per_rev: float | None = None, bins: int = 5
+) -> tuple[RegimeAxis, ...]:
+    """Axes whose bins hold at least 60 samples each: bins of equal sample count, time in equal stretches."""
+    names = list(moved)
+
+    def of(attribute: str, size: bool = False) -> dict[str, Real]:
+        values = {name: getattr(moved[name], attribute) for name in names}
+        return {name: np.abs(v) for name, v in values.items()} if size else values
+
+    speed = of("speed_rad_s")
+    fastest = max(float(np.max(np.abs(v))) for v in speed.values())
+    # A hundredth of the largest speed counts as standing still, neither forwards nor backwards.
+    still = 0.01 * fastest
+    axes = [
+        RegimeAxis(
+            "speed_sign",
+            "rad/s",
+            ("backwards", "forwards"),
+            ((-fastest, -still), (still, fastest)),
+            {name: np.where(v > still, 1, np.where(v < -still, 0, -1)) for name, v in speed.items()},
+        ),
+        _quantiles("speed_size", "rad/s", of("speed_rad_s", True), bins, "at {}"),
+        RegimeAxis(
+            "reversal",
+            "",
+            ("away from reversals", "near reversals"),
+            ((0.0, 1.0), (1.0, 2.0)),
+            {name: moved[name].near_reversal.astype(np.int64) for name in names},
+        ),
+        _quantiles("angle", "rad", of("angle_rad"), bins, "at {}"),
+        _quantiles("deflection", "m", of("deflection_m"), bins, "at {}"),
+        _quantiles("command_size", "V", of("command_V", True), bins, "at {}"),
+        _stretches(of("time_s"), bins + 1),
+    ]
+    if ripple_cycles_per_rev is not None:
+        axes.append(_period(of("angle_rad"), ripple_cycles_per_rev))
+    return tuple(axis for axis in axes if axis is not None and _enough(axis))
+
+
+def _enough(axis: RegimeAxis) -> bool:
+    counts = np.zeros(len(axis.titles), dtype=int)
+    for labels in axis.labels.values():
+        counts += np.bincount(labels[labels >= 0], minlength=counts.size)
+    return len(axis.titles) >= 2 and bool(np.all(counts >= _LEAST_SAMPLES))
+
+
+def quantile_labels(
+    values: Mapping[str, Real], bins: int
+) -> tuple[tuple[tuple[float, float], ...], dict[str, Integer]] | None:
+    """Bins of about equal count over all experiments, ((low, high), ...) and labels; None if all are equal.
+
+    Many equal values (a binary voltage) make fewer bins, none of them with less than half the mean count.
+    """
+    everything = np.concatenate(list(values.values()))
+    span = float(np.ptp(everything))
+    if span <= 0:
+        return None
+    inner: list[float] = []
+    last = float(np.min(everything))
+    for q in np.linspace(0, 1, bins + 1)[1:-1]:
+        cut = float(np.quantile(everything, q))
+        # A cut on a value many samples share goes above it: the bin below keeps them together.
+        cut = float(np.nextafter(cut + 1e-9 * span, np.inf))
+        below = np.count_nonzero((everything >= last) & (everything < cut))
+        above = np.count_nonzero(everything >= cut)
+        if min(below, above) >= everything.size / (2 * bins):
+            inner.append(cut)
+            last = cut
+    if not inner:
+        return None
+    edges = (float(np.min(everything)), *inner, float(np.max(everything)))
+    labels = {name: np.searchsorted(inner, v, side="right") for name, v in values.items()}
+    return tuple(pairwise(edges)), labels
+
+
+def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int, title: str) -> RegimeAxis | None:
+    cut = quantile_labels(values, bins)
+    if cut is None:
+        return None
+    edges, labels = cut
+    titles = tuple(title.format(f"{low:.3g} to {high:.3g} {unit}") for low, high in edges)
+    return RegimeAxis(name, unit, titles, edges, labels)
+
+
+def _stretches(time: Mapping[str, Real], bins: int) -> RegimeAxis:
+    longest = max(float(t[-1]) for t in time.values())
+    edges = np.linspace(0.0, longest * (1 + 1e-9), bins + 1)
+    labels = {name: np.searchsorted(edges[1:-1], t, side="right") for name, t in time.items()}
+    pairs = tuple((float(a), float(b)) for a, b in pairwise(edges))
+    titles = tuple(f"{a:.2g} to {b:.2g} s after the start" for a, b in pairs)
+    return RegimeAxis("time", "s", titles, pairs, labels)
+
+
+def _period(angle: Mapping[str, Real], cycles: float, bins: int = 8) -> RegimeAxis:
+    width = 2 * np.pi / bins
+    labels = {
+        name: np.minimum((np.mod(cycles * v, 2 * np.pi) / width).astype(np.int64), bins - 1)
+        for name, v in angle.items()
+    }
+    pairs = tuple((b * width, (b + 1) * width) for b in range(bins))
+    titles = tuple(f"{np.degrees(a):.0f} to {np.degrees(b):.0f} degrees into the ripple" for a, b in pairs)
+    return RegimeAxis("angle_in_period", "rad", titles, pairs, labels)
+
+
+def regime_findings(
+    residuals: Mapping[str, Real], axes: Sequence[RegimeAxis], level: float, rng: np.random.Generator
+) -> tuple[RegimeFinding, ...]:
+    """One finding per axis and sensor; all of them together raise a false alarm with the chance `level`."""
+    each = level / max(len(axes) * len(SENSORS), 1)
+    found = []
+    for axis in axes:
+        sums, counts = _shifted_energy(residuals, axis, rng)
+        for s, sensor in enumerate(SENSORS):
+            found.append(_finding(axis, sensor, sums[:, s], counts, each))
+    return tuple(found)
+
+
+def _shifted_energy(
+    residuals: Mapping[str, Real], axis: RegimeAxis, rng: np.random.Generator
+) -> tuple[Real, Integer]:
+    """Energy (1 + shifts, sensor, bin), row 0 as recorded, and samples (bin,).
+
+    All circular shifts of one experiment are one correlation by FFT; experiments shift independently.
+    """
+    K = len(axis.titles)
+    sums = np.zeros((_SHIFTS + 1, len(SENSORS), K))
+    counts = np.zeros(K, dtype=np.int64)
+    for name, labels in axis.labels.items():
+        T = labels.size
+        inside = (labels[None, :] == np.arange(K)[:, None]).astype(np.float64)
+        counts += inside.sum(axis=1).astype(np.int64)
+        energy = np.fft.rfft(np.square(residuals[name]).T, axis=1)
+        # correlation[s, b, k] = sum_t inside[b, t] energy[s, t + k]
+        correlation = np.fft.irfft(np.conj(np.fft.rfft(inside, axis=1))[None] * energy[:, None], T, axis=2)
+        shift = np.concatenate([[0], rng.integers(0, T, _SHIFTS)])
+        sums += np.moveaxis(correlation[:, :, shift], 2, 0)
+    return sums, counts
+
+
+def _finding(axis: RegimeAxis, sensor: str, sums: Real, counts: Integer, level: float) -> RegimeFinding:
+    mean = sums / counts
+    centre, spread = mean.mean(axis=0), mean.std(axis=0)
+    usable = spread > 1e-9 * max(float(centre.max()), 1e-12)
+    if not np.any(usable):
+        p_value, contrast = 1.0, 0.0
+    else:
+        score = np.max(np.abs(mean[:, usable] - centre[usable]) / spread[usable], axis=1)
+        # The recorded order counts among the shifts (Phipson and Smyth 2010), and so do ties within rounding.
+        p_value = float(np.mean(score >= score[0] * (1 - 1e-9)))
+        contrast = float(score[0])
+    low, high = np.quantile(mean, (0.025, 0.975), axis=0)
+    found = bool(p_value < level)
+    bins = tuple(
+        RegimeBin(title, edge[0], edge[1], int(n), float(value), (float(a), float(b)))
+        for title, edge, n, value, a, b in zip(
+            axis.titles, axis.edges, counts, mean[0], low, high, strict=True
+        )
+    )
+    sentence = _sentence(axis, sensor, mean[0], centre, spread, p_value) if found else ""
+    return RegimeFinding(axis.name, axis.unit, sensor, bins, p_value, found, sentence, contrast)
+
+
+def _sentence(axis: RegimeAxis, sensor: str, mean: Real, centre: Real, spread: Real, p_value: float) -> str:
+    excess = (mean - centre) / np.where(spread > 0, spread, np.inf)
+    top = int(np.argmax(excess)) if excess.max() >= -excess.min() else int(np.argmin(excess))
+    # Ratios of rms beyond the noise, which is what a person sees in a plot.
+    here, usual = (float(np.sqrt(max(v - 1.0, 0.0))) for v in (mean[top], centre[top]))
+    if max(here, usual) < _LEAST_RATIO * min(here, usual):
+        return ""
+    where = axis.titles[top]
+    odds = f"chance {'below 0.001' if p_value < 1e-3 else f'{p_value:.2g}'}"
+    word = "larger" if excess[top] > 0 else "smaller"
+    return (
+        f"The gap of the {sensor.replace('_', ' ')} sensor is {word} {where}: {here:.2g} noise deviations "
+        f"against {usual:.2g} expected there ({odds})."
+    )

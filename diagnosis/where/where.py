@@ -1,0 +1,110 @@
+"""Where the gap between machine and model lies: frequency, regime, time, amplitude, experiment, sensor.
+
+Everything is read from whitened residuals (measured - model) / noise of every experiment, whichever model
+made them: as given, with refitted parameters, or repaired.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from diagnosis.machine.case import Case, Real
+from diagnosis.where.distortion import periodic_findings
+from diagnosis.where.linear_correction import linear_correction
+from diagnosis.where.missing_function import missing_functions
+from diagnosis.where.regimes import motions, regime_axes, regime_findings
+from diagnosis.where.where_common import common_findings
+from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
+from diagnosis.where.where_records import Where
+from diagnosis.where.where_sentences import headline, sentences
+from diagnosis.where.where_trends import amplitude_finding, drift_findings
+from plant.effects import EFFECTS
+
+LEVEL = 0.01
+
+
+def where(
+    case: Case,
+    residuals: Mapping[str, Real],
+    probabilities: Mapping[str, float] | None = None,
+    *,
+    ripple_cycles_per_rev: float | None = None,
+    level: float = LEVEL,
+    rng: np.random.Generator | None = None,
+) -> Where:
+    """Locate the gap.
+
+    Parameters
+    ----------
+    residuals : experiment name -> (T, 2)
+        (measured - model) / noise, standard deviation 1 where the model explains everything; every experiment
+        of the case.
+    probabilities : effect id, "none" or "unknown" -> probability, optional
+        Of the causes, for the grouping by subsystem.
+    ripple_cycles_per_rev
+        Adds the angle within one period of a known torque ripple to the regimes.
+    level
+        Chance of a false finding in each axis (frequency, regimes, drift, experiments, sensors) when the
+        records hold only noise.
+    rng
+        Of the shifts and blocks; without it a fixed sequence, so that the same records give the same page.
+
+    Raises
+    ------
+    ValueError
+        Missing or misshaped residuals, a level outside (0, 1), an effect that does not exist.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1; got {level}")
+    rng = np.random.default_rng(0) if rng is None else rng
+    moved = motions(case, residuals)
+    e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
+    squares = Energy(sum(float(np.sum(v**2)) for v in e.values()), sum(v.size for v in e.values()))
+    found = Where(
+        headline="",
+        gap=part_gap(squares, squares, level),
+        sensors=sensor_gaps(e, level),
+        experiments=experiment_gaps(e, level),
+        bands=band_gaps(e, case.rig.sampling.dt_s, level),
+        regimes=regime_findings(e, regime_axes(moved, ripple_cycles_per_rev), level, rng),
+        drift=drift_findings(case, e, level),
+        common=common_findings(case, e, level),
+        curves=missing_functions(case, e, moved, level, rng),
+        periodic=periodic_findings(case, e, level),
+        amplitude=amplitude_finding(case, e, level, rng),
+        linear=linear_correction(case, e),
+        subsystem=subsystem_mass(probabilities) if probabilities else {},
+        sentences={},
+        level=level,
+    )
+    return replace(found, sentences=sentences(found), headline=headline(found))
+
+
+def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities added up by where an effect acts: actuator, joint, link, sensor, environment.
+
+    "none" and "unknown" stay on their own. What comes from outside the machine (a periodic disturbance,
+    gravity) counts as environment.
+
+    Raises
+    ------
+    ValueError
+        If a name is neither an effect of the registry nor none or unknown.
+    """
+    mass = dict.fromkeys(("none", "actuator", "joint", "link", "sensor", "environment", "unknown"), 0.0)
+    for name, value in probabilities.items():
+        if name in ("none", "unknown"):
+            mass[name] += float(value)
+        elif name in _ENVIRONMENT:
+            mass["environment"] += float(value)
+        elif name in EFFECTS:
+            mass[EFFECTS[name].group] += float(value)
+        else:
+            raise ValueError(f"{name}: no such effect; known: {', '.join(EFFECTS)}, none, unknown")
+    return mass
+
+
+_ENVIRONMENT = frozenset({"periodic_disturbance", "gravity"})

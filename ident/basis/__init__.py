@@ -1,0 +1,1 @@
+"""Poles, orthonormal bases, structure and search coordinates, models and their posterior."""

@@ -1,0 +1,193 @@
+"""Where the pole search looks: boxes from the data, and maps from the unit cube to poles.
+
+Coordinates "log": log10(1 - a) for a real pole, (log10 omega, log10 zeta) for a pair. Coordinates "raw":
+the paper's own x, and (beta, gamma) of (29). Poles of equal type are ordered by the triangular map s2 = s1
++ (hi - s1) x2 on their first coordinate: two equal real poles are a saddle that DIRECT would sample and a
+descent cannot leave.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.data.arrays import RealArray, kernel_array, readonly_real
+
+# A pair this close to critical damping is two real poles in disguise; its two columns become dependent.
+ZETA_LIMIT = 0.98
+# Without a bound of the user no pair is less damped: links have more, and an undamped pair with a free
+# initial state fits any slow disturbance.
+ZETA_LEAST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SearchSpace:
+    """Box of a search for n_real real poles and n_pairs pairs, as low and high (3,) of one pole of each type.
+
+    low, high: [real, pair first, pair second] in the coordinates of the module text; frequencies in
+    rad/sample.
+    """
+
+    n_real: int
+    n_pairs: int
+    low: RealArray
+    high: RealArray
+    raw: bool
+    dt_s: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "low", readonly_real(self.low))
+        object.__setattr__(self, "high", readonly_real(self.high))
+        if not np.all(self.low < self.high):
+            names = ("real pole", "pair frequency", "pair damping")
+            i = int(np.flatnonzero(~(self.low < self.high))[0])
+            raise ValueError(
+                f"the search box of the {names[i]} is empty: its lower bound is not below its upper bound"
+            )
+
+    @property
+    def dimension(self) -> int:
+        return self.n_real + 2 * self.n_pairs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each coordinate, with its unit."""
+        real = "x" if self.raw else "log10(1 - a)"
+        pair = ("beta", "gamma") if self.raw else ("log10(omega [rad/s])", "log10(zeta)")
+        pairs = [f"{name} {i + 1}" for i in range(self.n_pairs) for name in pair]
+        return (*(f"{real} {i + 1}" for i in range(self.n_real)), *pairs)
+
+    def kernel_arguments(self, units: RealArray) -> tuple[RealArray, int, RealArray, RealArray]:
+        """Points and box as compiled code takes them (`ident.data.arrays.kernel_array`)."""
+        return kernel_array(units), self.n_real, self.low.copy(), self.high.copy()
+
+    def blocks(self, unit: RealArray) -> RealArray:
+        """Cascade blocks (R + P, 4) of a point of the unit cube."""
+        return np.asarray(blocks_of_point(*self.kernel_arguments(unit), self.raw))
+
+    def poles(self, unit: RealArray) -> Poles:
+        """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =
+        0.95."""
+        if not self.raw:
+            point = np.asarray(_coordinates_of_point(*self.kernel_arguments(unit)))
+            real, first, second = point[: self.n_real], point[self.n_real :: 2], point[self.n_real + 1 :: 2]
+            omega, zeta = 10.0**first, 10.0**second
+            return Poles(1 - 10.0**real, np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+        blocks = self.blocks(unit)
+        gamma, beta = blocks[self.n_real :, 0], blocks[self.n_real :, 1]
+        re = beta * (1 + gamma) / 2
+        im = np.sqrt(np.maximum(gamma - re**2, 0.0))
+        pairs = re + 1j * im
+        with np.errstate(divide="ignore"):
+            log = np.log(np.where(pairs == 0, 1e-3, pairs))
+        size = np.minimum(np.abs(log), 0.9 * np.pi)
+        zeta = np.clip(-log.real / size, 1e-6, 0.95)
+        proper = (im > 0) & (-log.real < 0.95 * np.abs(log))
+        pairs = np.where(proper, pairs, np.exp(size * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+        return Poles(blocks[: self.n_real, 0], pairs)
+
+    def levels(self, poles: Poles) -> RealArray:
+        """Where poles lie in the box, 0 to 1: (R + P,) by their first coordinate; beyond a side counts as on
+        it."""
+        if self.raw:
+            first = np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
+        else:
+            first = np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
+        low = np.repeat(self.low[:2], [poles.real.size, poles.pairs.size])
+        high = np.repeat(self.high[:2], [poles.real.size, poles.pairs.size])
+        return np.asarray(np.clip((first - low) / (high - low), 0, 1))
+
+    def coordinates(self, units: RealArray) -> RealArray:
+        """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s."""
+        points = np.asarray(_coordinates_of_points(*self.kernel_arguments(units)))
+        if not self.raw:
+            points[:, self.n_real :: 2] -= np.log10(self.dt_s)
+        return points
+
+
+def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: IdentOptions) -> SearchSpace:
+    """Box from record length (samples) and sampling time; bounds given in the options replace its sides.
+
+    1 - a in [0.2/N, 0.7], omega in [4 pi/(N dt), 0.9 pi/dt], zeta in [1e-3, 0.63].
+    """
+    n = max(longest, 30)
+    if options.coordinates == "raw":
+        edge = 1 - 0.2 / n
+        return SearchSpace(
+            n_real, n_pairs, np.array([0.0, -edge, 0.0]), np.array([edge, edge, edge]), True, dt_s
+        )
+    low = [np.log10(0.2 / n), np.log10(4 * np.pi / n), np.log10(ZETA_LEAST)]
+    high = [np.log10(0.7), np.log10(0.9 * np.pi), np.log10(0.63)]
+    if options.decay_min_per_s is not None:
+        low[0] = np.log10(-np.expm1(-options.decay_min_per_s * dt_s))
+    if options.decay_max_per_s is not None:
+        high[0] = np.log10(-np.expm1(-options.decay_max_per_s * dt_s))
+    if options.omega_min_rad_s is not None:
+        low[1] = np.log10(options.omega_min_rad_s * dt_s)
+    if options.omega_max_rad_s is not None:
+        high[1] = np.log10(min(options.omega_max_rad_s * dt_s, 0.99 * np.pi))
+    if options.zeta_min is not None:
+        low[2] = np.log10(options.zeta_min)
+    if options.zeta_max is not None:
+        high[2] = np.log10(options.zeta_max)
+    return SearchSpace(n_real, n_pairs, np.array(low), np.array(high), False, dt_s)
+
+
+@numba.njit(cache=True)
+def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
+    point = np.empty(unit.size)
+    floor = low[0]
+    for i in range(n_real):
+        floor = floor + (high[0] - floor) * unit[i]
+        point[i] = floor
+    floor = low[1]
+    for i in range(n_real, unit.size, 2):
+        floor = floor + (high[1] - floor) * unit[i]
+        point[i] = floor
+        point[i + 1] = low[2] + (high[2] - low[2]) * unit[i + 1]
+    return point
+
+
+@numba.njit(cache=True)
+def _coordinates_of_points(units: Any, n_real: int, low: Any, high: Any) -> Any:
+    points = np.empty_like(units)
+    for i in range(units.shape[0]):
+        point = _coordinates_of_point(units[i], n_real, low, high)
+        for j in range(point.size):
+            points[i, j] = point[j]
+    return points
+
+
+@numba.njit(cache=True)
+def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> Any:
+    """Cascade blocks of a point of the unit cube (see `ident.basis.functions.block_parameters`), without
+    cancellation."""
+    point = _coordinates_of_point(unit, n_real, low, high)
+    blocks = np.zeros((n_real + (unit.size - n_real) // 2, 4))
+    for i in range(n_real):
+        distance = 1.0 - point[i] if raw else 10.0 ** point[i]
+        blocks[i, 0] = 1.0 - distance
+        blocks[i, 1] = np.sqrt(distance * (2.0 - distance))
+    for i in range(n_real, blocks.shape[0]):
+        first, second = point[2 * i - n_real], point[2 * i - n_real + 1]
+        if raw:
+            beta, gamma = first, second
+            sb = np.sqrt((1 - beta) * (1 + beta))
+            one_minus_gamma = 1 - gamma
+        else:
+            omega, zeta = 10.0**first, 10.0**second
+            decay, angle = zeta * omega, omega * np.sqrt(1 - zeta * zeta)
+            gamma = np.exp(-2 * decay)
+            one_minus_gamma = -np.expm1(-2 * decay)
+            beta = 2 * np.exp(-decay) * np.cos(angle) / (1 + gamma)
+            sb = np.sqrt(one_minus_gamma**2 + 4 * gamma * np.sin(angle) ** 2) / (1 + gamma)
+        blocks[i, 0] = gamma
+        blocks[i, 1] = beta
+        blocks[i, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
+        blocks[i, 3] = sb
+    return blocks

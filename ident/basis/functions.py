@@ -1,0 +1,246 @@
+"""Generalised orthonormal basis functions as a lossless cascade (design 4.1, paper (5)).
+
+L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper. A conjugate
+pair gets the real two-column Kautz form after the all-pass of the poles before it: sg (z - beta)/D and sg
+sb/D with D = z^2 - beta (1 + gamma) z + gamma, gamma = |x|^2, beta = 2 Re x/(1 + |x|^2), sg = sqrt(1 -
+gamma^2), sb = sqrt(1 - beta^2). FIR (all poles 0), Laguerre (one repeated real pole) and two-parameter
+Kautz (one repeated pair) are nothing but particular poles here: one code path, four names.
+
+Order of the functions: real poles first, then two per pair.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from ident.basis.poles import Poles
+from ident.data.arrays import ComplexArray, RealArray
+
+
+class LosslessCascade(NamedTuple):
+    """State space x(k+1) = A x + B u, w = C x + D u; the states x are the basis functions, w is the
+    all-pass output.
+
+    A (B, B), B (B, 1), C (1, B), D (1, 1); the matrix [[A, B], [C, D]] is orthogonal, so A A^T + B B^T = I.
+    """
+
+    A: RealArray
+    B: RealArray
+    C: RealArray
+    D: RealArray
+
+
+def block_parameters(poles: Poles) -> RealArray:
+    """The numbers each block of the cascade needs, (R + P, 4): real [a, sqrt(1 - a^2), 0, 0], pair [gamma,
+    beta, sg, sb].
+
+    Nothing here subtracts two numbers close to 1 after squaring: 1 - gamma is formed as (1 - |re|)(1 +
+    |re|) - im^2 from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 =
+    1 and gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
+    """
+    return np.asarray(_blocks(*poles.writable()))
+
+
+@numba.njit(cache=True)
+def _blocks(real: Any, pairs: Any) -> Any:
+    blocks = np.zeros((real.size + pairs.size, 4))
+    for i in range(real.size):
+        blocks[i, 0] = real[i]
+        blocks[i, 1] = np.sqrt((1 - real[i]) * (1 + real[i]))
+    for i in range(pairs.size):
+        re, im = pairs[i].real, pairs[i].imag
+        gamma = re**2 + im**2
+        # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis
+        # function.
+        one_minus_gamma = max((1 - abs(re)) * (1 + abs(re)) - im**2, 5e-17)
+        blocks[real.size + i, 0] = gamma
+        blocks[real.size + i, 1] = 2 * re / (1 + gamma)
+        blocks[real.size + i, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
+        blocks[real.size + i, 3] = np.sqrt(one_minus_gamma**2 + 4 * im**2) / (1 + gamma)
+    return blocks
+
+
+def basis_state_space(poles: Poles) -> LosslessCascade:
+    """Lossless cascade whose states are the basis functions (replaces inverting E in (24)).
+
+    Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B
+    = [sg, 0], C = [-beta sg, sb sg], D = gamma; each block is driven by the all-pass output of the one
+    before.
+    """
+    n = poles.order
+    A, B = np.zeros((n, n)), np.zeros((n, 1))
+    C, D = np.zeros((1, n)), np.ones((1, 1))
+    at = 0
+    for i, (p0, p1, p2, p3) in enumerate(block_parameters(poles)):
+        if i < poles.real.size:
+            block_a, block_b, block_c, block_d = np.array([[p0]]), np.array([[p1]]), np.array([[p1]]), -p0
+        else:
+            gamma, beta, sg, sb = p0, p1, p2, p3
+            block_a = np.array([[gamma * beta, -gamma * sb], [sb, beta]])
+            block_b = np.array([[sg], [0.0]])
+            block_c = np.array([[-beta * sg, sb * sg]])
+            block_d = gamma
+        here = slice(at, at + block_a.shape[0])
+        A[here, :] = block_b @ C
+        A[here, here] = block_a
+        B[here] = block_b @ D
+        C = block_d * C
+        C[:, here] = block_c
+        D = block_d * D
+        at = here.stop
+    return LosslessCascade(A, B, C, D)
+
+
+def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
+    """Values (F, B) of the basis functions at the points z (F,); z must not be a pole."""
+    return _response_and_all_pass(poles, z)[0]
+
+
+def all_pass_response(poles: Poles, z: ComplexArray) -> ComplexArray:
+    """B(z) = prod (1 - conj(x) z)/(z - x) at the points z (F,); modulus 1 on the unit circle."""
+    return _response_and_all_pass(poles, z)[1]
+
+
+def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    z = np.asarray(z, dtype=np.complex128)
+    if z.ndim != 1:
+        raise ValueError(f"z must be a 1-d array; got shape {z.shape}")
+    columns = np.empty((z.size, poles.order), dtype=np.complex128)
+    all_pass = np.ones(z.size, dtype=np.complex128)
+    blocks = block_parameters(poles)
+    n_real = poles.real.size
+    for i, a in enumerate(poles.real):
+        columns[:, i] = blocks[i, 1] / (z - a) * all_pass
+        all_pass *= (1 - a * z) / (z - a)
+    for i, p in enumerate(poles.pairs):
+        _, beta, sg, sb = blocks[n_real + i]
+        # Factored, not expanded: z^2 - beta (1 + gamma) z + gamma cancels when z is near the pole.
+        driven = all_pass / ((z - p) * (z - p.conjugate()))
+        columns[:, n_real + 2 * i] = sg * (z - beta) * driven
+        columns[:, n_real + 2 * i + 1] = sg * sb * driven
+        all_pass = (1 - p.conjugate() * z) * (1 - p * z) * driven
+    return columns, all_pass
+
+
+def regressor(poles: Poles, u: RealArray) -> RealArray:
+    """Basis functions driven by u from rest: Phi (T, B) with Phi[k, i] = [L_i(q) u](k); Phi[0] = 0."""
+    signal = np.array(u, dtype=np.float64)
+    if signal.ndim != 1:
+        raise ValueError(f"u must be (T,); got shape {signal.shape}")
+    rows = np.empty((poles.order, signal.size))
+    run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
+    return rows.T
+
+
+def all_pass_signal(poles: Poles, u: RealArray) -> RealArray:
+    """u (T,) sent through the all-pass of the poles, from rest, (T,)."""
+    signal = np.array(u, dtype=np.float64)
+    rows = np.empty((poles.order, signal.size))
+    run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
+    return signal
+
+
+def free_response(poles: Poles, n_samples: int) -> RealArray:
+    """Free responses of the cascade (T, B): column i is the basis impulse response h_i(k + 1), k = 0..T-1.
+
+    They span every output the poles can give without input, so they are the nuisance columns of an unknown
+    initial state.
+    """
+    rows = np.empty((poles.order, n_samples))
+    run_cascade_free(block_parameters(poles), poles.real.size, rows, 0, n_samples)
+    return rows.T
+
+
+@numba.njit(cache=True, forceinline=True, fastmath={"contract"})
+def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
+    """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
+    output.
+
+    One block after the other over the whole signal: the recursion of a block is a short chain that the
+    processor overlaps, and every row is written once, contiguously.
+    """
+    signal = w[lo:hi]
+    for i in range(blocks.shape[0]):
+        out1 = rows[row, lo:hi]
+        if i < n_real:
+            a, b = blocks[i, 0], blocks[i, 1]
+            x = 0.0
+            for k in range(signal.size):
+                v = signal[k]
+                out1[k] = x
+                signal[k] = b * x - a * v
+                x = b * v + a * x
+            row += 1
+        else:
+            gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
+            gb, gs = gamma * beta, gamma * sb
+            c1, c2 = -beta * sg, sb * sg
+            x1 = 0.0
+            x2 = 0.0
+            out2 = rows[row + 1, lo:hi]
+            for k in range(signal.size):
+                v = signal[k]
+                out1[k] = x1
+                out2[k] = x2
+                signal[k] = c1 * x1 + c2 * x2 + gamma * v
+                x1_next = (sg * v - gs * x2) + gb * x1
+                x2 = sb * x1 + beta * x2
+                x1 = x1_next
+            row += 2
+
+
+@numba.njit(cache=True)
+def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
+    """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k
+    = -1.
+
+    Once a block and its input have died out (1e-30, looked at every 32 samples) the rest is set to zero: far
+    below rounding, it saves time and keeps denormal numbers (slow) away.
+    """
+    # The all-pass response to the impulse: its value at k = -1 (the direct terms), the signal w from k = 0
+    # on.
+    impulse = 1.0
+    w = np.zeros(length)
+    alive = 0  # w is zero from here on
+    for i in range(blocks.shape[0]):
+        out1 = rows[row]
+        stop = 0
+        if i < n_real:
+            a, b = blocks[i, 0], blocks[i, 1]
+            x = b * impulse
+            impulse = -a * impulse
+            while stop < length and (stop < alive or abs(x) > 1e-30):
+                start, stop = stop, min(stop + 32, length)
+                for k in range(start, stop):
+                    v = w[k]
+                    out1[k] = x
+                    w[k] = b * x - a * v
+                    x = a * x + b * v
+            row += 1
+        else:
+            gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
+            gb, gs = gamma * beta, gamma * sb
+            c1, c2 = -beta * sg, sb * sg
+            x1 = sg * impulse
+            x2 = 0.0
+            impulse = gamma * impulse
+            out2 = rows[row + 1]
+            while stop < length and (stop < alive or abs(x1) + abs(x2) > 1e-30):
+                start, stop = stop, min(stop + 32, length)
+                for k in range(start, stop):
+                    v = w[k]
+                    out1[k] = x1
+                    out2[k] = x2
+                    w[k] = c1 * x1 + c2 * x2 + gamma * v
+                    x1_next = gb * x1 - gs * x2 + sg * v
+                    x2 = sb * x1 + beta * x2
+                    x1 = x1_next
+            for k in range(stop, length):
+                out2[k] = 0.0
+            row += 2
+        for k in range(stop, length):
+            out1[k] = 0.0
+        alive = max(alive, stop)

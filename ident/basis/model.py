@@ -1,0 +1,177 @@
+"""A GOBF model: poles, coefficients and the fixed structure around them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from ident.basis.functions import basis_response, basis_state_space, regressor
+from ident.basis.poles import Poles
+from ident.basis.structure import filter_input
+from ident.data.arrays import ComplexArray, RealArray, readonly_real
+
+
+@dataclass(frozen=True, eq=False)
+class GobfModel:
+    """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
+    (5).
+
+    Attributes
+    ----------
+    poles : Poles
+    coefficients : (B,) array
+        One per basis function, real poles first, then two per pair.
+    dt_s : float
+        Sampling time in seconds.
+    feedthrough : float
+        Direct term of the part in brackets.
+    integrators, input_delay_samples : int
+    input_name, output_name : str
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit, a number is not finite or dt_s is not positive.
+    """
+
+    poles: Poles
+    coefficients: RealArray
+    dt_s: float
+    feedthrough: float = 0.0
+    integrators: int = 0
+    input_delay_samples: int = 0
+    input_name: str = "u"
+    output_name: str = "y"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coefficients", readonly_real(self.coefficients))
+        if self.coefficients.shape != (self.poles.order,):
+            raise ValueError(
+                f"need one coefficient per basis function, shape ({self.poles.order},); got "
+                f"{self.coefficients.shape}"
+            )
+        if not (np.all(np.isfinite(self.coefficients)) and np.isfinite(self.feedthrough)):
+            raise ValueError("the coefficients and the direct term must be finite")
+        if not (np.isfinite(self.dt_s) and self.dt_s > 0):
+            raise ValueError(f"dt_s must be positive; got {self.dt_s}")
+        if not (self.integrators >= 0 and self.input_delay_samples >= 0):
+            raise ValueError(
+                "integrators and input_delay_samples must not be negative; "
+                f"got {self.integrators} and {self.input_delay_samples}"
+            )
+
+    @property
+    def order(self) -> int:
+        """Number of basis functions (integrators and delay not counted)."""
+        return self.poles.order
+
+    def frequency_response(self, omega_rad_s: RealArray) -> ComplexArray:
+        """omega (F,) in rad/s, |omega| <= pi/dt (and not 0 with integrators) -> G (F,)."""
+        omega = np.asarray(omega_rad_s, dtype=np.float64)
+        if omega.ndim != 1 or not np.all(np.abs(omega) <= np.pi / self.dt_s * (1 + 1e-12)):
+            raise ValueError(f"omega_rad_s must be (F,) and stop at pi/dt = {np.pi / self.dt_s:.6g} rad/s")
+        if self.integrators and not np.all(omega != 0):
+            raise ValueError("a model with integrators has no finite response at omega = 0")
+        z = np.exp(1j * omega * self.dt_s)
+        inner = basis_response(self.poles, z) @ self.coefficients + self.feedthrough
+        # 1 - 1/z without cancellation at low frequency: 2j sin(w dt/2) exp(-j w dt/2).
+        half = omega * self.dt_s / 2
+        difference = 2j * np.sin(half) * np.exp(-1j * half)
+        return np.asarray(
+            inner * difference ** (-self.integrators) * z ** (-self.input_delay_samples), dtype=np.complex128
+        )
+
+    def state_space(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+        """(A, B, C, D) of the cascade delay -> integrators -> lossless basis; (n, n), (n, 1), (1, n), (1, 1).
+
+        The basis keeps its orthogonal realisation (no expansion into polynomials, which loses order-12
+        models).
+        """
+        # Front end as scalar stages in series; the state vector is [delay line, integrators, basis].
+        delay, k, n = self.input_delay_samples, self.integrators, self.order
+        size = delay + k + n
+        A, B = np.zeros((size, size)), np.zeros((size, 1))
+        # signal_c x + signal_d u is the signal that leaves the stages built so far.
+        signal_c, signal_d = np.zeros((1, size)), np.ones((1, 1))
+        for i in range(delay):
+            A[i], B[i] = signal_c, signal_d
+            signal_c, signal_d = np.zeros((1, size)), np.zeros((1, 1))
+            signal_c[0, i] = 1.0
+        for i in range(delay, delay + k):
+            # w = s + v, s(k+1) = s + v: the sum that includes the present sample, z/(z - 1).
+            signal_c = signal_c.copy()
+            signal_c[0, i] = 1.0
+            A[i], B[i] = signal_c, signal_d
+        basis = basis_state_space(self.poles)
+        here = slice(delay + k, size)
+        A[here] += basis.B @ signal_c
+        A[here, here] += basis.A
+        B[here] = basis.B @ signal_d
+        C = self.feedthrough * signal_c
+        C[0, here] += self.coefficients
+        return A, B, C, self.feedthrough * signal_d
+
+    def zeros(self) -> ComplexArray:
+        """Finite zeros (Z,) of the basis part, by magnitude; those of delay and integrators are at 0 and left
+        out.
+
+        Generalised eigenvalues of the system pencil, so nothing is expanded into polynomials. A zero beyond
+        1e4 is one at infinity that rounding has brought back, and is left out as well.
+        """
+        basis = basis_state_space(self.poles)
+        n = self.order
+        pencil = np.block(
+            [[basis.A, basis.B], [self.coefficients[None, :], np.full((1, 1), self.feedthrough)]]
+        )
+        unit = np.diag(np.concatenate([np.ones(n), np.zeros(1)]))
+        alpha, beta = scipy.linalg.eigvals(pencil, unit, homogeneous_eigvals=True)
+        finite = np.abs(alpha) <= 1e4 * np.abs(beta)
+        values = np.asarray(alpha[finite] / beta[finite], dtype=np.complex128)
+        return values[np.argsort(np.abs(values), kind="stable")]
+
+    def to_control(self) -> Any:
+        """The same model as a `control.StateSpace` with dt = dt_s."""
+        import control
+
+        return control.ss(
+            *self.state_space(),
+            self.dt_s,
+            inputs=[self.input_name],
+            outputs=[self.output_name],
+            remove_useless_states=False,
+        )
+
+    def simulate(self, u: RealArray) -> RealArray:
+        """Output (T,) for the input u (T,), from rest."""
+        filtered = filter_input(u, self.integrators, self.input_delay_samples)
+        return np.asarray(regressor(self.poles, filtered) @ self.coefficients + self.feedthrough * filtered)
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        return {
+            "poles_real": self.poles.real,
+            "poles_pairs": self.poles.pairs,
+            "coefficients": self.coefficients,
+            "dt_s": np.array(self.dt_s),
+            "feedthrough": np.array(self.feedthrough),
+            "integrators": np.array(self.integrators),
+            "input_delay_samples": np.array(self.input_delay_samples),
+            "names": np.array([self.input_name, self.output_name]),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> GobfModel:
+        return cls(
+            poles=Poles(arrays["poles_real"], arrays["poles_pairs"]),
+            coefficients=arrays["coefficients"],
+            dt_s=float(arrays["dt_s"]),
+            feedthrough=float(arrays["feedthrough"]),
+            integrators=int(arrays["integrators"]),
+            input_delay_samples=int(arrays["input_delay_samples"]),
+            input_name=str(arrays["names"][0]),
+            output_name=str(arrays["names"][1]),
+        )

@@ -1,0 +1,154 @@
+"""Settings of an identification, checked when they are read."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+
+Algorithm = Literal[
+    "DIRECT_L",
+    "GN_DIRECT_L",
+    "GN_DIRECT",
+    "GN_DIRECT_NOSCAL",
+    "GN_DIRECT_L_NOSCAL",
+    "GN_DIRECT_L_RAND",
+    "GN_DIRECT_L_RAND_NOSCAL",
+    "GN_ORIG_DIRECT",
+    "GN_ORIG_DIRECT_L",
+    "SCIPY_DIRECT",
+    "SCIPY_DIRECT_L",
+]
+
+
+class IdentOptions(BaseModel):
+    """What to fit and how to search for the poles (design 4.3).
+
+    What is stated as known (integrators, fixed_poles, input_delay_samples, relative_degree) is tested against
+    the data (`ident.checks.prior_tests`): if they refuse it, it is kept and a warning says so. Numbers of
+    poles left at None are chosen from the data, step by step. The box of the search comes from the data alone
+    (record length and sampling time) where no bound is given; a given bound also binds the polish.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    n_real: int | None = Field(
+        None, ge=0, le=8, description="number of searched real poles; none: from the data"
+    )
+    n_pairs: int | None = Field(
+        None, ge=0, le=12, description="number of searched pole pairs; none: from the data"
+    )
+    max_real: int = Field(
+        4, ge=0, le=8, description="most real poles when their number is chosen from the data"
+    )
+    max_pairs: int = Field(
+        5, ge=0, le=12, description="most pole pairs when their number is chosen from the data"
+    )
+    fixed_poles: tuple[tuple[float, float], ...] = Field(
+        (), description="known poles in the z plane, [real part, imaginary part >= 0], kept where they are"
+    )
+
+    integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
+    feedthrough: bool = Field(
+        False, description="direct term from the input to the output of the same sample"
+    )
+    input_delay_samples: int = Field(0, ge=0, description="known whole delay of the input")
+    relative_degree: Annotated[int, Field(ge=1, le=6)] | Literal["auto"] | None = Field(
+        None,
+        description="known relative degree of the continuous-time plant behind a zero-order hold (torque to "
+        "angle: 2), tested and kept; auto: the largest of 1 to 3 that the data do not refuse",
+    )
+    estimate_offset: bool | Literal["auto"] = Field(
+        "auto", description="unknown constant on the output of each record; auto: kept if the data ask for it"
+    )
+    estimate_initial_state: bool | Literal["auto"] = Field(
+        "auto", description="records need not start from rest; auto: kept if the data ask for it"
+    )
+
+    algorithm: Algorithm = Field(
+        "DIRECT_L",
+        description="DIRECT_L: NLopt's GN_DIRECT_L point for point, the points of an iteration evaluated "
+        "together; or NLopt's DIRECT variants themselves, or scipy's",
+    )
+    coordinates: Literal["log", "raw"] = Field(
+        "log",
+        description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the "
+        "best poles more often than not",
+    )
+    evaluations: int = Field(
+        250, ge=20, le=1_000_000, description="cost evaluations of the first global search"
+    )
+    search_samples: int = Field(
+        20_000, ge=100, description="longer data are searched on a part of them, then polished on all"
+    )
+    starts: int = Field(
+        4,
+        ge=1,
+        le=20,
+        description="points of a global search that are polished; five times as many if the first disagree",
+    )
+
+    omega_min_rad_s: float | None = Field(None, gt=0, description="lowest natural frequency of a pair")
+    omega_max_rad_s: float | None = Field(None, gt=0, description="highest natural frequency of a pair")
+    zeta_min: float | None = Field(None, gt=0, lt=0.98, description="least damping ratio of a pair")
+    zeta_max: float | None = Field(None, gt=0, le=0.98, description="largest damping ratio of a pair")
+    decay_min_per_s: float | None = Field(None, gt=0, description="slowest decay of a real pole, 1/s")
+    decay_max_per_s: float | None = Field(None, gt=0, description="fastest decay of a real pole, 1/s")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IdentOptions:
+        for low, high in (
+            ("omega_min_rad_s", "omega_max_rad_s"),
+            ("zeta_min", "zeta_max"),
+            ("decay_min_per_s", "decay_max_per_s"),
+        ):
+            lowest, highest = getattr(self, low), getattr(self, high)
+            if lowest is not None and highest is not None and not lowest < highest:
+                raise ValueError(f"{low} must be below {high}; got {lowest} and {highest}")
+            if self.coordinates == "raw" and not (lowest is None and highest is None):
+                raise ValueError(f"{low} and {high} need coordinates = 'log'")
+        self.fixed()
+        self._refuse_impossible_relative_degree()
+        return self
+
+    def _refuse_impossible_relative_degree(self) -> None:
+        if self.relative_degree is None:
+            return
+        if self.feedthrough:
+            raise ValueError("relative_degree of 1 or more excludes a direct term; set feedthrough = false")
+        for re, im in self.fixed_poles:
+            if im == 0 and not re > 0:
+                raise ValueError(
+                    "relative_degree needs poles with a continuous-time counterpart; fixed_poles has "
+                    f"[{re:.6g}, 0], expected a positive real part"
+                )
+        if isinstance(self.relative_degree, int) and None not in (self.n_real, self.n_pairs):
+            order = self.fixed().order + (self.n_real or 0) + 2 * (self.n_pairs or 0)
+            if order < self.relative_degree:
+                raise ValueError(
+                    f"relative_degree = {self.relative_degree} needs at least that many poles, integrators "
+                    f"counted; got {order}"
+                )
+
+    def fixed(self) -> Poles:
+        """The fixed poles; ValueError if one is not inside the unit circle.
+
+        Each integrator brings a pole at z = 0: its filter z/(z - 1) puts a zero there, and only together
+        with a pole is the numerator as free as if the integrator were one of the poles.
+        """
+        real = [0.0] * self.integrators + [re for re, im in self.fixed_poles if im == 0]
+        pairs = [complex(re, im) for re, im in self.fixed_poles if im != 0]
+        return Poles(real, pairs)  # type: ignore[arg-type]
+
+    def structure(self) -> Structure:
+        """The structure these settings describe, before the data were asked: offset on, start from rest."""
+        return Structure(
+            integrators=self.integrators,
+            input_delay_samples=self.input_delay_samples,
+            feedthrough=self.feedthrough,
+            estimate_offset=bool(self.estimate_offset),
+            estimate_initial_state=self.estimate_initial_state is True,
+        )

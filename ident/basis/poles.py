@@ -1,0 +1,168 @@
+"""The poles of a basis: real ones and conjugate pairs, inside the unit circle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
+
+
+def _no_real() -> RealArray:
+    return np.zeros(0)
+
+
+def _no_pairs() -> ComplexArray:
+    return np.zeros(0, dtype=np.complex128)
+
+
+@dataclass(frozen=True, eq=False)
+class Poles:
+    """Discrete-time poles, real ones first, each pair by its member in the upper half plane.
+
+    Attributes
+    ----------
+    real : (R,) array
+        Real poles, -1 < a < 1. Zeros are allowed (FIR).
+    pairs : (P,) complex array
+        One pole p of each conjugate pair, imag(p) > 0 and |p| < 1.
+
+    Raises
+    ------
+    ValueError
+        If a pole is not inside the unit circle, not finite, or a pair member is not above the real axis.
+
+    Notes
+    -----
+    Equal poles are allowed (a basis may repeat a pole); the order is kept, because it fixes the order of the
+    basis functions.
+    """
+
+    real: RealArray = field(default_factory=_no_real)
+    pairs: ComplexArray = field(default_factory=_no_pairs)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "real", readonly_real(self.real))
+        object.__setattr__(self, "pairs", readonly_complex(self.pairs))
+        if self.real.ndim != 1 or self.pairs.ndim != 1:
+            raise ValueError(f"poles must be 1-d arrays; got shapes {self.real.shape} and {self.pairs.shape}")
+        # Number by number: a search makes tens of these, for a few poles each.
+        real, pairs = self.real.tolist(), self.pairs.tolist()
+        for pole in (*real, *pairs):
+            if not math.hypot(pole.real, pole.imag) < 1:
+                raise ValueError(
+                    f"every pole must lie inside the unit circle; got {pole:.6g} "
+                    f"(|p| = {math.hypot(pole.real, pole.imag):.6g})"
+                )
+        for pole in pairs:
+            if not pole.imag > 0:
+                raise ValueError(f"a pair is given by its pole with positive imaginary part; got {pole:.6g}")
+
+    @classmethod
+    def from_values(cls, values: Iterable[complex]) -> Poles:
+        """Sort a list of poles into real ones and pairs.
+
+        Raises
+        ------
+        ValueError
+            If a complex pole has no conjugate partner (to 1e-9), or a pole is outside the unit circle.
+        """
+        real: list[float] = []
+        upper: list[complex] = []
+        lower: list[complex] = []
+        for value in values:
+            pole = complex(value)
+            if pole.imag == 0:
+                real.append(pole.real)
+            elif pole.imag > 0:
+                upper.append(pole)
+            else:
+                lower.append(pole)
+        for pole in upper:
+            partner = min(lower, key=lambda other: abs(other - pole.conjugate()), default=None)
+            if partner is None or not abs(partner - pole.conjugate()) <= 1e-9:
+                raise ValueError(f"complex poles come in conjugate pairs; {pole:.6g} has no partner")
+            lower.remove(partner)
+        if lower:
+            raise ValueError(f"complex poles come in conjugate pairs; {lower[0]:.6g} has no partner")
+        return cls(np.array(real), np.array(upper, dtype=np.complex128))
+
+    @classmethod
+    def from_continuous(
+        cls,
+        *,
+        decay_per_s: Iterable[float] = (),
+        omega_rad_s: Iterable[float] = (),
+        zeta: Iterable[float] = (),
+        dt_s: float,
+    ) -> Poles:
+        """Real poles exp(-decay dt) and pairs exp((-zeta +- j sqrt(1 - zeta^2)) omega dt), 0 < zeta < 1."""
+        if not (np.isfinite(dt_s) and dt_s > 0):
+            raise ValueError(f"dt_s must be positive; got {dt_s}")
+        omega = np.array(list(omega_rad_s), dtype=np.float64)
+        damping = np.array(list(zeta), dtype=np.float64)
+        if omega.shape != damping.shape:
+            raise ValueError(
+                f"omega_rad_s and zeta must be equally long; got {omega.size} and {damping.size}"
+            )
+        if not (np.all(damping > 0) and np.all(damping < 1)):
+            raise ValueError(f"a pair needs 0 < zeta < 1; got {damping}")
+        angle = omega * np.sqrt(1 - damping**2) * dt_s
+        if not np.all((angle > 0) & (angle < np.pi)):
+            raise ValueError(
+                f"the damped frequency of a pair must lie in (0, pi/dt); got {angle / dt_s} rad/s"
+            )
+        real = np.exp(-np.array(list(decay_per_s), dtype=np.float64) * dt_s)
+        return cls(real, np.exp(-damping * omega * dt_s + 1j * angle))
+
+    @property
+    def order(self) -> int:
+        """Number of poles, a pair counted twice; also the number of basis functions."""
+        return int(self.real.size + 2 * self.pairs.size)
+
+    @property
+    def values(self) -> ComplexArray:
+        """All poles (B,): the real ones, then p, conj(p) for each pair."""
+        both = np.column_stack([self.pairs, self.pairs.conj()]).ravel()
+        return np.concatenate([self.real.astype(np.complex128), both])
+
+    def writable(self) -> tuple[RealArray, ComplexArray]:
+        """Copies of real and pairs as compiled code takes them (`ident.data.arrays.kernel_array`)."""
+        return self.real.copy(), self.pairs.copy()
+
+    def doubled(self) -> Poles:
+        """Every pole twice, neighbours equal: the poles of the tangent space Phi2 (design 4.2)."""
+        return Poles(np.repeat(self.real, 2), np.repeat(self.pairs, 2))
+
+    def appended(self, other: Poles) -> Poles:
+        """These poles and then the other's, real before pairs."""
+        return Poles(np.concatenate([self.real, other.real]), np.concatenate([self.pairs, other.pairs]))
+
+    def omega_rad_s(self, dt_s: float) -> RealArray:
+        """Undamped natural frequency |log p|/dt of each pair, (P,)."""
+        return np.asarray(np.abs(np.log(self.pairs)) / dt_s, dtype=np.float64)
+
+    def zeta(self) -> RealArray:
+        """Damping ratio of each pair, (P,), in (0, 1); it does not depend on the sampling time."""
+        log = np.log(self.pairs)
+        return np.asarray(-log.real / np.abs(log), dtype=np.float64)
+
+    def decay_per_s(self, dt_s: float) -> RealArray:
+        """Decay rate -log(a)/dt of each real pole, (R,).
+
+        A pole a <= 0 has no real continuous-time counterpart: its rate is -log|a|/dt, infinite at a = 0.
+        """
+        with np.errstate(divide="ignore"):
+            return np.asarray(-np.log(np.abs(self.real)) / dt_s, dtype=np.float64)
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        return {"real": self.real, "pairs": self.pairs}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Poles:
+        return cls(arrays["real"], arrays["pairs"])

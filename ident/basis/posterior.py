@@ -1,0 +1,236 @@
+"""What identification knows about a response, as a Gaussian over coefficients: evaluable at any frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from ident.basis.functions import basis_response, regressor
+from ident.basis.poles import Poles
+from ident.basis.structure import filter_input
+from ident.data.arrays import ComplexArray, RealArray
+from ident.data.ellipses import ellipse_distance
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+
+# Responses times frequencies that are drawn at once for simultaneous bands.
+_LARGEST_BATCH = 1_000_000
+
+
+@dataclass(frozen=True)
+class EmbeddingReport:
+    """How a posterior came about, in numbers a reader can judge.
+
+    noise_std is that of the (whitened, if ar_coefficients is not empty) output noise in output units; alpha
+    and lam are the kernel's scale (relative to the noise variance) and decay per sample at the largest
+    weight; probability_no_remainder the posterior probability that the poles explain everything (prior 1/2);
+    log_evidence the gain in restricted log likelihood of the best kernel over none; n_rows the samples used
+    after nuisance columns; ar_coefficients (a_1 .. a_n) of the noise filter 1 / (1 + a_1 q^-1 + ...).
+    probability_missed_mode is the posterior probability that the poles lack a lightly damped mode, and
+    missed_mode_rad_s where it most probably is (0: nowhere more than a few per mille); n_added_modes counts
+    modes beyond the model's poles that were too plain to be left to a probability.
+    """
+
+    method: str
+    noise_std: float
+    alpha: float
+    lam: float
+    probability_no_remainder: float
+    log_evidence: float
+    n_rows: int
+    n_regressors: int
+    ar_coefficients: tuple[float, ...] = ()
+    probability_missed_mode: float = 0.0
+    missed_mode_rad_s: float = 0.0
+    n_added_modes: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        return asdict(self) | {"ar_coefficients": list(self.ar_coefficients)}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`."""
+        return cls(**(dict(document) | {"ar_coefficients": tuple(document["ar_coefficients"])}))
+
+
+@dataclass(frozen=True, eq=False)
+class ResponsePosterior:
+    """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
+
+    poles are those of the basis functions L_i (the doubled ones for the tangent method); has_feedthrough says
+    whether d is among the coefficients; fir_length = L. mean (P,) and covariance_factor S (P,P') with
+    P = poles.order + has_feedthrough + L, in the order a, d, h_1 .. h_L; the covariance is S S^T.
+    """
+
+    poles: Poles
+    mean: RealArray
+    covariance_factor: RealArray
+    dt_s: float
+    fir_length: int = 0
+    has_feedthrough: bool = False
+    integrators: int = 0
+    input_delay_samples: int = 0
+    input_name: str = "u"
+    output_name: str = "y"
+    report: EmbeddingReport | None = None
+
+    def __post_init__(self) -> None:
+        mean = np.array(self.mean, dtype=np.float64)
+        factor = np.array(self.covariance_factor, dtype=np.float64)
+        size = self.poles.order + int(self.has_feedthrough) + self.fir_length
+        if mean.shape != (size,) or factor.ndim != 2 or factor.shape[0] != size:
+            raise ValueError(
+                f"need mean ({size},) and covariance_factor ({size}, P'); got {mean.shape}, {factor.shape}"
+            )
+        if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(factor))):
+            raise ValueError("mean and covariance_factor must be finite")
+        if not 0 < self.dt_s < np.inf:
+            raise ValueError(f"dt_s must be positive and finite; got {self.dt_s}")
+        if min(self.fir_length, self.integrators, self.input_delay_samples) < 0:
+            raise ValueError("fir_length, integrators and input_delay_samples must not be negative")
+        for name, array in (("mean", mean), ("covariance_factor", factor)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def frequency_rows(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
+        """(F,P) matrix that maps coefficients to the response at omega (F,) [rad/s], 0 <= omega <= pi / dt_s.
+
+        Raises ValueError outside that range, and at omega = 0 when there are integrators.
+        """
+        omega = np.asarray(omega_rad_s, dtype=np.float64)
+        nyquist = np.pi / self.dt_s
+        if omega.ndim != 1 or not np.all((omega >= 0) & (omega <= nyquist * (1 + 1e-9))):
+            raise ValueError(f"omega (F,) is in rad/s, from 0 to pi / dt_s = {nyquist:.6g}")
+        if self.integrators and not np.all(omega > 0):
+            raise ValueError("the response of an integrator has no value at omega = 0")
+        z = np.exp(1j * omega * self.dt_s)
+        parts = [basis_response(self.poles, z)]
+        if self.has_feedthrough:
+            parts.append(np.ones((omega.size, 1), dtype=np.complex128))
+        parts.append(np.exp(-1j * self.dt_s * np.outer(omega, np.arange(1, self.fir_length + 1))))
+        # 1 - z^-1 written with sin, which keeps its digits near omega = 0 where the difference would lose
+        # them.
+        half = 0.5 * omega * self.dt_s
+        common = np.exp(-1j * omega * self.dt_s * self.input_delay_samples)
+        if self.integrators:
+            common = common / (2j * np.sin(half) * np.exp(-1j * half)) ** self.integrators
+        return np.asarray(common[:, None] * np.hstack(parts))
+
+    def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:
+        """Centre and 2x2 covariances at any strictly increasing omega (F,) [rad/s]."""
+        rows = self.frequency_rows(omega_rad_s)
+        spread = rows @ self.covariance_factor
+        re, im = spread.real, spread.imag
+        covariance = np.empty((rows.shape[0], 2, 2))
+        covariance[:, 0, 0] = np.einsum("fp,fp->f", re, re)
+        covariance[:, 1, 1] = np.einsum("fp,fp->f", im, im)
+        covariance[:, 0, 1] = covariance[:, 1, 0] = np.einsum("fp,fp->f", re, im)
+        method = self.report.method if self.report is not None else "coefficient posterior"
+        return FrequencyUncertainty(
+            np.asarray(omega_rad_s, dtype=np.float64), rows @ self.mean, covariance, self.dt_s, level, method
+        )
+
+    def centre(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
+        """Posterior mean response (F,) alone."""
+        return np.asarray(self.frequency_rows(omega_rad_s) @ self.mean)
+
+    def sample(self, rng: np.random.Generator, n_draws: int) -> RealArray:
+        """(n_draws, P) coefficient draws."""
+        noise = rng.standard_normal((n_draws, self.covariance_factor.shape[1]))
+        return np.asarray(self.mean + noise @ self.covariance_factor.T)
+
+    def response_of(self, draws: RealArray, omega_rad_s: npt.ArrayLike) -> ComplexArray:
+        """Responses (n_draws, F) of coefficient draws (n_draws, P)."""
+        return np.asarray(draws @ self.frequency_rows(omega_rad_s).T)
+
+    def simulate(self, u: RealArray, coefficients: RealArray | None = None) -> RealArray:
+        """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,)."""
+        values = self.mean if coefficients is None else np.asarray(coefficients, dtype=np.float64)
+        if values.shape != self.mean.shape:
+            raise ValueError(f"need coefficients {self.mean.shape}; got {values.shape}")
+        filtered = filter_input(u, self.integrators, self.input_delay_samples)
+        n_poles, n_direct = self.poles.order, int(self.has_feedthrough)
+        taps = np.concatenate([np.zeros(1), values[n_poles + n_direct :]])
+        if self.has_feedthrough:
+            taps[0] = values[n_poles]
+        return np.asarray(
+            regressor(self.poles, filtered) @ values[:n_poles] + lfilter(taps, np.ones(1), filtered)
+        )
+
+    def joint_level(
+        self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
+    ) -> float:
+        """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`.
+
+        The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses,
+        as a per-frequency level; the sampling error of the joint probability is sqrt(level (1 - level) /
+        n_draws).
+        """
+        median = self.at(omega_rad_s, level=0.5)
+        axes, rows = median.ellipse(), self.frequency_rows(omega_rad_s).T
+        largest = np.empty(n_draws)
+        step = max(1, _LARGEST_BATCH // median.centre.size)
+        for start in range(0, n_draws, step):
+            responses = self.sample(rng, min(step, n_draws - start)) @ rows
+            magnitude = np.abs(median.centre) + np.abs(responses)
+            distance = ellipse_distance(responses - median.centre, axes, magnitude)
+            largest[start : start + step] = distance.max(axis=1)
+        # Ellipses at level 1/2 have squared radius 2 ln 2; a distance d on them is level 1 - 2^(-d^2).
+        worst = float(np.quantile(largest, level))
+        return float(min(-np.expm1(-(worst**2) * np.log(2)), 1 - 1e-15))
+
+    def simultaneous(
+        self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
+    ) -> FrequencyUncertainty:
+        """Ellipses that hold the whole response on omega (F,) at once with probability `level`.
+
+        Those of `at` at the `joint_level`: their squared radius is 12 to 13 where that of one alone is 5.99.
+        """
+        return self.at(omega_rad_s, self.joint_level(omega_rad_s, level, rng, n_draws))
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Plain arrays for `np.savez`; `from_arrays` gives back exactly this record."""
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "poles_real": self.poles.real,
+            "poles_pairs": self.poles.pairs,
+            "mean": self.mean,
+            "covariance_factor": self.covariance_factor,
+            "dt_s": np.array(self.dt_s),
+            "names": np.array([self.input_name, self.output_name]),
+        }
+        for name in ("fir_length", "has_feedthrough", "integrators", "input_delay_samples"):
+            arrays[name] = np.array(getattr(self, name))
+        if self.report is not None:
+            arrays |= {
+                f"report_{f.name}": np.array(getattr(self.report, f.name)) for f in fields(EmbeddingReport)
+            }
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+        report = None
+        if "report_method" in mapping:
+            # A report written before a field existed has its default.
+            names = {f.name for f in fields(EmbeddingReport) if f"report_{f.name}" in mapping}
+            values = {name: mapping[f"report_{name}"] for name in names}
+            numbers = {name: value.item() for name, value in values.items() if name != "ar_coefficients"}
+            report = EmbeddingReport(**numbers, ar_coefficients=tuple(values["ar_coefficients"].tolist()))
+        return cls(
+            poles=Poles(mapping["poles_real"], mapping["poles_pairs"]),
+            mean=mapping["mean"],
+            covariance_factor=mapping["covariance_factor"],
+            dt_s=float(mapping["dt_s"]),
+            fir_length=int(mapping["fir_length"]),
+            has_feedthrough=bool(mapping["has_feedthrough"]),
+            integrators=int(mapping["integrators"]),
+            input_delay_samples=int(mapping["input_delay_samples"]),
+            input_name=str(mapping["names"][0]),
+            output_name=str(mapping["names"][1]),
+            report=report,
+        )

@@ -1,0 +1,77 @@
+"""The paper's freedom in the two real functions of a conjugate pair, equations (7) to (19).
+
+After the all-pass of the poles before it, a pair xi, conj(xi) may use any two functions
+sqrt(1 - |xi|^2) (m1 z + m2)/D(z), D = z^2 - 2 Re(xi) z + |xi|^2, whose numerators x1 = (m1, m2), x2 = (m3,
+m4) satisfy x_k^T M x_k = |1 - xi^2|^2 (14) and x1^T M x2 = 0 (15) with the M of (16). They all span the
+same space.
+
+The all-pass factor that (13) writes out, (1 - conj(xi_{i-1}) z) on L_{i-1}, is the all-pass that drives the
+pair here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.data.arrays import ComplexArray, RealArray
+
+
+def pair_metric(pole: complex) -> RealArray:
+    """M of (16), (2, 2): [[1 + |xi|^2, 2 Re xi], [2 Re xi, 1 + |xi|^2]], positive definite for |xi| < 1."""
+    size = 1 + abs(pole) ** 2
+    return np.array([[size, 2 * pole.real], [2 * pole.real, size]])
+
+
+def paper_numerators(pole: complex) -> tuple[RealArray, RealArray]:
+    """The solution (18), (19) with m2 = 0: x1 = (|1 - xi^2|, 0)/s, x2 = (-2 Re xi/s, s), s = sqrt(1 +
+    |xi|^2)."""
+    size = 1 + abs(pole) ** 2
+    x1 = np.array([abs(1 - pole**2) / np.sqrt(size), 0.0])
+    x2 = np.array([-2 * pole.real / np.sqrt(size), np.sqrt(size)])
+    return x1, x2
+
+
+def rotated_numerators(pole: complex, angle_rad: float) -> tuple[RealArray, RealArray]:
+    """Any solution of (14): x1 = |1 - xi^2| M^-1/2 (cos t, sin t), and x2 by the quarter turn of (17)."""
+    values, vectors = np.linalg.eigh(pair_metric(pole))
+    inverse_root = (vectors / np.sqrt(values)) @ vectors.T
+    unit = np.array([np.cos(angle_rad), np.sin(angle_rad)])
+    quarter = np.array([-unit[1], unit[0]])
+    size = abs(1 - pole**2)
+    return size * inverse_root @ unit, size * inverse_root @ quarter
+
+
+def kautz_numerators(pole: complex) -> tuple[RealArray, RealArray]:
+    """The solution used by `ident.basis.functions`: sg (z - beta) and sg sb, divided by sqrt(1 - |xi|^2)."""
+    gamma = abs(pole) ** 2
+    beta = 2 * pole.real / (1 + gamma)
+    scale = np.sqrt(1 + gamma)  # sg / sqrt(1 - gamma)
+    return scale * np.array([1.0, -beta]), scale * np.array([0.0, np.sqrt((1 - beta) * (1 + beta))])
+
+
+def combination(pole: complex, x1: RealArray, x2: RealArray) -> ComplexArray:
+    """[[c1, c2], [c3, c4]] of (7): the two real functions as combinations of the complex L_i, L_{i+1} of (5).
+
+    Over the width sqrt(1 - |xi|^2)/D these have the numerators z - conj(xi) and 1 - conj(xi) z, so (13) asks
+    for c1 (z - conj(xi)) + c2 (1 - conj(xi) z) = m1 z + m2. The matrix is unitary, (8) to (10), exactly when
+    x1 and x2 satisfy (14) and (15).
+    """
+    numerators = np.array([[1, -np.conj(pole)], [-np.conj(pole), 1]])
+    return np.asarray(np.array([x1, x2]) @ np.linalg.inv(numerators), dtype=np.complex128)
+
+
+def pair_response(pole: complex, x1: RealArray, x2: RealArray, z: ComplexArray) -> ComplexArray:
+    """Values (F, 2) of the two functions with numerators x1 = (m1, m2) and x2 = (m3, m4) at the points z
+    (F,).
+
+    Raises
+    ------
+    ValueError
+        If x1 and x2 do not satisfy (14) and (15) to 1e-9.
+    """
+    metric, target = pair_metric(pole), abs(1 - pole**2) ** 2
+    gram = np.array([[x1 @ metric @ x1, x1 @ metric @ x2], [x2 @ metric @ x1, x2 @ metric @ x2]])
+    if not np.all(np.abs(gram - target * np.eye(2)) <= 1e-9 * target):
+        raise ValueError(f"the numerators {x1} and {x2} do not satisfy (14) and (15) for the pole {pole:.6g}")
+    factor = np.sqrt((1 - abs(pole)) * (1 + abs(pole))) / ((z - pole) * (z - np.conj(pole)))
+    return np.column_stack([(x1[0] * z + x1[1]) * factor, (x2[0] * z + x2[1]) * factor])

@@ -1,0 +1,211 @@
+"""Relative degree of the continuous-time plant as linear conditions on the coefficients (design 4.3).
+
+A plant of relative degree r behind a zero-order hold has C B_c = C A_c B_c = ... = C A_c^(r-2) B_c = 0, where
+[[A_c, B_c], [0, 0]] dt is the logarithm of [[A, B], [0, 1]] and (A, B) are the discrete states: the first
+r - 1 derivatives of its impulse response vanish at t = 0. For given poles each condition is a linear
+functional of the transfer function, so it also acts on the change of it when a pole moves; that is all a
+constrained descent needs (`ident.fit.structured_fit`).
+
+The states are [hold, integrators 1/(z - 1)^j, lossless cascade of the other poles], which is block lower
+triangular. A unitary change of the two states of each pair makes it triangular, and the logarithm is taken
+there by repeated square roots; scipy's general one takes a hundred times as long.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy.special import comb
+
+from ident.basis.functions import LosslessCascade, basis_state_space
+from ident.basis.poles import Poles
+from ident.data.arrays import ComplexArray, RealArray
+
+# Square roots are drawn until the matrix is this near the identity; 8 Gauss nodes then give the logarithm to
+# ((sqrt(1.25) - 1)/(sqrt(1.25) + 1))^16 = 1e-20.
+_NEAR_IDENTITY = 0.25
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+
+
+def refuse_without_counterpart(poles: Poles, integrators: int) -> None:
+    """Raise ValueError if a pole (those at 0 that belong to integrators apart) has no continuous-time
+    counterpart."""
+    for a in poles.real[integrators:]:
+        if not a > 0:
+            raise ValueError(
+                f"relative_degree needs poles with a continuous-time counterpart; the real pole {a:.6g} in "
+                "the z plane has none (expected 0 < pole < 1)"
+            )
+
+
+def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArray:
+    """Rows R (r - 1, B) with R c = 0 for coefficients c of a plant of relative degree r.
+
+    `poles` as in `GobfModel`: with integrators, the first real poles are the zeros that their filters cancel.
+    Row k is C A_c^k B_c dt^(k + 1).
+
+    Raises
+    ------
+    ValueError
+        If a pole has no continuous-time counterpart, or there are fewer than r poles in all.
+    """
+    return _functionals(poles, integrators, relative_degree, None, ())[0]
+
+
+def conditions_with_sensitivities(
+    poles: Poles, integrators: int, relative_degree: int, coefficients: RealArray, blocks: tuple[Poles, ...]
+) -> tuple[RealArray, RealArray]:
+    """Rows R as in `conditions`, and the same functionals (r - 1, S) of further blocks behind the model.
+
+    Each entry of `blocks` is one pole (real, or a pair) whose basis functions are driven by the output of the
+    model with the given coefficients (B,); the columns are those functions, in order. They are the directions
+    in which the model moves with that pole (`ident.fit.refinement`).
+    """
+    return _functionals(poles, integrators, relative_degree, coefficients, blocks)
+
+
+def _functionals(
+    poles: Poles,
+    integrators: int,
+    relative_degree: int,
+    coefficients: RealArray | None,
+    blocks: tuple[Poles, ...],
+) -> tuple[RealArray, RealArray]:
+    if not relative_degree >= 1:
+        raise ValueError(f"relative_degree must be at least 1; got {relative_degree}")
+    if relative_degree == 1:
+        return np.zeros((0, poles.order)), np.zeros((0, sum(block.order for block in blocks)))
+    refuse_without_counterpart(poles, integrators)
+    if np.any(poles.real[:integrators] != 0):
+        raise ValueError("the first real poles must be the zeros that the integrators bring")
+    if poles.order < relative_degree:
+        raise ValueError(
+            f"relative_degree = {relative_degree} needs at least that many poles, integrators counted; got "
+            f"{poles.order}"
+        )
+    rest = Poles(poles.real[integrators:], poles.pairs)
+    # The columns of the model are z^(k - j)/(z - 1)^k (j = 1 .. k) and the cascade behind 1/(z - 1)^k;
+    # expand z^(k - j) = ((z - 1) + 1)^(k - j) over the states 1/(z - 1)^m.
+    k = integrators
+    expansion = comb(k - np.arange(1, k + 1)[:, None], k - np.arange(1, k + 1)[None, :])
+    first, size = 1 + k, 1 + k + rest.order
+    parts = [basis_state_space(block) for block in blocks]
+    total = size + sum(part.A.shape[0] for part in parts)
+    matrix = np.zeros((total, total))
+    matrix[: k + 1, : k + 1] = np.eye(k + 1) + np.eye(k + 1, k=-1)
+    cascade = basis_state_space(rest)
+    matrix[first:size, first:size] = cascade.A
+    matrix[first:size, k] = cascade.B[:, 0]
+    pairs = [(first + rest.real.size + 2 * i, pole) for i, pole in enumerate(rest.pairs)]
+    scale = 1.0
+    if coefficients is not None:
+        drive = np.concatenate([coefficients[:k] @ expansion, coefficients[k:]])
+        scale = float(np.max(np.abs(drive), initial=0.0)) or 1.0
+        _append(matrix, parts, blocks, drive / scale, size, pairs)
+    change = np.eye(total, dtype=np.complex128)
+    for at, pole in pairs:
+        change[at : at + 2, at : at + 2] = _schur_vectors(matrix[at : at + 2, at : at + 2], pole)
+    triangular = change.conj().T @ matrix @ change
+    vector = np.zeros(total, dtype=np.complex128)
+    vector[0] = 1.0
+    moments = _log_moments(triangular, vector, relative_degree - 1, _NODES, _WEIGHTS)
+    values = (moments @ change.T).real
+    rows = values[:, 1:size].copy()
+    rows[:, :k] = rows[:, :k] @ expansion.T
+    return rows, values[:, size:] * scale
+
+
+def _append(
+    matrix: RealArray,
+    parts: list[LosslessCascade],
+    blocks: tuple[Poles, ...],
+    drive: RealArray,
+    at: int,
+    pairs: list[tuple[int, complex]],
+) -> None:
+    """Put each block behind the output drive @ (states 1 ..) into the matrix, from row `at` on."""
+    for part, block in zip(parts, blocks, strict=True):
+        if block.real.size + block.pairs.size != 1:
+            raise ValueError("a block is one real pole or one pair")
+        here = slice(at, at + part.A.shape[0])
+        matrix[here, here] = part.A
+        matrix[here, 1 : 1 + drive.size] = part.B @ drive[None, :]
+        if block.pairs.size:
+            pairs.append((at, complex(block.pairs[0])))
+        at = here.stop
+
+
+def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
+    """Unitary (2, 2) U with U^* block U lower triangular; block is [[., .], [b, c]] with b != 0."""
+    x, y = pole.conjugate() - block[1, 1], block[1, 0]
+    vectors = np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y)
+    return np.asarray(vectors, dtype=np.complex128)
+
+
+@numba.njit(cache=True)
+def _log_moments(matrix: Any, vector: Any, count: int, nodes: Any, weights: Any) -> Any:
+    """log(T)^m v for m = 1 .. count, rows (count, n); T (n, n) complex, lower triangular, no eigenvalue on
+    (-inf, 0]."""
+    n = vector.size
+    root = matrix.copy()
+    factor = 1.0
+    for _ in range(40):
+        largest = 0.0
+        for i in range(n):
+            row = 0.0
+            for j in range(i + 1):
+                row += abs(root[i, j] - (1.0 if i == j else 0.0))
+            largest = max(largest, row)
+        if largest <= _NEAR_IDENTITY:
+            break
+        for i in range(n):
+            root[i, i] = np.sqrt(root[i, i])
+        for gap in range(1, n):
+            for j in range(n - gap):
+                i = j + gap
+                value = root[i, j]
+                for k in range(j + 1, i):
+                    value -= root[i, k] * root[k, j]
+                root[i, j] = value / (root[i, i] + root[j, j])
+        factor *= 2.0
+    for i in range(n):
+        root[i, i] -= 1.0
+    moments = np.zeros((count, n), dtype=np.complex128)
+    present = vector.copy()
+    for m in range(count):
+        product = np.zeros(n, dtype=np.complex128)
+        for i in range(n):
+            for j in range(i + 1):
+                product[i] += root[i, j] * present[j]
+        solved = np.zeros(n, dtype=np.complex128)
+        for q in range(nodes.size):
+            # (I + t X) solved = X v, forward.
+            for i in range(n):
+                value = product[i]
+                for j in range(i):
+                    value -= nodes[q] * root[i, j] * solved[j]
+                solved[i] = value / (1.0 + nodes[q] * root[i, i])
+            for i in range(n):
+                moments[m, i] += factor * weights[q] * solved[i]
+        for i in range(n):
+            present[i] = moments[m, i]
+    return moments
+
+
+def null_space(rows: RealArray, column_scale: npt.ArrayLike) -> tuple[RealArray, RealArray]:
+    """Basis N (B, B - K) of the coefficients with rows @ c = 0 (rows (K, B)), and a right inverse (B, K).
+
+    Both are taken in coefficients times `column_scale` (B,), the lengths of the regression columns: a column
+    that moves the output much shall count as much.
+    """
+    scale = np.maximum(np.asarray(column_scale, dtype=np.float64), 1e-300)
+    n_rows, n_columns = rows.shape
+    scaled = rows / scale
+    lengths = np.linalg.norm(scaled, axis=1)
+    q, triangle = np.linalg.qr((scaled / lengths[:, None]).T, mode="complete")
+    inverse = q[:, :n_rows] @ np.linalg.solve(triangle[:n_rows].T, np.diag(1 / lengths))
+    return q[:, n_rows:] / scale[:, None], np.asarray(inverse.reshape(n_columns, n_rows) / scale[:, None])

@@ -1,0 +1,61 @@
+"""What is known or assumed around the basis: integrators, delay, direct term, and the nuisance columns of a
+fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.data.arrays import RealArray
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Fixed structure of y = [sum_i c_i L_i(q) + feedthrough] (1 - q^-1)^-integrators q^-delay u + nuisance.
+
+    The nuisance columns belong to each record by itself: a constant (`estimate_offset`), and with
+    `estimate_initial_state` the free responses of all poles together with the polynomials that the
+    integrators leave free (1, k, ... up to k^(integrators - 1)). `relative_degree` is that of the
+    continuous-time plant behind the hold: 1 asks for nothing beyond the absence of a direct term, more are
+    linear conditions on the coefficients (`ident.basis.relative_degree`).
+    """
+
+    integrators: int = 0
+    input_delay_samples: int = 0
+    feedthrough: bool = False
+    estimate_offset: bool = False
+    estimate_initial_state: bool = False
+    relative_degree: int = 1
+
+    def __post_init__(self) -> None:
+        if not (self.integrators >= 0 and self.input_delay_samples >= 0):
+            raise ValueError(
+                "integrators and input_delay_samples must not be negative; "
+                f"got {self.integrators} and {self.input_delay_samples}"
+            )
+        if not self.relative_degree >= 1 or (self.feedthrough and self.relative_degree > 1):
+            raise ValueError(
+                "relative_degree must be at least 1, and 1 with a direct term; got "
+                f"{self.relative_degree} and feedthrough = {self.feedthrough}"
+            )
+
+    @property
+    def n_polynomials(self) -> int:
+        """Number of polynomial nuisance columns per record, degrees 0, 1, ..."""
+        return max(int(self.estimate_offset), self.integrators if self.estimate_initial_state else 0)
+
+    def filter_input(self, u: RealArray) -> RealArray:
+        """(1 - q^-1)^-integrators q^-delay u, from rest, (T,) -> (T,)."""
+        return filter_input(u, self.integrators, self.input_delay_samples)
+
+
+def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
+    """u (T,) delayed by whole samples (zeros before the record), then summed `integrators` times: 1/(1 -
+    q^-1)^k, exact."""
+    u = np.asarray(u, dtype=np.float64)
+    delayed = np.zeros_like(u)
+    delayed[delay_samples:] = u[: max(u.size - delay_samples, 0)]
+    for _ in range(integrators):
+        delayed = np.cumsum(delayed)
+    return delayed

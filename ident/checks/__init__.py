@@ -1,0 +1,1 @@
+"""Stated knowledge tested against the data, residual tests, validation."""

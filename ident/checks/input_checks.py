@@ -1,0 +1,316 @@
+"""What the records themselves say about a fit: unusable ones are refused, doubtful ones get advice.
+
+Every sentence names what was seen and what to do about it, and appears only where that would help: the
+benchmark plants and the examples are quiet (`tests/ident/test_input_checks.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.least_squares import linearisation
+from ident.fit.refinement import pole_system
+from ident.fit.regression import Regression
+from ident.fit.residual_colour import effective_samples
+
+# An input is there at a frequency if it has this share of the density that it would have if its power were
+# spread evenly up to Nyquist ...
+_WEAK_INPUT = 1e-2
+# ... or if the response over a third of that frequency can be told to 30 %: the power that the model makes of
+# it, over what the model leaves, times the number of spectral lines there is at least 10; never below this
+# share of its largest density, where windows leak.
+_TOLD = 10.0
+_LEAKAGE = 1e-6
+# A rate of decay within this factor either way (95 %) is known; beyond, the record does not tell it.
+_KNOWN_WITHIN = 2.0
+# Real poles with time constants above this share of the record count as slow; others have their own advice.
+_SLOW = 0.5
+# A straight line has to be this much of a residual's power, and this improbable, to be called a drift.
+_DRIFT_SHARE = 0.2
+_DRIFT_LEVEL = 1e-5
+# A line serves as well as a slow pole if it leaves at most this much more.
+_AS_WELL = 1.05
+# Deviations from an operating point this many times larger are lost beside it.
+_LARGE_OFFSET = 10.0
+
+
+def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> None:
+    """Raise ValueError for a constant input or output, or too few samples for `order` poles; names the
+    record."""
+    for record in records:
+        for kind, signal, names in (
+            ("input", record.input, record.input_names),
+            ("output", record.output, record.output_names),
+        ):
+            if np.ptp(signal[:, 0]) == 0:
+                raise ValueError(
+                    f"{record.label}: {kind} column '{names[0]}' is constant ({signal[0, 0]:.6g}); "
+                    "expected a signal that varies"
+                )
+    needed = data.n_parameters(order)
+    if not data.n_samples > needed:
+        labels = records[0].label if len(records) == 1 else f"{len(records)} records"
+        raise ValueError(
+            f"{labels}: {data.n_samples} samples are too few for order {order}, which has {needed} unknowns; "
+            f"expected at least {needed + 1}"
+        )
+
+
+def advice(
+    records: Sequence[Record],
+    data: Regression,
+    model: GobfModel,
+    residuals: Sequence[RealArray],
+    fixed: Poles,
+) -> list[str]:
+    """One sentence per doubt about the records behind a fitted model; residuals (T,) one per record.
+
+    `fixed` are the poles that were given (they come first among the model's).
+    """
+    return [
+        *_too_short(data, model, fixed),
+        *_weak_input(records, data, model, residuals),
+        *_clipped(records),
+        *_drifting(records, data, model, residuals, fixed),
+        *_far_from_zero(records, data),
+    ]
+
+
+def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
+    sentences = []
+    needed = data.n_parameters(model.order)
+    if data.n_samples < 10 * needed:
+        sentences.append(
+            f"only {data.n_samples} samples for {needed} unknowns: record longer, or fit fewer poles; "
+            "below ten samples per unknown the choice of the poles is itself uncertain"
+        )
+    return sentences + _unknown_rates(data, model, fixed)
+
+
+def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
+    """Poles whose decay the records do not tell, by the Gauss-Newton covariance.
+
+    Where the residual is coloured, what counts for a pole is the noise around its own frequency.
+    """
+    poles, dt_s = model.poles, model.dt_s
+    n_real, n_pairs = fixed.real.size, fixed.pairs.size
+    here = linearisation(data, poles)
+    normal, _ = pole_system(here, poles, n_real, n_pairs)
+    if normal.size == 0 or not data.n_samples > data.n_parameters(poles.order):
+        return []
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    noise = here.rss / (data.n_samples - data.n_parameters(poles.order))
+    deviation = np.sqrt(noise * np.maximum(np.diag(inverse), 0.0)) / scale
+    # Unknowns of the polish: 1 - a of the real poles, then decay and angle per sample of each pair.
+    n_free = poles.real.size - n_real
+    still = 1.01e-3 / data.longest  # slower ones have come to the bound, which pole_warnings speaks of
+    seconds = data.longest * dt_s
+    sentences = []
+    for rate, spread in zip(1 - poles.real[n_real:], deviation[:n_free], strict=True):
+        slow = still < rate < 1 / (_SLOW * data.longest)
+        if slow and not _is_known(here.residual, data, rate / dt_s, spread / rate):
+            sentences.append(
+                f"a real pole decays with a time constant of {dt_s / rate:.0f} s, give or take a factor "
+                f"of two at best, in {seconds:.3g} s of record: record longer, or give it as known "
+                "(integrators, fixed_poles)"
+            )
+    omegas = poles.omega_rad_s(dt_s)[n_pairs:]
+    rates = -np.log(np.abs(poles.pairs[n_pairs:]))
+    for omega, rate, spread in zip(omegas, rates, deviation[n_free::2], strict=True):
+        if rate > still and not _is_known(here.residual, data, omega, spread / rate):
+            sentences.append(
+                f"the damping of the pole pair at {omega:.4g} rad/s is known to a factor of two at best: "
+                f"record longer than {seconds:.3g} s, drive it harder, or fit one pair less if it is no mode "
+                "of the machine"
+            )
+    return sentences
+
+
+def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviation: float) -> bool:
+    """Whether a relative deviation, computed for white noise, is small enough with the residual's colour."""
+    allowed = float(np.log(_KNOWN_WITHIN)) / 1.96
+    if deviation < allowed / 5:  # no colour seen so far makes more of it
+        return True
+    segment = int(min(256, np.min(np.diff(data.starts))))
+    density = np.mean([_spectrum(residual[data.segment(i)], segment) for i in range(data.n_records)], axis=0)
+    omega = np.linspace(0, np.pi / data.dt_s, density.size)
+    there = float(np.interp(omega_rad_s, omega, _smooth(density, 3)))
+    return bool(deviation * np.sqrt(there / max(float(density.mean()), 1e-300)) <= allowed)
+
+
+def _weak_input(
+    records: Sequence[Record], data: Regression, model: GobfModel, residuals: Sequence[RealArray]
+) -> list[str]:
+    limit = excitation_limit_rad_s(records, model, residuals)
+    if limit >= 0.6 * np.pi / data.dt_s:
+        return []
+    return [
+        f"the input is not exciting above {limit:.3g} rad/s: the model there is extrapolation; "
+        "use an input with power up to the frequency you need"
+    ]
+
+
+def _clipped(records: Sequence[Record]) -> list[str]:
+    sentences = []
+    for record in records:
+        for kind, signal, names in (
+            ("input", record.input, record.input_names),
+            ("output", record.output, record.output_names),
+        ):
+            share = clipped_share(signal[:, 0])
+            if share > 0:
+                sentences.append(
+                    f"{record.label}: {share:.1%} of {kind} '{names[0]}' stand at its very limit, as if "
+                    "saturated or clipped: lower the amplitude, or cut those samples out"
+                )
+    return sentences
+
+
+def _drifting(
+    records: Sequence[Record],
+    data: Regression,
+    model: GobfModel,
+    residuals: Sequence[RealArray],
+    fixed: Poles,
+) -> list[str]:
+    # A machine that integrates also integrates friction and offsets of its drive: its output walks away
+    # without any fault of the record.
+    if model.integrators:
+        return []
+    slow = np.flatnonzero(1 - model.poles.real < 1 / (_SLOW * data.longest))
+    if slow.size:
+        return [
+            f"a real pole with a time constant of {data.dt_s / (1 - model.poles.real[i]):.3g} s describes a "
+            f"drift of '{model.output_name}', a straight line does it as well: take the trend off the output"
+            for i in slow[slow >= fixed.real.size]
+            if _is_a_line(data, model.poles, int(i))
+        ]
+    sentences = []
+    for record, residual in zip(records, residuals, strict=True):
+        if residual.size < 50:
+            continue
+        line = np.linspace(-1.0, 1.0, residual.size)
+        centred = residual - residual.mean()
+        slope = float(line @ centred / (line @ line))
+        power, rest = float(centred @ centred), centred - slope * line
+        if not power > 0:
+            continue
+        share = 1 - float(rest @ rest) / power
+        worth = effective_samples(rest, np.array([0, residual.size]))
+        if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chdtri(1, _DRIFT_LEVEL):
+            sentences.append(
+                f"{record.label}: output '{record.output_names[0]}' drifts by {2 * slope:+.3g} in all, "
+                f"without a cause in the input ({share:.0%} of what the model leaves): take the trend "
+                "off, or fit within a band above it"
+            )
+    return sentences
+
+
+def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
+    """Whether a straight line on each record serves as well as the slow real pole `index`."""
+    degree = data.polynomials.shape[0]
+    lines = [
+        np.polynomial.legendre.legvander(np.linspace(-1, 1, n), max(degree, 1)) for n in np.diff(data.starts)
+    ]
+    with_lines = replace(data, polynomials=np.ascontiguousarray(np.concatenate(lines).T))
+    without = Poles(np.delete(poles.real, index), poles.pairs)
+    if not data.n_samples > with_lines.n_parameters(without.order):
+        return False
+    return linearisation(with_lines, without).rss <= _AS_WELL * linearisation(data, poles).rss
+
+
+def _far_from_zero(records: Sequence[Record], data: Regression) -> list[str]:
+    sentences = []
+    for record in records:
+        u = record.input[:, 0]
+        if abs(u.mean()) > _LARGE_OFFSET * u.std() and not data.structure.estimate_initial_state:
+            sentences.append(
+                f"{record.label}: input '{record.input_names[0]}' stands at {u.mean():.4g} and moves by "
+                f"{u.std():.2g} only, but the fit starts from rest at zero: subtract the operating point "
+                "from input and output"
+            )
+    return sentences
+
+
+def excitation_limit_rad_s(
+    records: Sequence[Record],
+    model: GobfModel | None = None,
+    residuals: Sequence[RealArray] = (),
+) -> float:
+    """Highest frequency at which the input of any record is there, rad/s.
+
+    There is: with a hundredth of the density of an evenly spread input of the same power, or where what it
+    drives by the model stands so far above the residual that the response can be told to 30 %. A band that
+    only the plant's own roll-off hides is not blamed on the input.
+    """
+    highest = 0.0
+    for index, record in enumerate(records):
+        u = record.input[:, 0]
+        segment = int(min(u.size, max(64, u.size // 8)))
+        frequency = 2 * np.pi * np.fft.rfftfreq(segment, record.dt_s).astype(np.float64)
+        density = _spectrum(u, segment)
+        present = density >= _WEAK_INPUT * density.mean()
+        if model is not None and residuals[index].size >= segment:
+            noise = _spectrum(residuals[index], segment)
+            gain = np.abs(model.frequency_response(frequency[1:]))
+            lines = np.maximum(record.n_samples * record.dt_s * frequency[1:] / (6 * np.pi), 1.0)
+            seen = lines * gain**2 * density[1:] >= _TOLD * _smooth(noise)[1:]
+            present[1:] |= seen & (density[1:] >= _LEAKAGE * density.max())
+        highest = max(highest, float(frequency[np.flatnonzero(present)[-1]]))
+    return highest
+
+
+def _spectrum(x: RealArray, segment: int) -> RealArray:
+    """Welch's mean periodogram over half-overlapping stretches, without their means, under a Hann window;
+    unscaled, (segment // 2 + 1,).
+
+    scipy.signal.welch gives the same numbers in ten times the time on short records, a tenth of a whole fit.
+    """
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(segment) / segment)
+    pieces = np.lib.stride_tricks.sliding_window_view(x, segment)[:: segment - segment // 2]
+    lines = np.abs(np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window)) ** 2
+    density = lines.mean(axis=0)
+    density[1 : (segment + 1) // 2] *= 2  # one-sided: every line but those at 0 and at the Nyquist frequency
+    return np.asarray(density)
+
+
+def _smooth(density: RealArray, width: int = 11) -> RealArray:
+    """Mean over neighbouring lines: a noise spectrum of few averages has holes that are chance."""
+    window = np.ones(min(width, density.size))
+    return np.asarray(
+        np.convolve(density, window, "same") / np.convolve(np.ones(density.size), window, "same")
+    )
+
+
+def clipped_share(signal: RealArray) -> float:
+    """Share of samples that stand at an extreme value which is suspiciously frequent, else 0.
+
+    Suspicious: at least 1 % of the samples, and five times as many as at the next level (a slow sine in a
+    converter's steps has 2.4 times), in more than one stretch unless that one is 5 % of the record (a machine
+    that sticks where it turns does so once). A signal at rest before and after the experiment is not held
+    against it. Signals of a few levels, and those that spend most of their time at both extremes, are binary
+    or multilevel by design and left alone.
+    """
+    levels, counts = np.unique(signal, return_counts=True)
+    if levels.size < 10 or counts[0] + counts[-1] > 0.5 * signal.size:
+        return 0.0
+    changes = np.flatnonzero(np.diff(signal))
+    inside = signal[changes[0] + 1 : changes[-1] + 1]
+    share = 0.0
+    for extreme, neighbour in ((levels[0], counts[1]), (levels[-1], counts[-2])):
+        at = inside == extreme
+        count = int(np.count_nonzero(at))
+        stretches = np.count_nonzero(at[1:] & ~at[:-1]) + int(at[:1].any())
+        often = stretches >= 2 or count >= 0.05 * signal.size
+        if often and count >= max(0.01 * signal.size, 5, 5 * neighbour):
+            share += count / signal.size
+    return share

@@ -1,0 +1,298 @@
+"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree (design 4.3).
+
+Each is a generalised likelihood ratio Ne ln(J with the prior / J without) against a chi-square quantile, Ne
+being the number of independent samples the residual is worth (`effective_samples`). A pole at z = 1 lies on
+the edge of the stable ones, where the chi-square quantile is on the safe side: a true prior is refused less
+often than in 1 % of all records.
+
+A refused prior is kept all the same: who gives it may know the machine better than one record does, and a
+model whose structure was changed in silence is the worse surprise. The verdict says so and what to do. What
+was left to the data (`relative_degree = "auto"`) is imposed only as far as the data agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.least_squares import fit
+from ident.fit.refinement import Polished
+from ident.fit.regression import Regression, prepare
+from ident.fit.residual_colour import effective_samples
+from ident.fit.structured_fit import structured_fit, structured_polish
+from ident.search.order_selection import OrderSelection
+from ident.search.pole_search import PoleSearch
+
+TEST_LEVEL = 0.99
+# Descents that only compare starts stop when this fraction of J is left to gain.
+ROUGH = 1e-4
+
+
+@dataclass(frozen=True)
+class PriorTest:
+    """Verdict of the data on one prior.
+
+    statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
+    above it the prior is refused; a cancelled integrator is refused the other way round, as its verdict says
+    (`ident.checks.integrators_prior`). imposed says whether the model keeps to the prior; verdict is one
+    sentence, with advice where it is refused.
+    """
+
+    prior: str
+    refused: bool
+    imposed: bool
+    statistic: float
+    limit: float
+    degrees_of_freedom: int
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        return {
+            "prior": self.prior,
+            "refused": self.refused,
+            "imposed": self.imposed,
+            "statistic": self.statistic,
+            "limit": self.limit,
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "verdict": self.verdict,
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> PriorTest:
+        """Inverse of `to_dict`."""
+        return cls(**document)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An optimum on all samples, and the search (options, bounds, trace) it belongs to."""
+
+    data: Regression
+    end: Polished
+    search: PoleSearch
+
+    @property
+    def residual(self) -> RealArray:
+        return fit(self.data, self.end.poles).residual
+
+    def worth(self) -> float:
+        """Independent samples that the residual is worth."""
+        return effective_samples(self.residual, self.data.starts)
+
+
+def statistic(rss_with_prior: float, without: Fitted) -> float:
+    """Ne ln(J with the prior / J without); not below 0, where only descents that ended early can bring it."""
+    ratio = max(rss_with_prior, 1e-300) / max(without.end.rss, 1e-300)
+    # Residuals at rounding level (noise-free data) decide nothing.
+    if rss_with_prior <= 1e-18 * float(without.data.y @ without.data.y):
+        return 0.0
+    return max(0.0, float(without.worth() * np.log(ratio)))
+
+
+def limit(degrees_of_freedom: int) -> float:
+    """Chi-square quantile that a statistic of a true prior stays below in 99 % of the records."""
+    return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
+
+
+def judged(prior: str, value: float, degrees_of_freedom: int, without: str, advice: str) -> PriorTest:
+    """`without`: what the data were offered instead; `advice`: what to do if they take it."""
+    bound = limit(degrees_of_freedom)
+    numbers = _numbers(value, bound)
+    if value > bound:
+        verdict = (
+            f"{prior} refused by the data: {without} fits better than chance allows ({numbers}); kept as "
+            f"asked, but {advice}"
+        )
+    else:
+        verdict = f"{prior} accepted: {without} fits no better than chance would ({numbers})"
+    return PriorTest(prior, value > bound, True, value, bound, degrees_of_freedom, verdict)
+
+
+def _numbers(value: float, bound: float) -> str:
+    return f"test statistic {value:.1f} against {bound:.1f} at {TEST_LEVEL:.0%}"
+
+
+def fixed_poles_test(
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+) -> PriorTest:
+    """Poles fixed by the user against as many free ones, from where they are and searched anew."""
+    k, fixed, poles = given.data.structure.integrators, given.search.fixed, given.end.poles
+    options = given.search.options.model_copy(
+        update={
+            "fixed_poles": (),
+            "n_real": poles.real.size - k,
+            "n_pairs": poles.pairs.size,
+        }
+    )
+    small = PoleSearch(prepare(*searched), options)
+    ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small, silent).run()]
+    best = min(ends, key=lambda end: end.rss)
+    search = PoleSearch(given.data, options)
+    freed = Fitted(given.data, search.descend(best.poles, "fixed poles freed"), search)
+    real = ", ".join(f"{a:.6g}" for a in np.sort(freed.end.poles.real[k:]))
+    pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.end.poles.pairs)
+    return judged(
+        "fixed_poles",
+        statistic(given.end.rss, freed),
+        fixed.real.size - k + 2 * fixed.pairs.size,
+        f"leaving them free (poles at {', '.join(part for part in (real, pairs) if part)})",
+        "leave them to the search, or check sampling time and units",
+    )
+
+
+def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -> PriorTest:
+    """The input delay against one sample less and one more, on the rows that all three explain.
+
+    Under the relative degree that the model keeps: without it the numerator can take over a sample of delay.
+    The models are not nested; under a true delay the statistic is mostly negative (shown as 0), so one
+    degree of freedom is on the safe side.
+    """
+    if relative_degree > 1:
+        given = replace(given, end=best_under_relative_degree(given, relative_degree))
+    structure = given.data.structure
+    delay = structure.input_delay_samples
+    best, chosen = 0.0, delay + 1
+    for other in (delay - 1, delay + 1):
+        if other < 0:
+            continue
+        data = prepare(records, replace(structure, input_delay_samples=other))
+        search = PoleSearch(data, given.search.options.model_copy(update={"input_delay_samples": other}))
+        shifted = Fitted(data, search.descend(given.end.poles, "other delay"), search)
+        if relative_degree > 1:
+            shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
+        residuals = [
+            fit(item.data, item.end.poles).residual
+            if structure.feedthrough  # which a relative degree of 1, the least there is, would refuse
+            else structured_fit(item.data, item.end.poles, relative_degree).residual
+            for item in (given, shifted)
+        ]
+        common = max(delay, other)
+        ours = _power_from(residuals[0], given.data, common - delay)
+        theirs = _power_from(residuals[1], data, common - other)
+        worth = effective_samples(residuals[1], data.starts)
+        value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
+        if ours <= 1e-18 * float(given.data.y @ given.data.y):
+            value = 0.0
+        if value > best:
+            best, chosen = value, other
+    plural = "s" if chosen != 1 else ""
+    return judged(
+        f"input_delay_samples = {delay}",
+        best,
+        1,
+        f"a delay of {chosen} sample{plural}",
+        f"set input_delay_samples = {chosen}, and look for the sample of delay in the time stamps",
+    )
+
+
+def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
+    parts = [residual[data.segment(i)][skip:] for i in range(data.n_records)]
+    return float(sum(part @ part for part in parts))
+
+
+def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
+    """Relative degree 1 (no direct term) against a model with one."""
+    data = prepare(records, replace(given.data.structure, feedthrough=True))
+    data = replace(data, polynomials=given.data.polynomials)
+    search = PoleSearch(data, given.search.options.model_copy(update={"feedthrough": True}))
+    free = Fitted(data, search.descend(given.end.poles, "direct term"), search)
+    return judged(
+        "relative_degree = 1",
+        statistic(given.end.rss, free),
+        1,
+        "a model with a direct term",
+        "set feedthrough = true and leave out relative_degree, or check whether the input runs late",
+    )
+
+
+def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Polished]:
+    """Relative degree r >= 2 against 1, and the best fit under it.
+
+    `free` is the optimum without the conditions. The descent under them starts there and, because a wrong
+    start can lose a mode, from further optima of the search with as many poles.
+    """
+    constrained = best_under_relative_degree(free, relative_degree)
+    # Nested models: the free fit is at least as good as one that starts from the constrained optimum.
+    again = free.search.descend(constrained.poles, "relative degree released")
+    if again.rss < free.end.rss:
+        free = replace(free, end=again)
+    test = judged(
+        f"relative_degree = {relative_degree}",
+        statistic(constrained.rss, free),
+        relative_degree - 1,
+        "a numerator without that limit",
+        f"set relative_degree = {relative_degree - 1} or leave it out (a sample of delay, a filter in the "
+        "sensor or an input that is not held constant between samples blurs it)",
+    )
+    return test, constrained
+
+
+def not_imposed(test: PriorTest) -> PriorTest:
+    """The same refusal for a prior that nobody stated: it was only tried."""
+    verdict = test.verdict.split("; kept as asked")[0] + "; not imposed"
+    return replace(test, imposed=False, verdict=verdict)
+
+
+def too_few_poles(relative_degree: int, order: int) -> PriorTest:
+    """A relative degree above the number of poles that the data showed."""
+    prior = f"relative_degree = {relative_degree}"
+    verdict = (
+        f"{prior} not imposed: the model has only {order} poles, integrators counted; state n_real and "
+        "n_pairs, or record more"
+    )
+    return PriorTest(prior, True, False, 0.0, limit(relative_degree - 1), relative_degree - 1, verdict)
+
+
+def best_under_relative_degree(free: Fitted, relative_degree: int) -> Polished:
+    """Best descent under the relative degree from the free optimum and the next two other ones."""
+    search, poles = free.search, free.end.poles
+    starts = [poles]
+    for minimum in sorted(search.minima, key=lambda item: item.rss):
+        other = minimum.poles
+        if (other.real.size, other.pairs.size) != (poles.real.size, poles.pairs.size):
+            continue
+        if all(_distance(other, start) > 0.15 for start in starts):
+            starts.append(other)
+        if len(starts) == 3:
+            break
+    fixed = search.fixed
+
+    def descended(start: Poles, tolerance: float) -> Polished:
+        return structured_polish(
+            free.data,
+            start,
+            relative_degree,
+            search.bounds,
+            n_fixed_real=fixed.real.size,
+            n_fixed_pairs=fixed.pairs.size,
+            tolerance=tolerance,
+        )
+
+    rough = min((descended(start, ROUGH) for start in starts), key=lambda end: end.rss)
+    return descended(rough.poles, 1e-9)
+
+
+def _distance(one: Poles, other: Poles) -> float:
+    """Largest change of a pole in natural logarithm of decay, or of frequency and decay of a pair."""
+    real = np.abs(np.log(np.sort(1 - one.real) / np.sort(1 - other.real)))
+    first, second = np.sort_complex(np.log(one.pairs)), np.sort_complex(np.log(other.pairs))
+    return float(
+        max(
+            np.max(real, initial=0.0),
+            np.max(np.abs(np.log(first.real / second.real)), initial=0.0),
+            np.max(np.abs(np.log(first.imag / second.imag)), initial=0.0),
+        )
+    )
+
+
+def silent(fraction: float, message: str) -> None:
+    """Default progress: nobody listens."""

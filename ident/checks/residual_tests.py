@@ -1,0 +1,209 @@
+"""Is anything left in the residuals? Whiteness and independence from the input, with bands and a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from scipy.signal import correlate
+from scipy.stats import chi2, norm
+
+from ident.data.arrays import RealArray, readonly_real
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualTest:
+    """One correlation test.
+
+    lags (K,) in samples, correlation (K,) in -1..1, band (K,): |correlation| stays below it with probability
+    `level` at each lag alone if the hypothesis holds. probability is that of correlations as large as these,
+    all lags together, under the hypothesis; passed says that it is at least 1 - level; verdict is one
+    sentence.
+    """
+
+    name: str
+    lags: RealArray
+    correlation: RealArray
+    band: RealArray
+    level: float
+    probability: float
+    passed: bool
+    verdict: str
+
+    def __post_init__(self) -> None:
+        for name in ("lags", "correlation", "band"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        if not (self.lags.shape == self.correlation.shape == self.band.shape and self.lags.ndim == 1):
+            raise ValueError("lags, correlation and band must be (K,) arrays")
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        lists = {name: getattr(self, name).tolist() for name in ("lags", "correlation", "band")}
+        rest = {name: getattr(self, name) for name in ("name", "level", "probability", "passed", "verdict")}
+        return lists | rest
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`."""
+        lists = {name: np.array(document[name], dtype=np.float64) for name in ("lags", "correlation", "band")}
+        return cls(**(dict(document) | lists))
+
+
+def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99) -> ResidualTest:
+    """Autocorrelation of the residuals at lags 1..max_lag, records pooled; Ljung-Box over all lags together.
+
+    residuals: one (T,) array per record. The few parameters fitted on many samples are not taken off the
+    degrees of freedom. Records of at most 2 max_lag samples say next to nothing about such lags and are left
+    out. Raises ValueError when none is longer, or the residuals are zero.
+    """
+    centred = _centred(_long_enough(residuals, max_lag), max_lag)
+    n = sum(e.size for e in centred)
+    correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
+    lags = np.arange(1, max_lag + 1)
+    statistic = n * (n + 2) * float(np.sum(correlation**2 / (n - lags)))
+    probability = float(chi2.sf(statistic, max_lag))
+    passed = probability >= 1 - level
+    band = np.full(max_lag, norm.ppf(0.5 + level / 2) / np.sqrt(n))
+    largest = int(np.argmax(np.abs(correlation)))
+    if passed:
+        verdict = (
+            f"The residuals look white over {max_lag} lags ({_p(probability)}): no noise model is missed."
+        )
+    else:
+        verdict = (
+            f"The residuals are not white ({_p(probability)}, largest correlation "
+            f"{correlation[largest]:+.2f} at lag {lags[largest]}): the bounds may be too narrow; model the "
+            "noise (coloured_noise) or, where that is done already, more of it (max_ar_order)."
+        )
+    return ResidualTest(
+        "whiteness", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
+    )
+
+
+def independence_test(
+    inputs: Sequence[RealArray], residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99
+) -> ResidualTest:
+    """Cross-correlation of past input and residual at lags -max_lag..max_lag (residual after input: lag > 0).
+
+    Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, so a coloured input or residual does not
+    fail the test by itself. Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0
+    (dynamics the model lacks) with the level shared over them (Sidak); what stands out at negative lags only
+    says that the output feeds back into the input.
+    """
+    if len(inputs) != len(residuals) or any(
+        u.size != e.size for u, e in zip(inputs, residuals, strict=False)
+    ):
+        raise ValueError("need one input of equal length for every residual")
+    e = _centred(_long_enough(residuals, max_lag), max_lag)
+    u = _centred(_long_enough(inputs, max_lag), max_lag)
+    n = sum(part.size for part in e)
+    correlation = _pooled_correlation(e, u, max_lag)
+    longest = min(part.size for part in e) // 2
+    memory = _pooled_correlation(e, e, longest) * _pooled_correlation(u, u, longest)
+    # Bartlett taper keeps the sum of sample correlations positive.
+    taper = 1 - np.abs(np.arange(-longest, longest + 1)) / (longest + 1)
+    deviation = np.sqrt(max(float(np.sum(taper * memory)), 1.0 / n) / n)
+    causal = np.abs(correlation[max_lag:])
+    # 2 Phi(-x), all of max_lag + 1 lags below x with probability (1 - that)^(max_lag + 1).
+    single = 2 * norm.sf(causal / deviation)
+    probability = float(-np.expm1((max_lag + 1) * np.log1p(-min(float(single.min()), 1 - 1e-16))))
+    passed = probability >= 1 - level
+    band = np.full(correlation.size, norm.ppf(0.5 + level / 2) * deviation)
+    lags = np.arange(-max_lag, max_lag + 1)
+    worst = int(np.argmax(causal))
+    if passed:
+        verdict = (
+            f"The residuals do not depend on the input ({_p(probability)}): no linear dynamics is missed."
+        )
+    else:
+        verdict = (
+            f"The residuals depend on the input {worst} samples before (correlation "
+            f"{correlation[max_lag + worst]:+.2f}, {_p(probability)}): the model lacks dynamics or delay "
+            "there; allow more poles, a direct term or another delay."
+        )
+    before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
+    if before > deviation * norm.ppf(1 - (1 - level) / (2 * max(max_lag, 1))):
+        verdict += " They also precede the input: the record was taken in closed loop."
+    return ResidualTest(
+        "independence", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
+    )
+
+
+def residual_advice(
+    whiteness: ResidualTest, independence: ResidualTest, *, noise_order: int = 0
+) -> list[str]:
+    """What to do about tests that fail, one sentence each; nothing where both pass.
+
+    noise_order: order of the noise model behind which whiteness was tested, 0 without one.
+    """
+    sentences = []
+    if not independence.passed:
+        after = int(
+            independence.lags[
+                np.argmax(np.where(independence.lags >= 0, np.abs(independence.correlation), 0))
+            ]
+        )
+        sentences.append(
+            f"the residuals depend on the input, most {after} samples after it: allow a pole pair or a real "
+            "pole more, a direct term, or another delay; if that does not help, the machine is not linear at "
+            "this amplitude (dry friction, saturation), and the bounds hold for this kind of input only"
+        )
+    if not whiteness.passed and noise_order:
+        sentences.append(
+            f"the residuals are coloured even behind a noise model of order {noise_order}: the bounds may be "
+            "too narrow; "
+            + (
+                "raise max_ar_order, or take them as lower limits"
+                if independence.passed
+                else "cure the dependence on the input first"
+            )
+        )
+    elif not whiteness.passed:
+        sentences.append(
+            "the residuals are coloured, and the bounds take them as white: "
+            + (
+                "model the noise (coloured_noise = true)"
+                if independence.passed
+                else "cure the dependence on the input first, then model the noise (coloured_noise = true)"
+            )
+        )
+    return sentences
+
+
+def _p(probability: float) -> str:
+    """'p = 0.02'; far out in the tail doubles end, and 'p = 0' would claim a certainty nobody has."""
+    return "p < 1e-300" if probability < 1e-300 else f"p = {probability:.2g}"
+
+
+def _long_enough(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
+    """The signals longer than 2 max_lag, or all of them where none is (`_centred` then refuses them)."""
+    return [signal for signal in signals if signal.size > 2 * max_lag] or list(signals)
+
+
+def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
+    if not signals:
+        raise ValueError("need at least one record")
+    if not max_lag >= 1:
+        raise ValueError(f"max_lag must be at least 1; got {max_lag}")
+    for signal in signals:
+        if signal.ndim != 1 or signal.size <= 2 * max_lag or not np.all(np.isfinite(signal)):
+            raise ValueError(
+                f"residual tests over {max_lag} lags need finite (T,) signals with T > {2 * max_lag}; "
+                f"got shape {signal.shape}"
+            )
+    centred = [np.asarray(signal - signal.mean(), dtype=np.float64) for signal in signals]
+    if not any(np.any(signal) for signal in centred):
+        raise ValueError("the signals are constant: there is nothing to correlate")
+    return centred
+
+
+def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag: int) -> RealArray:
+    """sum_k e(k) u(k - lag) over all records, lag = -max_lag..max_lag, divided by the norms."""
+    total = np.zeros(2 * max_lag + 1)
+    for a, b in zip(e, u, strict=True):
+        middle = b.size - 1
+        total += correlate(a, b, mode="full", method="fft")[middle - max_lag : middle + max_lag + 1]
+    scale = np.sqrt(sum(float(a @ a) for a in e) * sum(float(b @ b) for b in u))
+    return np.asarray(total / scale)

@@ -1,0 +1,316 @@
+"""Does the model hold on other data? Fit on fresh records, invalidation by a response, repeat scatter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, Self
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import binom, chi2
+
+from ident.basis.functions import free_response
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.checks.residual_tests import ResidualTest, independence_test, whiteness_test
+from ident.data.arrays import RealArray, readonly_real
+from ident.data.ellipses import chi2_radius
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
+
+__all__ = [
+    "FreshFit",
+    "Invalidation",
+    "ResidualTest",
+    "ScatterRow",
+    "fit_on_fresh_data",
+    "independence_test",
+    "invalidate",
+    "repeat_scatter",
+    "whiteness_test",
+]
+
+
+class SimulatedModel(Protocol):
+    """What a free run needs: GobfModel and ResponsePosterior both have it."""
+
+    @property
+    def poles(self) -> Poles: ...
+    @property
+    def integrators(self) -> int: ...
+    @property
+    def dt_s(self) -> float: ...
+    def simulate(self, u: RealArray) -> RealArray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class FreshFit:
+    """Free run on a record the model was not fitted to.
+
+    fit_percent = 100 (1 - |y - y_hat| / |y - mean y|); simulated and residual (T,) in output units.
+    """
+
+    name: str
+    fit_percent: float
+    simulated: RealArray
+    residual: RealArray
+
+    def __post_init__(self) -> None:
+        for name in ("simulated", "residual"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays; `from_arrays` is the inverse."""
+        return {
+            "name": np.array(self.name),
+            "fit_percent": np.array(self.fit_percent),
+            "simulated": self.simulated,
+            "residual": self.residual,
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+        return cls(str(arrays["name"]), float(arrays["fit_percent"]), arrays["simulated"], arrays["residual"])
+
+
+def fit_on_fresh_data(
+    model: SimulatedModel,
+    record: Record,
+    *,
+    estimate_initial_state: bool = True,
+    estimate_offset: bool = True,
+) -> FreshFit:
+    """Free-run simulation of a SISO record, no output fed back.
+
+    With estimate_initial_state the free response of the model's poles (and integrators) at the start is
+    fitted to the record, with estimate_offset a constant; neither touches the response to the input. Raises
+    ValueError for another sampling time, more than one channel, or a constant output.
+    """
+    if record.input.shape[1] != 1 or record.output.shape[1] != 1:
+        raise ValueError(f"{record.label}: need one input and one output; use record.siso(input, output)")
+    if not abs(record.dt_s - model.dt_s) <= 1e-9 * model.dt_s:
+        raise ValueError(f"{record.label}: dt_s = {record.dt_s}, the model has {model.dt_s}")
+    y = record.output[:, 0]
+    spread = float(np.linalg.norm(y - y.mean()))
+    if spread == 0:
+        raise ValueError(f"{record.label}: the output is constant")
+    simulated = model.simulate(record.input[:, 0])
+    degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
+    columns = [np.linspace(-1.0, 1.0, y.size)[:, None] ** degree for degree in range(degrees)]
+    if estimate_initial_state:
+        columns.append(free_response(model.poles, y.size))
+    if columns:
+        nuisance = np.hstack(columns)
+        coefficients, *_ = np.linalg.lstsq(nuisance, y - simulated, rcond=1e-10)
+        simulated = simulated + nuisance @ coefficients
+    residual = y - simulated
+    return FreshFit(record.name, 100 * (1 - float(np.linalg.norm(residual)) / spread), simulated, residual)
+
+
+@dataclass(frozen=True, eq=False)
+class Invalidation:
+    """Comparison of a predicted and a measured response, both with covariances.
+
+    distance (F,): length of the difference in units of the ellipse of both covariances together at `level` (1
+    = on its boundary); probability (F,) of a difference as large if the prediction holds; n_outside
+    frequencies lie outside, worst_omega_rad_s is the least probable; joint_probability is that of the least
+    probable one among F independent frequencies; invalidated when it is below 1 - level; verdict is one
+    sentence.
+    """
+
+    omega_rad_s: RealArray
+    distance: RealArray
+    probability: RealArray
+    level: float
+    n_outside: int
+    worst_omega_rad_s: float
+    joint_probability: float
+    invalidated: bool
+    verdict: str
+
+    def __post_init__(self) -> None:
+        for name in ("omega_rad_s", "distance", "probability"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` is the inverse."""
+        arrays = {name: getattr(self, name).tolist() for name in ("omega_rad_s", "distance", "probability")}
+        names = ("level", "n_outside", "worst_omega_rad_s", "joint_probability", "invalidated", "verdict")
+        return arrays | {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`."""
+        arrays = {name: np.array(document[name]) for name in ("omega_rad_s", "distance", "probability")}
+        return cls(**(dict(document) | arrays))
+
+
+def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) -> Invalidation:
+    """Does a new record's empirical response leave the predicted ellipses, where, and how improbable is that?
+
+    Both on one grid (`posterior.at(measured.omega_rad_s)`), errors independent; the level is that of
+    `predicted`. Raises ValueError when the grids differ.
+    """
+    if not np.array_equal(predicted.omega_rad_s, measured.omega_rad_s):
+        raise ValueError("predicted and measured responses are on different frequency grids")
+    both = FrequencyUncertainty(
+        predicted.omega_rad_s,
+        predicted.centre,
+        predicted.covariance + measured.covariance,
+        predicted.dt_s,
+        predicted.level,
+    )
+    distance = both.normalised_distance(measured.centre)
+    probability = chi2.sf((distance * chi2_radius(both.level)) ** 2, 2)
+    worst = int(np.argmax(distance))
+    n, outside = distance.size, int(np.count_nonzero(distance > 1))
+    joint = float(-np.expm1(n * np.log1p(-min(float(probability[worst]), 1 - 1e-16))))
+    invalidated = joint < 1 - both.level
+    expected = int(binom.ppf(both.level, n, 1 - both.level))
+    where = f"{both.omega_rad_s[worst]:.4g} rad/s"
+    count = f"{outside} of {n} frequencies lie outside their {100 * both.level:.3g} % ellipses"
+    if invalidated:
+        verdict = (
+            f"The new data contradict the model, most at {where} ({distance[worst]:.2g} radii); {count}."
+        )
+    elif outside > expected:
+        verdict = f"No single frequency contradicts the model, but {count}, more than {expected} by chance."
+    else:
+        verdict = f"The new data do not contradict the model: {count}, the farthest at {where}."
+    return Invalidation(
+        both.omega_rad_s,
+        distance,
+        np.asarray(probability),
+        both.level,
+        outside,
+        float(both.omega_rad_s[worst]),
+        joint,
+        bool(invalidated),
+        verdict,
+    )
+
+
+@dataclass(frozen=True)
+class ScatterRow:
+    """One band of `repeat_scatter`; radii are RMS over the band, at one standard deviation, relative to |G|.
+
+    predicted: of one repeat's own covariance; measured: scatter of the repeats around their mean, unbiased;
+    ratio = measured / predicted, about 1 if the bounds are honest about noise: then it lies between ratio_low
+    and ratio_high in 95 % of experiments like this one (chi-square with degrees_of_freedom, which a few
+    repeats and neighbouring frequencies that move together keep small). between: distance of the groups'
+    means (RMS deviation, unbiased), between_ratio: the same over what noise alone would give; both NaN with
+    one group.
+    """
+
+    omega_low_rad_s: float
+    omega_high_rad_s: float
+    n_frequencies: int
+    predicted: float
+    measured: float
+    ratio: float
+    between: float
+    between_ratio: float
+    degrees_of_freedom: float = float("nan")
+    ratio_low: float = float("nan")
+    ratio_high: float = float("nan")
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able (NaN where there is one group only)."""
+        return asdict(self)
+
+
+def repeat_scatter(
+    groups: Sequence[Sequence[FrequencyUncertainty]],
+    bands_rad_s: Sequence[tuple[float, float]],
+    *,
+    posterior: ResponsePosterior | None = None,
+) -> list[ScatterRow]:
+    """Predicted noise ellipses against the scatter between repeats, band by band.
+
+    groups: one sequence per condition (amplitude, day) with the estimate of each repeat, all on one grid;
+    e.g. `record_posteriors(...)` evaluated with `.at(omega)`. posterior (of any one repeat) tells how the
+    errors of neighbouring frequencies move together, for the sampling interval of the ratio; without it they
+    count as independent. Bands without a grid frequency are left out. Raises ValueError when a group has
+    fewer than two repeats or the grids differ.
+    """
+    everything = [estimate for group in groups for estimate in group]
+    if not everything or any(len(group) < 2 for group in groups):
+        raise ValueError("every group needs at least two repeats")
+    omega = everything[0].omega_rad_s
+    if any(not np.array_equal(estimate.omega_rad_s, omega) for estimate in everything):
+        raise ValueError("the estimates are on different frequency grids")
+    means = np.stack([np.mean([estimate.centre for estimate in group], axis=0) for group in groups])
+    size = np.abs(means.mean(axis=0))
+    predicted = np.mean([_variance(estimate) for estimate in everything], axis=0) / size**2
+    scatter = np.zeros(omega.size)
+    for group, mean in zip(groups, means, strict=True):
+        scatter += np.sum([np.abs(estimate.centre - mean) ** 2 for estimate in group], axis=0)
+    measured = scatter / (len(everything) - len(groups)) / size**2
+    if len(groups) > 1:
+        between = np.sum(np.abs(means - means.mean(axis=0)) ** 2, axis=0) / (len(groups) - 1) / size**2
+        noise = [
+            np.mean([_variance(estimate) for estimate in group], axis=0) / len(group) for group in groups
+        ]
+        between_noise = np.mean(noise, axis=0) / size**2
+    else:
+        between = between_noise = np.full(omega.size, np.nan)
+    rows = []
+    for low, high in bands_rad_s:
+        inside = (omega >= low) & (omega < high)
+        if not np.any(inside):
+            continue
+        p, m, b, bn = (
+            float(np.sqrt(np.mean(part[inside]))) for part in (predicted, measured, between, between_noise)
+        )
+        relative = _relative_spread(everything[0], posterior, inside, size)
+        freedom = _independent(relative) * (len(everything) - len(groups))
+        interval = np.sqrt(chi2.ppf([0.025, 0.975], freedom) / freedom) if freedom > 0 else [np.nan, np.nan]
+        rows.append(
+            ScatterRow(
+                float(low),
+                float(high),
+                int(inside.sum()),
+                p,
+                m,
+                _ratio(m, p),
+                b,
+                _ratio(b, bn),
+                freedom,
+                float(interval[0]),
+                float(interval[1]),
+            )
+        )
+    return rows
+
+
+def _relative_spread(
+    estimate: FrequencyUncertainty,
+    posterior: ResponsePosterior | None,
+    inside: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    size: RealArray,
+) -> RealArray:
+    """Factor M (2 F, K) of the covariance M M^T of the relative errors (Re, Im) of a band."""
+    if posterior is not None:
+        spread = posterior.frequency_rows(estimate.omega_rad_s[inside]) @ posterior.covariance_factor
+        spread = spread / size[inside, np.newaxis]
+        return np.concatenate([spread.real, spread.imag])
+    values, vectors = np.linalg.eigh(estimate.covariance[inside] / size[inside, None, None] ** 2)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    return np.asarray(block_diag(*roots))
+
+
+def _independent(spread: RealArray) -> float:
+    """Satterthwaite's degrees of freedom of |e|^2 for e ~ N(0, M M^T): tr(K)^2 / tr(K^2), K = M M^T."""
+    inner = spread.T @ spread if spread.shape[1] < spread.shape[0] else spread @ spread.T
+    total = float(np.trace(inner))
+    return total**2 / float(np.sum(inner**2)) if total > 0 else 0.0
+
+
+def _variance(estimate: FrequencyUncertainty) -> RealArray:
+    return np.asarray(estimate.covariance[:, 0, 0] + estimate.covariance[:, 1, 1])
+
+
+def _ratio(measured: float, predicted: float) -> float:
+    return measured / predicted if predicted > 0 else float("inf") if measured > 0 else float("nan")

@@ -1,0 +1,1 @@
+"""Records, their readers, frequency data, ellipses and non-parametric estimates."""

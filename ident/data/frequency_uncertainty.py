@@ -1,0 +1,209 @@
+"""A frequency response with a 2x2 covariance at every frequency: what identification hands to control."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ident.data.arrays import ComplexArray, RealArray
+from ident.data.ellipses import (
+    Ellipses,
+    chi2_radius,
+    ellipse_distance,
+    offset_disc_radius,
+    relative_deficit,
+    standard_axes,
+)
+from ident.data.frequency_data import mean_of_repeats, read_frequency_table, write_frequency_table
+
+# A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
+# more.
+_PSD_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyUncertainty:
+    """G(e^{j omega dt}) ~ N(centre, covariance) over (Re, Im), frequency by frequency.
+
+    omega_rad_s (F,) strictly increasing, 0 <= omega <= pi / dt_s; centre (F,) complex; covariance (F,2,2) of
+    (real part, imaginary part), symmetric and positive semidefinite (zero = exactly known); level is the
+    confidence of each frequency's ellipse taken alone, not of all of them jointly; method says where the
+    numbers come from. Raises ValueError, naming the first frequency at fault.
+    """
+
+    omega_rad_s: RealArray
+    centre: ComplexArray
+    covariance: RealArray
+    dt_s: float
+    level: float = 0.95
+    method: str = "given"
+
+    def __post_init__(self) -> None:
+        omega = np.array(self.omega_rad_s, dtype=np.float64)
+        centre = np.array(self.centre, dtype=np.complex128)
+        covariance = np.array(self.covariance, dtype=np.float64)
+        if (
+            omega.ndim != 1
+            or omega.size == 0
+            or centre.shape != omega.shape
+            or covariance.shape != (omega.size, 2, 2)
+        ):
+            raise ValueError(
+                "need omega (F,), centre (F,) and covariance (F,2,2) with F >= 1; "
+                f"got {omega.shape}, {centre.shape}, {covariance.shape}"
+            )
+        if not (0 < self.dt_s < np.inf):
+            raise ValueError(f"dt_s must be positive and finite; got {self.dt_s}")
+        chi2_radius(self.level)
+        _refuse_first(~np.isfinite(omega), omega, "omega is not finite")
+        _refuse_first(~(np.diff(omega) > 0), omega[1:], "omega must be strictly increasing; it is not")
+        _refuse_first(omega < 0, omega, "omega must not be negative")
+        nyquist = np.pi / self.dt_s
+        _refuse_first(omega > nyquist * (1 + 1e-9), omega, f"omega is above pi / dt_s = {nyquist:.6g} rad/s")
+        _refuse_first(~np.isfinite(centre), omega, "the centre is not finite")
+        _refuse_first(~np.all(np.isfinite(covariance), axis=(1, 2)), omega, "the covariance is not finite")
+        skew = np.abs(covariance[:, 0, 1] - covariance[:, 1, 0])
+        largest = np.abs(covariance).max(axis=(1, 2))
+        _refuse_first(skew > _PSD_TOLERANCE * largest, omega, "the covariance is not symmetric")
+        _refuse_first(
+            relative_deficit(covariance) > _PSD_TOLERANCE,
+            omega,
+            "the covariance is not positive semidefinite",
+        )
+        off_diagonal = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
+        covariance[:, 0, 1] = covariance[:, 1, 0] = off_diagonal
+        object.__setattr__(self, "dt_s", float(self.dt_s))
+        object.__setattr__(self, "level", float(self.level))
+        for name, array in (("omega_rad_s", omega), ("centre", centre), ("covariance", covariance)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def ellipse(self, level: float | None = None) -> Ellipses:
+        """Axes of the ellipses that hold the response with probability `level` (default: the record's)."""
+        s1, s2, u1 = standard_axes(self.covariance)
+        radius = chi2_radius(self.level if level is None else level)
+        return Ellipses(semi_major=radius * s1, semi_minor=radius * s2, direction=u1)
+
+    def normalised_distance(self, response: npt.ArrayLike) -> RealArray:
+        """Distance (F,) of a response (F,) from the centre in units of the ellipse: 1 on its boundary."""
+        response = self._matching(response)
+        magnitude = np.abs(self.centre) + np.abs(response)
+        return ellipse_distance(response - self.centre, self.ellipse(), magnitude)
+
+    def contains(self, response: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """(F,) whether a response (F,) lies in the ellipse of its frequency."""
+        return np.asarray(self.normalised_distance(response) <= 1.0)
+
+    def enclosing_radius(self) -> RealArray:
+        """(F,) radius of the smallest disc around the centre that holds the ellipse."""
+        return self.ellipse().semi_major
+
+    def offset_disc(self, nominal_response: npt.ArrayLike) -> tuple[ComplexArray, RealArray]:
+        """Offset m_n = centre - G_nom (F,) and radius rho (F,) with P(|G - G_nom| <= rho) = level.
+
+        For a nominal model of lower order than the identified one: the set around the nominal is an ellipse
+        off centre, and rho is the magnitude of an additive weight that covers it (design 4.5).
+        """
+        offset = self.centre - self._matching(nominal_response)
+        return offset, offset_disc_radius(offset, self.covariance, self.level)
+
+    def to_control(self) -> Any:
+        """The centre as `control.FrequencyResponseData` (covariances have no place there)."""
+        # Here and not above: python-control brings its plotting along.
+        import control
+
+        return control.FrequencyResponseData(self.centre, self.omega_rad_s, dt=self.dt_s)
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Plain arrays for `np.savez`; `from_arrays` gives back exactly this record."""
+        return {
+            "omega_rad_s": self.omega_rad_s,
+            "centre": self.centre,
+            "covariance": self.covariance,
+            "dt_s": np.array(self.dt_s),
+            "level": np.array(self.level),
+            "method": np.array(self.method),
+        }
+
+    @classmethod
+    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+        return cls(
+            omega_rad_s=mapping["omega_rad_s"],
+            centre=mapping["centre"],
+            covariance=mapping["covariance"],
+            dt_s=float(mapping["dt_s"]),
+            level=float(mapping["level"]),
+            method=str(mapping["method"]),
+        )
+
+    @classmethod
+    def from_csv(cls, path: str | Path, dt_s: float, *, level: float = 0.95) -> Self:
+        """A user's own frequency response with covariances.
+
+        One header line; columns `omega_rad_s` or `frequency_Hz`, `real`, `imag`, `variance_real`,
+        `variance_imag` and, if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming
+        file, line and column.
+        """
+        path = Path(path)
+        omega, centre, covariance = read_frequency_table(path)
+        try:
+            return cls(omega, centre, covariance, dt_s=dt_s, level=level, method=f"given in {path.name}")
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the columns `from_csv` reads; numbers keep all their digits."""
+        write_frequency_table(Path(path), self.omega_rad_s, self.centre, self.covariance)
+
+    @classmethod
+    def from_frf_repeats(
+        cls,
+        omega_rad_s: npt.ArrayLike,
+        response: npt.ArrayLike,
+        dt_s: float,
+        *,
+        level: float = 0.95,
+        pool_neighbours: int = 0,
+        outlier_threshold: float | None = None,
+    ) -> Self:
+        """Mean and covariance of the mean from repeated measurements of a frequency response.
+
+        omega_rad_s (K,) and response (K,): one entry per measured point in any order; points of equal
+        frequency are repeats. Few repeats know their own scatter badly, so the covariance is widened until
+        the ellipse of the chi-square quantile at `level` equals Hotelling's T-square ellipse at that level
+        (variance x 1.7 with 10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative
+        covariances over m frequencies on either side first, which suits a scatter that varies slowly with
+        frequency and few repeats. outlier_threshold = t drops points farther than t robust standard
+        deviations from the median of their frequency. Raises ValueError where a frequency is left with too
+        few repeats.
+        """
+        omega, centre, covariance = mean_of_repeats(
+            np.asarray(omega_rad_s, dtype=np.float64),
+            np.asarray(response, dtype=np.complex128),
+            level=level,
+            pool_neighbours=pool_neighbours,
+            outlier_threshold=outlier_threshold,
+        )
+        return cls(omega, centre, covariance, dt_s=dt_s, level=level, method="repeated measurements")
+
+    def _matching(self, response: npt.ArrayLike) -> ComplexArray:
+        response = np.asarray(response, dtype=np.complex128)
+        if response.shape != self.omega_rad_s.shape:
+            raise ValueError(
+                f"need a response on this grid, shape {self.omega_rad_s.shape}; got {response.shape}"
+            )
+        if not np.all(np.isfinite(response)):
+            raise ValueError("the response must be finite")
+        return response
+
+
+def _refuse_first(bad: npt.NDArray[np.bool_], omega: RealArray, complaint: str) -> None:
+    if np.any(bad):
+        index = int(np.argmax(bad))
+        raise ValueError(f"{complaint} (first at omega = {omega[index]:.6g} rad/s)")

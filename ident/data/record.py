@@ -1,0 +1,287 @@
+"""Measured signals: sampled uniformly, checked once, and read from CSV, npz and MATLAB files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from ident.data.arrays import RealArray, readonly_real
+
+# Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
+_LARGEST = 1e100
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One uniformly sampled experiment.
+
+    Attributes
+    ----------
+    name : str
+        Shown to the user; the file stem when read from a file.
+    input : (T, U) array
+    output : (T, Y) array
+    dt_s : float
+        Sampling time in seconds.
+    input_names, output_names : tuple of str
+        U and Y distinct names.
+    reference : (T, R) array or None
+        Closed-loop reference, if there is one.
+    reference_names, input_units, output_units : tuple of str
+        Units are free text for display, either empty or one per column.
+    source : str
+        Where the data came from (the file), named in later error messages.
+
+    Raises
+    ------
+    ValueError
+        If a shape or a name does not fit, dt_s is not positive, or a sample is not finite or above 1e100
+        (names the first one).
+    """
+
+    name: str
+    input: RealArray
+    output: RealArray
+    dt_s: float
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    reference: RealArray | None = None
+    reference_names: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
+            object.__setattr__(self, key, tuple(getattr(self, key)))
+        if not (np.isfinite(self.dt_s) and self.dt_s > 0):
+            raise ValueError(f"{self.label}: dt_s must be a positive number of seconds; got {self.dt_s}")
+        self._check("input", self.input_names)
+        self._check("output", self.output_names)
+        if self.reference is not None:
+            self._check("reference", self.reference_names)
+        elif self.reference_names:
+            raise ValueError(f"{self.label}: reference_names given without a reference")
+        for key, names in (("input_units", self.input_names), ("output_units", self.output_names)):
+            if len(getattr(self, key)) not in (0, len(names)):
+                raise ValueError(
+                    f"{self.label}: {key} must be empty or one per column; got {getattr(self, key)}"
+                )
+
+    def _check(self, key: str, names: tuple[str, ...]) -> None:
+        signal = readonly_real(getattr(self, key))
+        object.__setattr__(self, key, signal)
+        if signal.ndim != 2 or signal.shape[1] != len(names) or not names:
+            raise ValueError(
+                f"{self.label}: {key} must be (T, {len(names)}), one column per name {list(names)}; got "
+                f"shape {signal.shape}"
+            )
+        if len(set(names)) != len(names):
+            raise ValueError(f"{self.label}: {key} names must be distinct; got {list(names)}")
+        if signal.shape[0] != np.shape(self.input)[0] or signal.shape[0] < 1:
+            raise ValueError(
+                f"{self.label}: {key} has {signal.shape[0]} samples and input {np.shape(self.input)[0]}; "
+                "they must be equally long, at least one"
+            )
+        bad = np.argwhere(~np.isfinite(signal))
+        if bad.size:
+            k, column = bad[0]
+            raise ValueError(
+                f"{self.label}: {key} column '{names[column]}' is {signal[k, column]} at index {k}; "
+                "expected finite numbers"
+            )
+        large = np.argwhere(np.abs(signal) > _LARGEST)
+        if large.size:
+            k, column = large[0]
+            raise ValueError(
+                f"{self.label}: {key} column '{names[column]}' is {signal[k, column]:.6g} at index {k}; "
+                f"expected magnitudes up to {_LARGEST:g} (choose another unit)"
+            )
+
+    @property
+    def label(self) -> str:
+        """How error messages call this record: the file if there is one, else the name."""
+        return self.source or f"record '{self.name}'"
+
+    @property
+    def n_samples(self) -> int:
+        return int(self.input.shape[0])
+
+    @property
+    def time_s(self) -> RealArray:
+        """Sampling instants (T,), starting at 0."""
+        return np.arange(self.n_samples, dtype=np.float64) * self.dt_s
+
+    def siso(self, input_name: str | None = None, output_name: str | None = None) -> Record:
+        """The record with one input and one output; a name may be left out where there is only one column."""
+        i = self._column("input", self.input_names, input_name)
+        o = self._column("output", self.output_names, output_name)
+        return Record(
+            name=self.name,
+            input=self.input[:, [i]],
+            output=self.output[:, [o]],
+            dt_s=self.dt_s,
+            input_names=(self.input_names[i],),
+            output_names=(self.output_names[o],),
+            reference=self.reference,
+            reference_names=self.reference_names,
+            input_units=self.input_units[i : i + 1],
+            output_units=self.output_units[o : o + 1],
+            source=self.source,
+        )
+
+    def _column(self, key: str, names: tuple[str, ...], name: str | None) -> int:
+        if name is None and len(names) == 1:
+            return 0
+        if name not in names:
+            raise ValueError(f"{self.label}: no {key} column {name!r}; there is {list(names)}")
+        return names.index(name)
+
+    def slice(self, start: int, stop: int) -> Record:
+        """Samples start <= k < stop, 0 <= start < stop <= T; the new record's time starts at 0 again."""
+        if not 0 <= start < stop <= self.n_samples:
+            raise ValueError(
+                f"{self.label}: samples {start} to {stop} asked for; expected 0 <= start < stop <= "
+                f"{self.n_samples}, the number there are"
+            )
+        part = slice(start, stop)
+        return Record(
+            name=self.name,
+            input=self.input[part],
+            output=self.output[part],
+            dt_s=self.dt_s,
+            input_names=self.input_names,
+            output_names=self.output_names,
+            reference=None if self.reference is None else self.reference[part],
+            reference_names=self.reference_names,
+            input_units=self.input_units,
+            output_units=self.output_units,
+            source=self.source,
+        )
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        arrays: dict[str, np.ndarray[Any, Any]] = {
+            "name": np.array(self.name),
+            "source": np.array(self.source),
+            "input": self.input,
+            "output": self.output,
+            "dt_s": np.array(self.dt_s),
+        }
+        if self.reference is not None:
+            arrays["reference"] = self.reference
+        for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
+            arrays[key] = np.array(getattr(self, key), dtype=np.str_)
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Record:
+        names = {
+            key: tuple(str(item) for item in arrays[key])
+            for key in ("input_names", "output_names", "reference_names", "input_units", "output_units")
+        }
+        return cls(
+            name=str(arrays["name"]),
+            source=str(arrays["source"]),
+            input=arrays["input"],
+            output=arrays["output"],
+            dt_s=float(arrays["dt_s"]),
+            reference=arrays.get("reference"),
+            **names,
+        )
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | PathLike[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        *,
+        time: str | None = None,
+        dt_s: float | None = None,
+        references: Sequence[str] = (),
+        name: str | None = None,
+        separator: str = ",",
+    ) -> Record:
+        """Read columns of a CSV file with one header line; see `ident.data.record_files` for the checks."""
+        from ident.data.record_files import read_csv
+
+        return _assemble(cls, read_csv(path, separator), inputs, outputs, time, dt_s, references, name)
+
+    @classmethod
+    def from_npz(
+        cls,
+        path: str | PathLike[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        *,
+        time: str | None = None,
+        dt_s: float | None = None,
+        references: Sequence[str] = (),
+        name: str | None = None,
+    ) -> Record:
+        """Read vectors of a numpy .npz file (never unpickled); same arguments and checks as `from_csv`."""
+        from ident.data.record_files import read_npz
+
+        return _assemble(cls, read_npz(path), inputs, outputs, time, dt_s, references, name)
+
+    @classmethod
+    def from_mat(
+        cls,
+        path: str | PathLike[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        *,
+        time: str | None = None,
+        dt_s: float | None = None,
+        references: Sequence[str] = (),
+        name: str | None = None,
+    ) -> Record:
+        """Read vectors of a MATLAB .mat file (up to version 7.2); same arguments and checks as `from_csv`."""
+        from ident.data.record_files import read_mat
+
+        return _assemble(cls, read_mat(path), inputs, outputs, time, dt_s, references, name)
+
+
+def _assemble(
+    cls: type[Record],
+    table: Any,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    time: str | None,
+    dt_s: float | None,
+    references: Sequence[str],
+    name: str | None,
+) -> Record:
+    for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
+        if isinstance(names, str):
+            raise ValueError(
+                f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
+            )
+    wanted = [*inputs, *outputs, *references]
+    if time in wanted:
+        raise ValueError(f"{table.path}: column {time!r} is asked for as time and as a signal; expected two")
+    both = [item for item in inputs if item in outputs]
+    if both:
+        raise ValueError(f"{table.path}: column {both[0]!r} is asked for as input and output; expected two")
+    columns = table.columns(wanted if time is None else [time, *wanted])
+    step = table.sampling_time(None if time is None else columns[time], time, dt_s)
+
+    def stack(names: Sequence[str]) -> RealArray:
+        return np.column_stack([columns[item] for item in names]) if names else np.zeros((0, 0))
+
+    return cls(
+        name=table.path.stem if name is None else name,
+        input=stack(inputs),
+        output=stack(outputs),
+        dt_s=step,
+        input_names=tuple(inputs),
+        output_names=tuple(outputs),
+        reference=stack(references) if references else None,
+        reference_names=tuple(references),
+        source=str(table.path),
+    )

@@ -1,0 +1,83 @@
+"""Fitting inside a frequency band: the same filter on input and output leaves the model, and removes the
+rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import scipy.signal
+
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+
+
+def band_limited(
+    record: Record,
+    low_rad_s: float | None = None,
+    high_rad_s: float | None = None,
+    *,
+    filter_order: int = 2,
+    skip_s: float = 0.0,
+) -> Record:
+    """Input, output and reference sent through one Butterworth filter; the first `skip_s` seconds left out.
+
+    A linear system between input and output stays what it is, so a fit of the filtered record is a fit
+    weighted to the band. Meant for drift and friction below `low_rad_s` and noise above `high_rad_s`; None
+    leaves that side open. The filter starts with its steady state for the first sample; what the plant did
+    before the record (and before `skip_s`) is not in it, so that a lightly damped plant not at rest then
+    needs an unknown initial state in the fit.
+
+    Raises
+    ------
+    ValueError
+        If the band is empty or leaves (0, pi/dt), both sides are None, or nothing is left after `skip_s`.
+    """
+    nyquist = np.pi / record.dt_s
+    low, high = low_rad_s, high_rad_s
+    if low is None and high is None:
+        raise ValueError("a band needs a lower or an upper frequency")
+    edges = [edge for edge in (low, high) if edge is not None]
+    if not all(a < b for a, b in pairwise([0.0, *edges, nyquist])):
+        raise ValueError(
+            f"the band must lie in (0, {nyquist:.6g}) rad/s, lower below upper; got {low} to {high}"
+        )
+    skip = round(skip_s / record.dt_s)
+    if not 0 <= skip < record.n_samples:
+        raise ValueError(f"{record.label}: skip_s = {skip_s} leaves nothing of {record.n_samples} samples")
+    kind: Literal["bandpass", "lowpass", "highpass"] = (
+        "lowpass" if low is None else "highpass" if high is None else "bandpass"
+    )
+    sections = scipy.signal.butter(
+        filter_order, edges if len(edges) == 2 else edges[0], kind, output="sos", fs=2 * np.pi / record.dt_s
+    )
+    settled = scipy.signal.sosfilt_zi(sections)
+
+    def filtered(signal: RealArray) -> RealArray:
+        columns = [scipy.signal.sosfilt(sections, x, zi=settled * x[0])[0] for x in signal.T]
+        return np.column_stack(columns)[skip:]
+
+    return replace(
+        record,
+        input=filtered(record.input),
+        output=filtered(record.output),
+        reference=None if record.reference is None else filtered(record.reference),
+    )
+
+
+def increments(record: Record) -> Record:
+    """Input, output and reference filtered by 1 - q^-1, one sample shorter: the same response, slow noise
+    whitened.
+
+    Raises ValueError if a single sample is all there is.
+    """
+    if record.n_samples < 2:
+        raise ValueError(f"{record.label}: differences need at least two samples")
+    return replace(
+        record,
+        input=np.diff(record.input, axis=0),
+        output=np.diff(record.output, axis=0),
+        reference=None if record.reference is None else np.diff(record.reference, axis=0),
+    )

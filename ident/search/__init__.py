@@ -1,0 +1,1 @@
+"""DIRECT over poles, order selection, and what the search saw on its way."""

@@ -1,0 +1,156 @@
+"""The cost over one pole pair with everything else frozen: the paper's Fig. 1 for any record and model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ident.basis.coordinates import SearchSpace
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure
+from ident.data.arrays import RealArray, readonly_real
+from ident.data.record import Record
+from ident.fit.regression import prepare
+from ident.search.candidate_cost import CandidateCost
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSurface:
+    """Mean square residual over two coordinates of one pair.
+
+    Attributes
+    ----------
+    first, second : (A,), (B,) arrays
+        Coordinate values: (beta, gamma) of (29), or (omega [rad/s], zeta).
+    names : (str, str)
+        Their names.
+    mean_square : (A, B) array
+        J/N as in (20), coefficients fitted at every point, in squared units of the output.
+    pole : (float, float)
+        The model's own pair in these coordinates.
+    """
+
+    first: RealArray
+    second: RealArray
+    names: tuple[str, str]
+    mean_square: RealArray
+    pole: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        for key in ("first", "second", "mean_square"):
+            object.__setattr__(self, key, readonly_real(getattr(self, key)))
+        if self.mean_square.shape != (self.first.size, self.second.size):
+            raise ValueError(
+                f"mean_square must be ({self.first.size}, {self.second.size}); got {self.mean_square.shape}"
+            )
+
+    def local_minima(self) -> list[tuple[int, int]]:
+        """Grid points lower than all their (up to 8) neighbours, lowest first."""
+        padded = np.pad(self.mean_square, 1, constant_values=np.inf)
+        inner = padded[1:-1, 1:-1]
+        lowest = np.ones(inner.shape, dtype=np.bool_)
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                if (i, j) != (0, 0):
+                    neighbour = padded[1 + i : padded.shape[0] - 1 + i, 1 + j : padded.shape[1] - 1 + j]
+                    lowest &= inner < neighbour
+        found = np.argwhere(lowest)
+        order = np.argsort(inner[lowest], kind="stable")
+        return [(int(i), int(j)) for i, j in found[order]]
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        return {
+            "first": self.first,
+            "second": self.second,
+            "names": np.array(self.names),
+            "mean_square": self.mean_square,
+            "pole": np.array(self.pole),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> ErrorSurface:
+        first, second = (str(name) for name in arrays["names"])
+        return cls(
+            arrays["first"],
+            arrays["second"],
+            (first, second),
+            arrays["mean_square"],
+            (float(arrays["pole"][0]), float(arrays["pole"][1])),
+        )
+
+
+def error_surface(
+    records: Sequence[Record],
+    model: GobfModel,
+    structure: Structure,
+    *,
+    pair: int = 0,
+    coordinates: Literal["raw", "log"] = "log",
+    first: RealArray | None = None,
+    second: RealArray | None = None,
+    n_points: int = 61,
+) -> ErrorSurface:
+    """Mean square residual with the pair number `pair` of the model moved over a grid, its other poles
+    frozen.
+
+    Parameters
+    ----------
+    structure : Structure
+        As in `Identification.structure`.
+    coordinates : "raw" for (beta, gamma), "log" for (omega, zeta)
+    first, second : arrays, optional
+        Grid of the two coordinates. Default: two octaves each way in omega and a factor of 30 each way in
+        zeta, logarithmic; or a window of ten damping widths in (beta, gamma), gamma spaced logarithmically
+        in 1 - gamma.
+
+    Raises
+    ------
+    ValueError
+        If the model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi/dt, 0 <
+        zeta < 1.
+    """
+    if not 0 <= pair < model.poles.pairs.size:
+        raise ValueError(f"the model has {model.poles.pairs.size} pole pairs; there is no pair {pair}")
+    pole = complex(model.poles.pairs[pair])
+    nyquist = np.pi / model.dt_s
+    if coordinates == "raw":
+        gamma = abs(pole) ** 2
+        own = (2 * pole.real / (1 + gamma), gamma)
+        width = 1 - gamma
+        if first is None:
+            reach = max(10 * width, 0.02) * np.array([-1, 1])
+            left, right = np.clip(own[0] + reach, -1 + 1e-9, 1 - 1e-9)
+            first = np.linspace(float(left), float(right), n_points)
+        if second is None:
+            second = 1 - np.geomspace(min(30 * width, 1.0), width / 30, n_points)
+        names = ("beta", "gamma")
+        proper = np.all(np.abs(first) < 1) and np.all((second >= 0) & (second < 1))
+        box = np.array([[0.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+        values_first, values_second = first, second
+    else:
+        own = (float(model.poles.omega_rad_s(model.dt_s)[pair]), float(model.poles.zeta()[pair]))
+        if first is None:
+            first = np.geomspace(own[0] / 4, min(4 * own[0], 0.99 * nyquist), n_points)
+        if second is None:
+            second = np.geomspace(max(own[1] / 30, 1e-5), min(30 * own[1], 0.95), n_points)
+        names = ("omega_rad_s", "zeta")
+        proper = np.all((first > 0) & (first < nyquist)) and np.all((second > 0) & (second < 1))
+        box = np.array([[-1.0, -12.0, -12.0], [0.0, 1.0, 0.0]])
+        values_first, values_second = np.log10(first * model.dt_s), np.log10(second)
+    if not proper:
+        raise ValueError(
+            f"the grid of {names} leaves the region of stable pole pairs below the Nyquist frequency"
+        )
+    data = prepare(records, structure)
+    kept = Poles(model.poles.real, np.delete(model.poles.pairs, pair))
+    low, high = box
+    space = SearchSpace(0, 1, low, high, coordinates == "raw", model.dt_s)
+    grid = np.array([[a, b] for a in values_first for b in values_second])
+    cost = CandidateCost(data, space, kept, kept)
+    rss = cost.rss((grid - low[1:]) / (high[1:] - low[1:])).reshape(first.size, second.size)
+    return ErrorSurface(first, second, names, rss / data.n_samples, own)

@@ -1,0 +1,290 @@
+"""Global search for the poles: DIRECT on log J, descents from the best points, block rescans (design 4.3)."""
+
+from __future__ import annotations
+
+import cmath
+from collections.abc import Callable
+from functools import cache, partial
+from itertools import combinations_with_replacement, cycle, islice, pairwise
+
+import numpy as np
+
+from ident.basis.coordinates import SearchSpace, search_space
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.data.arrays import RealArray
+from ident.fit.least_squares import linearisation
+from ident.fit.refinement import FAR, NEAR, Bounds, Polished, polish
+from ident.fit.regression import Regression
+from ident.fit.residual_colour import ResidualColour, residual_colour
+from ident.search.candidate_cost import CandidateCost
+from ident.search.direct import best_apart
+from ident.search.search_trace import PolishedMinimum, SearchStage
+
+# A rescan has to gain this fraction of J to count.
+_GAIN = 1e-6
+# Rescans of every block at most.
+_ROUNDS = 6
+# Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
+# end.
+ROUGH = 1e-3
+# So many starts that end in one place make further ones and a rescan superfluous.
+_STARTS_TO_AGREE = 3
+# Cost evaluations for one more pair when the rest is frozen: two unknowns.
+_PAIR_EVALUATIONS = 240
+_REAL_GRID = 9
+_PAIR_GRID = (60, 3)
+# Ends of rough descents are one optimum if they differ in J by no more than what such descents leave, in a
+# pole by no more than this fraction; of rates below the box's slowest nothing is told anyway.
+_SAME_COST = 3 * ROUGH
+_SAME_POLE = 0.1
+# Share of the output's power up to which a residual counts as little: with more noise than that many minima
+# lie close together, and a whiteness test does not tell them apart.
+_LITTLE_NOISE = 0.02
+
+
+class PoleSearch:
+    """The search on one regression problem; collects the trace on the way.
+
+    The fixed poles come first among the poles of each type and are never moved.
+    """
+
+    patience = 5
+
+    def __init__(self, data: Regression, options: IdentOptions) -> None:
+        self.data = data
+        self.options = options
+        self.fixed = options.fixed()
+        self.bounds = Bounds.from_options(options, data.longest, data.dt_s)
+        self.stages: list[SearchStage] = []
+        self.minima: list[PolishedMinimum] = []
+        self.evaluations = 0
+        # Slower than the box of the search goes, of which a record says nothing.
+        self._slowest = 0.2 / max(data.longest, 30)
+        self._power = float(data.y_clear @ data.y_clear)
+        self._settled: Polished | None = None
+        self._coloured: tuple[Polished, ResidualColour] | None = None
+
+    def space(self, n_real: int, n_pairs: int) -> SearchSpace:
+        return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self.options)
+
+    def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
+        """The cost that global searches and rescans look at (`ident.search.miso_search` has another)."""
+        return CandidateCost(self.data, space, shared, local)
+
+    def joint(self, n_real: int, n_pairs: int) -> Polished:
+        """Best poles of a joint global search over n_real real poles and n_pairs pairs.
+
+        The search has settled if the first starts, points of the cube far from each other, all end in one
+        place that can be trusted (`_is_trusted`). Agreement by itself is not enough: a broad wrong minimum
+        can catch several starts, but leaves dynamics in the residual. Else `patience` times as many starts
+        are tried: more of them find more than more evaluations do.
+        """
+        title = f"{n_real} real, {n_pairs} pairs"
+        if n_real + n_pairs == 0:
+            return self.descend(self.fixed, title)
+        space = self.space(n_real, n_pairs)
+        cost = self.candidate_cost(space, self.fixed, self.fixed)
+        few = min(self.options.starts, _STARTS_TO_AGREE)
+        most = self.options.starts * self.patience
+        points = self._global(title, cost, self.options.evaluations, most)
+
+        def starts(chosen: RealArray) -> list[Poles]:
+            return [self.fixed.appended(space.poles(point)) for point in chosen]
+
+        known = len(self.minima)
+        best = self._best_descent(starts(points[:few]), title)
+        ends = self.minima[known : known + len(points[:few])]
+        agreed = len(ends) == _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
+        if agreed and self._is_trusted(best):
+            self._settled = best
+            return best
+        if len(points) > few:
+            other = self._best_rough(starts(points[few:]), title)
+            if other.rss < best.rss * (1 - _GAIN):
+                best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
+        return best
+
+    def _is_trusted(self, best: Polished) -> bool:
+        """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real poles.
+
+        Two real poles that meet stay together in a descent, although apart they may fit better.
+        """
+        distances = sorted(1 - a for a in best.poles.real[self.fixed.real.size :].tolist())
+        meeting = any(
+            fast > self._slowest / 4 and fast - slow <= _SAME_POLE * fast
+            for slow, fast in pairwise(distances)
+        )
+        return not meeting and best.rss <= _LITTLE_NOISE * self._power and self.colour(best).white
+
+    def _is_same(self, end: PolishedMinimum, best: Polished) -> bool:
+        """Whether a rough descent was on its way to `best`."""
+        if end.rss > best.rss * (1 + _SAME_COST):
+            return False
+        return all(
+            abs(ours - theirs) <= _SAME_POLE * theirs + self._slowest
+            for ours, theirs in zip(_rates(end.poles), _rates(best.poles), strict=True)
+        )
+
+    def add_pair(self, poles: Poles) -> Polished:
+        """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
+        title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
+        space = self.space(0, 1)
+        cost = self.candidate_cost(space, poles.doubled(), poles)
+        points = self._global(
+            title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations), self.options.starts
+        )
+        return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
+
+    def add_real(self, poles: Poles) -> Polished:
+        """Best descent from the given poles and one more real pole."""
+        space = self.space(1, 0)
+        cost = self.candidate_cost(space, poles.doubled(), poles)
+        grid = np.linspace(0, 1, 2 * _REAL_GRID)[:, np.newaxis]
+        points = best_apart(grid, cost.rss(grid), 2)
+        self.evaluations += cost.evaluations
+        return self._best_descent(
+            [poles.appended(space.poles(point)) for point in points], "one more real pole"
+        )
+
+    def rescan(self, best: Polished) -> Polished:
+        """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round
+        gains nothing.
+
+        Not if the joint search settled on `best`.
+        """
+        if best is self._settled:
+            return best
+        n_fixed_real, n_fixed_pairs = self.fixed.real.size, self.fixed.pairs.size
+        n_real, n_pairs = best.poles.real.size, best.poles.pairs.size
+        # Up to two real poles are looked at together: one alone can be held by the other.
+        couples = [slice(i, min(i + 2, n_real)) for i in range(n_fixed_real, n_real, 2)]
+        singles = [slice(i, i + 1) for i in range(n_fixed_pairs, n_pairs)]
+        scans = [partial(self._rescan_real, here=here) for here in couples]
+        scans += [partial(self._rescan_pair, here=here) for here in singles]
+        quiet = 0
+        for scan in islice(cycle(scans), _ROUNDS * len(scans)):
+            found = scan(best)
+            quiet = 1 if found.rss < best.rss * (1 - _GAIN) else quiet + 1
+            best = found
+            if quiet == len(scans):
+                break
+        return best
+
+    def _rescan_real(self, best: Polished, here: slice) -> Polished:
+        count = here.stop - here.start
+        kept = Poles(np.delete(best.poles.real, here), best.poles.pairs)
+        space = self.space(count, 0)
+        cost = self.candidate_cost(space, kept, kept)
+        here_now = np.sort(space.levels(Poles(best.poles.real[here])))
+
+        def looks(point: RealArray) -> tuple[Poles, bool]:
+            new = space.poles(point)
+            known = np.abs(np.sort(space.levels(new)) - here_now) <= 1 / (_REAL_GRID - 1)
+            real = best.poles.real.copy()
+            real[here] = new.real
+            return Poles(real, best.poles.pairs), bool(np.all(known))
+
+        return self._descend_from_grid(best, _real_grid(count), cost, looks, n_starts=2)
+
+    def _rescan_pair(self, best: Polished, here: slice) -> Polished:
+        kept = Poles(best.poles.real, np.delete(best.poles.pairs, here))
+        space = self.space(0, 1)
+        cost = self.candidate_cost(space, kept, kept)
+        here_now = space.levels(Poles(pairs=best.poles.pairs[here]))
+
+        def looks(point: RealArray) -> tuple[Poles, bool]:
+            new = space.poles(point)
+            known = np.abs(space.levels(new) - here_now) <= 1 / (_PAIR_GRID[0] - 1)
+            pairs = best.poles.pairs.copy()
+            pairs[here] = new.pairs
+            return Poles(best.poles.real, pairs), bool(np.all(known))
+
+        return self._descend_from_grid(best, _pair_grid(), cost, looks, n_starts=1)
+
+    def _descend_from_grid(
+        self,
+        best: Polished,
+        grid: RealArray,
+        cost: CandidateCost,
+        looks: Callable[[RealArray], tuple[Poles, bool]],
+        n_starts: int,
+    ) -> Polished:
+        """Descents from the best points of the grid; `looks` gives the poles of a point, and whether it is
+        next to where the block already is: from there a descent would come back."""
+        costs = cost.rss(grid)
+        self.evaluations += cost.evaluations
+        found = best
+        for point in best_apart(grid, costs, n_starts):
+            start, known = looks(point)
+            if known:
+                continue
+            trial = self.descend(start, "rescan", ROUGH)
+            if trial.rss < found.rss * (1 - _GAIN):
+                found = self.descend(trial.poles, "rescan")
+        return found
+
+    def residual(self, poles: Poles) -> RealArray:
+        """What the fit with these poles leaves of the output, (N,)."""
+        return linearisation(self.data, poles).residual
+
+    def colour(self, end: Polished) -> ResidualColour:
+        """Colour of the residual of an end; kept for the last end asked for."""
+        if self._coloured is None or self._coloured[0] is not end:
+            self._coloured = end, residual_colour(self.residual(end.poles), self.data.starts)
+        return self._coloured[1]
+
+    def descend(self, poles: Poles, stage: str, tolerance: float = 1e-9) -> Polished:
+        """Polish from the given poles (fixed ones first) and note the end in the trace."""
+        end = polish(
+            self.data,
+            poles,
+            self.bounds,
+            n_fixed_real=self.fixed.real.size,
+            n_fixed_pairs=self.fixed.pairs.size,
+            tolerance=tolerance,
+            damping=FAR if tolerance >= ROUGH else NEAR,
+        )
+        self.evaluations += end.iterations + 1
+        self.minima.append(PolishedMinimum(stage, end.poles, end.rss))
+        return end
+
+    def _best_descent(self, starts: list[Poles], stage: str) -> Polished:
+        return self.descend(self._best_rough(starts, stage).poles, stage)
+
+    def _best_rough(self, starts: list[Poles], stage: str) -> Polished:
+        return min((self.descend(start, stage, ROUGH) for start in starts), key=lambda end: end.rss)
+
+    def _global(self, title: str, cost: CandidateCost, evaluations: int, count: int) -> RealArray:
+        points, costs = cost.minimise(self.options.algorithm, evaluations)
+        self.evaluations += cost.evaluations
+        self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
+        return best_apart(points, costs, count)
+
+
+def _rates(poles: Poles) -> list[float]:
+    """Decays of the real poles, frequencies of the pairs and their decays per sample, each by size."""
+    pairs = [cmath.log(pole) for pole in poles.pairs.tolist()]
+    return [
+        *sorted(1 - a for a in poles.real.tolist()),
+        *sorted(abs(log) for log in pairs),
+        *sorted(-log.real for log in pairs),
+    ]
+
+
+@cache
+def _pair_grid() -> RealArray:
+    """Frequencies and dampings of one pair, as points of the unit cube."""
+    omegas, zetas = np.linspace(0, 1, _PAIR_GRID[0]), np.linspace(0, 1, _PAIR_GRID[1] + 2)[1:-1]
+    return np.array([[omega, zeta] for omega in omegas for zeta in zetas])
+
+
+@cache
+def _real_grid(n_poles: int) -> RealArray:
+    """Levels of one real pole, or all ordered couples of levels of two, as points of the unit cube."""
+    levels = np.linspace(0, 1, _REAL_GRID)
+    if n_poles == 1:
+        return levels[:, np.newaxis]
+    # The triangular map of the search space turns (low, 1) into equal poles at the top.
+    couples = combinations_with_replacement(levels, 2)
+    return np.array([[low, 0.0 if low == 1 else (high - low) / (1 - low)] for low, high in couples])

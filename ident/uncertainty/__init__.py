@@ -1,0 +1,9 @@
+"""The two types through which control design sees identification."""
+
+from __future__ import annotations
+
+from ident.basis.posterior import EmbeddingReport, ResponsePosterior
+from ident.data.ellipses import Ellipses, offset_disc_radius
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+
+__all__ = ["Ellipses", "EmbeddingReport", "FrequencyUncertainty", "ResponsePosterior", "offset_disc_radius"]

@@ -1,0 +1,149 @@
+"""Autoregressive models of residuals: the whitening filter for coloured noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular, toeplitz
+from scipy.signal import lfilter
+
+from ident.data.arrays import RealArray
+
+# Largest change of A(q) by a correction, relative to A(q), at any frequency: |1 + x|^2 >= 1/2 for all x of
+# this size, so that the spectrum of the noise is nowhere more than doubled.
+_LARGEST_MOVE = 1.0 - 1.0 / np.sqrt(2.0)
+# First rows are whitened exactly up to this condition number of their covariance. The start of a record is
+# never quite stationary (a record cut out of a sweep, a filter that starts settled): a deviation by a
+# hundredth of the noise then counts like the whole noise in the direction of the largest weight.
+_LARGEST_CONDITION = 1e4
+_FREQUENCIES = np.concatenate([np.geomspace(1e-4, 1e-2, 128), np.linspace(0.0, np.pi, 2048)])
+
+
+class FitBias(Protocol):
+    """What a fit does to the estimating equations of its noise, see
+    `ident.uncertainty.residual_noise.Absorbed`.
+    """
+
+    def gradient(self, whitening: RealArray, order: int, start: int) -> RealArray: ...
+
+
+def fit_autoregression(
+    residuals: Sequence[RealArray],
+    max_order: int,
+    weights: RealArray | None = None,
+    absorbed: FitBias | None = None,
+) -> RealArray:
+    """[1, a_1, ..., a_n] of A(q) e = white, order n <= max_order by BIC, from all records together.
+
+    Conditional least squares on the rows that have max_order predecessors, so that all orders are judged on
+    the same rows; a model with a root on or outside the unit circle has its roots reflected inside. Raises
+    ValueError when no record is longer than twice max_order.
+
+    With the whitening filter `weights` that the fit behind the residuals used, and what it `absorbed`, the
+    bias of that fit is removed: the sums of (A e)_t e_(t-i) are set to what the fit would have made of them
+    for noise with that very filter, instead of to zero. That is of first order in the change of the filter,
+    and exact in expectation once it no longer changes. The sums are those over the rows used: differences of
+    lag averages are not even a covariance when the noise has many decades between its peaks and its floor. A
+    correction that moves the spectrum by more than a factor of two anywhere is no small perturbation, and is
+    shrunk until it does not; it then leaves all roots inside the unit circle (Rouche).
+    """
+    long_enough = [i for i, e in enumerate(residuals) if e.size > 2 * max_order]
+    usable = [np.asarray(residuals[i], dtype=np.float64) for i in long_enough]
+    if not usable:
+        raise ValueError(
+            f"an AR model up to order {max_order} needs a record of more than {2 * max_order} samples"
+        )
+    rows = np.vstack([toeplitz(e[max_order - 1 :], e[max_order - 1 :: -1])[:-1] for e in usable])
+    target = np.concatenate([e[max_order:] for e in usable])
+    n = target.size
+    floor = np.finfo(np.float64).tiny
+    best, best_cost, variance = np.ones(1), n * np.log(max(float(target @ target) / n, floor)), 0.0
+    for order in range(1, max_order + 1):
+        coefficients, *_ = np.linalg.lstsq(rows[:, :order], target, rcond=None)
+        error = target - rows[:, :order] @ coefficients
+        cost = n * np.log(max(float(error @ error) / n, floor)) + order * np.log(n)
+        if cost < best_cost:
+            best, best_cost = np.concatenate([[1.0], -coefficients]), cost
+            variance = float(error @ error) / (n - order)
+    if weights is None or absorbed is None or best.size == 1 or weights.size == 1:
+        return _stable(best)
+    order = best.size - 1
+    gradient = absorbed.gradient(weights, order, max_order)
+    # (X^T X)^-1 through the singular values of X: its square may be beyond the reach of double precision.
+    _, d, vt = np.linalg.svd(rows[:, :order], full_matrices=False)
+    kept = d > np.finfo(np.float64).eps * n * d[0]
+    step = variance * (vt[kept].T / d[kept] ** 2) @ (vt[kept] @ gradient)
+    return _moved(_stable(best), step)
+
+
+def first_rows(whitening: RealArray) -> RealArray:
+    """(n,n) lower triangle that whitens the first n samples of stationary noise with A(q) of order n.
+
+    The inverse Cholesky factor of their covariance: with it on top of A(q) no sample is lost. Dropping the
+    first rows instead leaves any transient that A(q) annuls free, such as that of a pole of the plant which
+    the noise happens to share. All the same they are dropped (zeros) where the covariance is nearly singular,
+    as that of noise inside a narrow band: see _LARGEST_CONDITION.
+    """
+    order = whitening.size - 1
+    if order == 0:
+        return np.zeros((0, 0))
+    covariance = toeplitz(autocovariance(whitening, order - 1))
+    spread = np.linalg.eigvalsh(covariance)
+    if not spread[0] * _LARGEST_CONDITION >= spread[-1]:
+        return np.zeros((order, order))
+    factor = cholesky(covariance, lower=True)
+    return np.asarray(solve_triangular(factor, np.eye(order), lower=True), dtype=np.float64)
+
+
+def whitened(signals: RealArray, whitening: RealArray) -> RealArray:
+    """White unit-variance version of noise with A(q) v = e, along the first axis; (T,) or (T,n).
+
+    Rows that `first_rows` drops are zero.
+    """
+    order = whitening.size - 1
+    if order == 0 or signals.size == 0:
+        return signals
+    out = np.asarray(lfilter(whitening, np.ones(1), signals, axis=0), dtype=np.float64)
+    out[:order] = first_rows(whitening) @ signals[:order]
+    return out
+
+
+def autocovariance(whitening: RealArray, max_lag: int) -> RealArray:
+    """gamma_k, k = 0 .. max_lag, of e with A(q) e white of unit variance; A stable.
+
+    The Yule-Walker equations sum_i a_i gamma_|k - i| = (k == 0) for k = 0 .. n, then the recursion.
+    """
+    order = whitening.size - 1
+    equations = np.zeros((order + 1, order + 1))
+    for k in range(order + 1):
+        for i in range(order + 1):
+            equations[k, abs(k - i)] += whitening[i]
+    gamma = np.linalg.solve(equations, np.eye(order + 1)[0]).tolist()
+    for k in range(order + 1, max_lag + 1):
+        gamma.append(-sum(float(whitening[i]) * gamma[k - i] for i in range(1, order + 1)))
+    return np.array(gamma[: max_lag + 1], dtype=np.float64)
+
+
+def _moved(whitening: RealArray, step: RealArray) -> RealArray:
+    """A(q) - s B(q), b_1 .. b_n = step, with the largest s <= 1 for which s |B / A| <= _LARGEST_MOVE."""
+    # Where it matters most: next to the roots, however sharp their peaks.
+    peaks = np.angle(np.roots(whitening))
+    delays = np.exp(-1j * np.concatenate([_FREQUENCIES, peaks]))
+    moved = np.polyval(np.concatenate([step[::-1], [0.0]]), delays) / np.polyval(whitening[::-1], delays)
+    share = min(1.0, _LARGEST_MOVE / max(float(np.abs(moved).max()), _LARGEST_MOVE))
+    return np.asarray(whitening - share * np.concatenate([[0.0], step]), dtype=np.float64)
+
+
+def _stable(whitening: RealArray) -> RealArray:
+    """Roots reflected into the unit circle: the same spectrum, an invertible filter."""
+    roots = np.asarray(np.roots(whitening), dtype=np.complex128)
+    outside = np.abs(roots) >= 1
+    if not np.any(outside):
+        return whitening
+    # On the circle itself reflection changes nothing; a root there is pulled in by a millionth.
+    roots[outside] = np.minimum(1.0 / np.abs(roots[outside]), 1 - 1e-6) * np.exp(
+        1j * np.angle(roots[outside])
+    )
+    return np.asarray(np.real(np.poly(roots)), dtype=np.float64)

@@ -1,0 +1,283 @@
+"""Model error and noise as one covariance: stochastic embedding, classical and tangent (design 4.5).
+
+`classical` is the recipe of Goodwin, Gevers and Ninness (IEEE TAC 37(7), 1992) that the paper's Fig. 7 uses.
+Its ellipses do not cover: poles chosen from the same data are treated as known, and the kernel keeps its
+prior variance at frequencies that the data know well. `tangent` is the default: every pole twice (which spans
+the first-order effect of moving the poles), initial state and offset as nuisance, a short kernel for what is
+left, everything conditioned on the data, averaged over one mode that the search may have missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import EmbeddingReport, ResponsePosterior
+from ident.basis.structure import Structure
+from ident.data.arrays import ComplexArray, RealArray
+from ident.data.record import Record
+from ident.uncertainty.autoregression import fit_autoregression
+from ident.uncertainty.embedding_algebra import (
+    KernelGrid,
+    KernelPosterior,
+    ReducedRegression,
+    conditional_posterior,
+    evaluate_grid,
+    exponential_factor,
+    grid_weights,
+    joint_factor,
+    kernel_spectrum,
+    prior_posterior,
+    reduce_regression,
+    tc_factor,
+    total_log_evidence,
+)
+from ident.uncertainty.embedding_rows import EmbeddingRows
+from ident.uncertainty.residual_noise import gls_residuals
+from ident.uncertainty.undetected_mode import (
+    PairMixture,
+    candidate_pairs,
+    cascade_coordinates,
+    pair_mixture,
+    pair_statistics,
+    refined_pair,
+    with_pairs,
+)
+
+# Kernel of 150 taps (design 4.5), as far as the records can carry it.
+_DEFAULT_FIR_LENGTH = 150
+# Modes that the order selection missed and the embedding adds: coloured noise hides them from a search that
+# takes it for white, and whitening brings them out.
+_MOST_ADDED = 5
+# Rounds of residuals -> noise model -> whitening: the first sees residuals of an unwhitened fit, the others
+# remove what is left of its bias.
+_NOISE_ROUNDS = 3
+
+
+class EmbeddingOptions(BaseModel):
+    """Settings of the uncertainty estimate."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    fir_length: int | None = Field(
+        default=None,
+        ge=1,
+        description="taps of the kernel on the remainder; none given: 150, less for short records",
+    )
+    hyperparameters: Literal["average", "maximum"] = Field(
+        default="average",
+        description="average the kernel over a grid weighted by restricted likelihood, or take the largest",
+    )
+    prior_no_remainder: float = Field(
+        default=0.5,
+        ge=0.0,
+        lt=1.0,
+        description="prior probability that the poles explain everything (alpha = 0)",
+    )
+    estimate_offset: bool = Field(default=True, description="a constant on each record's output")
+    estimate_initial_state: bool = Field(
+        default=True, description="free response of all poles in each record"
+    )
+    prior_missed_mode: float = Field(
+        default=0.5,
+        ge=0.0,
+        lt=1.0,
+        description="prior probability that the poles lack a lightly damped mode; 0: none is looked for. "
+        "For records only: a fit to a measured frequency response does not look for one",
+    )
+    coloured_noise: bool = Field(
+        default=False, description="whiten with an AR model of the residuals, three rounds"
+    )
+    max_ar_order: int = Field(default=8, ge=1, le=100, description="largest AR order that BIC may choose")
+    feedthrough: bool | None = Field(
+        default=None, description="direct term; none given: as the model has one or not"
+    )
+
+
+def tangent(
+    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
+) -> ResponsePosterior:
+    """Posterior of the response around a model whose poles were chosen from these records.
+
+    records: SISO, same sampling time as the model, each with its own initial state and offset; model gives
+    poles, integrators and delay (its coefficients are not used). Raises ValueError when the records are too
+    short, have another sampling time, or do not excite the poles at all.
+
+    The posterior's poles are the model's, twice; then, twice each, modes so plain that an order selection
+    would have kept them (after whitening, or in a model whose order was given); then, once each, pairs of one
+    further mode that has a probability worth counting (`ident.uncertainty.undetected_mode`). A mode that is
+    not seen in these records at all stays outside the ellipses at its peak: no data speak of it.
+    """
+    options = options or EmbeddingOptions()
+    return _embed(records, model, model.poles.doubled(), options, classical_recipe=False)
+
+
+def classical(
+    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
+) -> ResponsePosterior:
+    """The published recipe, for comparison: F = Phi, prior C = alpha lam^k, unconditional covariance.
+
+    Same arguments and errors as `tangent`; hyperparameters are always those of largest restricted likelihood,
+    and prior_no_remainder is not used. Do not design a controller on it: see the module docstring.
+    """
+    options = options or EmbeddingOptions()
+    return _embed(records, model, model.poles, options, classical_recipe=True)
+
+
+def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
+    """Taps of the kernel: as given, else 150 or a third of the rows that the regressors leave over."""
+    if options.fir_length is not None:
+        return options.fir_length
+    spare = sum(record.n_samples for record in records) - (len(records) + 1) * (poles.order + 2)
+    return max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
+
+
+def _embed(
+    records: Sequence[Record],
+    model: GobfModel,
+    poles: Poles,
+    options: EmbeddingOptions,
+    *,
+    classical_recipe: bool,
+) -> ResponsePosterior:
+    rows = _rows(records, model, poles, options)
+    solve = _solve_classical if classical_recipe else _solve
+    # Coloured noise taken for white passes for modes: none are added before it has been whitened.
+    first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
+    solved = solve(rows, first)
+    if options.coloured_noise:
+        for _ in range(_NOISE_ROUNDS):
+            residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
+            whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
+            solved = solve(solved.rows.with_whitening(whitening), options)
+    poles = solved.rows.poles
+    reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
+    if missed is not None and missed.poles.size:
+        reduced, kernel = (
+            replace(reduced, r12=np.hstack([reduced.r12, missed.onto])),
+            with_pairs(kernel, missed),
+        )
+        poles = Poles(poles.real, np.concatenate([poles.pairs, missed.poles]))
+        mean, factor = (
+            _pairs_after_poles(part, solved.rows.poles.order, missed.poles)
+            for part in joint_factor(reduced, kernel)
+        )
+    else:
+        mean, factor = joint_factor(reduced, kernel)
+    return ResponsePosterior(
+        poles=poles,
+        mean=mean,
+        covariance_factor=factor,
+        dt_s=model.dt_s,
+        fir_length=rows.fir_length,
+        has_feedthrough=rows.structure.feedthrough,
+        integrators=model.integrators,
+        input_delay_samples=model.input_delay_samples,
+        input_name=model.input_name,
+        output_name=model.output_name,
+        report=EmbeddingReport(
+            method="classical embedding" if classical_recipe else "tangent embedding",
+            noise_std=float(np.sqrt(kernel.noise_variance)),
+            alpha=kernel.alpha,
+            lam=kernel.lam,
+            probability_no_remainder=kernel.probability_no_remainder,
+            log_evidence=kernel.log_evidence,
+            n_rows=reduced.n_rows,
+            n_regressors=reduced.n_regressors,
+            ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
+            probability_missed_mode=missed.probability if missed else 0.0,
+            missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
+            n_added_modes=(solved.rows.poles.order - rows.poles.order) // 4,
+        ),
+    )
+
+
+def _rows(
+    records: Sequence[Record], model: GobfModel, poles: Poles, options: EmbeddingOptions
+) -> EmbeddingRows:
+    if not records:
+        raise ValueError("need at least one record")
+    for record in records:
+        if record.input.shape[1] != 1 or record.output.shape[1] != 1:
+            raise ValueError(
+                f"record {record.name!r}: need one input and one output; use record.siso(input, output)"
+            )
+        if not abs(record.dt_s - model.dt_s) <= 1e-9 * model.dt_s:
+            raise ValueError(f"record {record.name!r} has dt_s = {record.dt_s}, the model {model.dt_s}")
+    structure = Structure(
+        integrators=model.integrators,
+        input_delay_samples=model.input_delay_samples,
+        feedthrough=model.feedthrough != 0 if options.feedthrough is None else options.feedthrough,
+        estimate_offset=options.estimate_offset,
+        estimate_initial_state=options.estimate_initial_state,
+    )
+    length = common_fir_length(records, poles, options)
+    return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Posterior without a missed mode, and the pairs that may be missing (None: not looked for)."""
+
+    rows: EmbeddingRows
+    reduced: ReducedRegression
+    kernel: KernelPosterior
+    missed: PairMixture | None = None
+
+
+def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
+    """Posterior on these rows; modes that an order selection would have kept are added to their poles."""
+    n_added = 0
+    while True:
+        reduced, grid = _kernel_grid(rows, tc_factor)
+        weights, none = grid_weights(grid, options.prior_no_remainder)
+        if options.hyperparameters == "maximum":
+            # alpha = 0 is the lower end of the grid in the limit, so it wins only where the whole grid is
+            # worse.
+            none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
+            weights = np.zeros_like(weights)
+            weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
+        kernel = conditional_posterior(grid, weights, none)
+        if not options.prior_missed_mode > 0:
+            return _Solved(rows, reduced, kernel)
+        candidates = candidate_pairs(max(record.n_samples for record in rows.records))
+        statistics = pair_statistics(rows.pair_blocks(), reduced, candidates.poles)
+        odds = options.prior_missed_mode / (1 - options.prior_missed_mode)
+        log_rest = total_log_evidence(grid, options.prior_no_remainder)
+        missed = pair_mixture(candidates, statistics, reduced.degrees_of_freedom, log_rest, odds)
+        if missed.visible is None or n_added == _MOST_ADDED:
+            return _Solved(rows, reduced, kernel, missed)
+        rows = rows.with_pair(refined_pair(rows.pair_blocks, reduced, missed.visible))
+        n_added += 1
+
+
+def _solve_classical(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
+    reduced, grid = _kernel_grid(rows, exponential_factor)
+    return _Solved(rows, reduced, prior_posterior(grid))
+
+
+def _kernel_grid(
+    rows: EmbeddingRows, factor: Callable[[float, int], RealArray]
+) -> tuple[ReducedRegression, KernelGrid]:
+    reduced = reduce_regression(rows.blocks())
+    length = rows.fir_length
+    # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
+    decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
+    # From a remainder far below the noise to one a hundred thousand times its amplitude.
+    relative_alpha = np.geomspace(1e-2, 1e10, 49)
+    spectra = [
+        kernel_spectrum(reduced, lam, factor(lam, length)) for lam in np.exp(-1.0 / decay_samples).tolist()
+    ]
+    return reduced, evaluate_grid(reduced, spectra, relative_alpha)
+
+
+def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:
+    """Rows (theta, eta, amplitudes) rearranged to (basis of all poles in cascade, direct term, eta)."""
+    first, rest, amplitudes = np.split(coefficients, [order, coefficients.shape[0] - 2 * pairs.size])
+    return np.concatenate([first, cascade_coordinates(pairs) @ amplitudes, rest])

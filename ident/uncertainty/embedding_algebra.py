@@ -1,0 +1,379 @@
+"""Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of the kernel.
+
+Model y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), v ~ N(0, s2 I)
+(Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Ct = alpha B B^T, and
+everything that depends on the data is contained in a triangle of the size of the parameters, whatever the
+record length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import lapack, qr, solve_triangular, svd
+
+from ident.data.arrays import RealArray
+
+# Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
+_NUISANCE_RANK = 1e-10
+# A diagonal entry of R11 (columns of unit length) below this says that these records cannot tell the column
+# from the earlier ones.
+_EXCITATION = 1e-10
+# Share of the largest prior variance below which a tap is none: rounding, even ten orders above the noise.
+_DIED_OUT = 1e-17
+
+
+@dataclass(frozen=True, eq=False)
+class RegressionBlock:
+    """Rows of one record: nuisance (T,n), regressors F (T,p), kernel columns Psi (T,L), output y (T,)."""
+
+    nuisance: RealArray
+    regressors: RealArray
+    kernel: RealArray
+    output: RealArray
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedRegression:
+    """[F Psi y] after projecting the nuisance out and QR: the sufficient statistics.
+
+    r11 (p,p) upper triangular in units of the original columns, r12 (p,L), r1 (p,), r22 (L,L), z (L,), rest =
+    squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank. kept (p,) are the
+    columns of F that stayed, of n_columns: one that these records cannot tell from the others (a pole nearly
+    four times in the doubled set) is left out, its coefficient zero, and changes the response at no excited
+    frequency.
+    """
+
+    r11: RealArray
+    r12: RealArray
+    r1: RealArray
+    r22: RealArray
+    z: RealArray
+    rest: float
+    n_rows: int
+    kept: npt.NDArray[np.intp]
+    n_columns: int
+
+    @property
+    def n_regressors(self) -> int:
+        return int(self.r1.size)
+
+    @property
+    def fir_length(self) -> int:
+        return int(self.z.size)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """nu = N - p, with the nuisance already taken off N."""
+        return self.n_rows - self.n_regressors
+
+
+@dataclass(frozen=True, eq=False)
+class KernelPosterior:
+    """Gaussian of theta and eta.
+
+    eta = kernel_mean + kernel_factor w', theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w); w, w'
+    standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the classical
+    recipe) mean 0 and the prior factor. alpha and lam are those of largest weight; probability_no_remainder
+    the weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
+    """
+
+    kernel_mean: RealArray
+    kernel_factor: RealArray
+    noise_variance: float
+    alpha: float
+    lam: float
+    probability_no_remainder: float
+    log_evidence: float
+
+
+def nuisance_basis(nuisance: RealArray) -> RealArray:
+    """Orthonormal columns (T,r) spanning the nuisance columns (T,n), nearly dependent ones dropped."""
+    if nuisance.shape[1] == 0:
+        return nuisance
+    length = np.linalg.norm(nuisance, axis=0)
+    scaled = np.asarray(nuisance[:, length > 0] / length[length > 0], dtype=np.float64)
+    if scaled.shape[1] == 0:
+        return scaled
+    q, r, _ = qr(scaled, mode="economic", pivoting=True)
+    rank = int(np.count_nonzero(np.abs(np.diag(r)) > _NUISANCE_RANK))
+    return np.asarray(q[:, :rank])
+
+
+def without_nuisance(columns: RealArray, basis: RealArray) -> RealArray:
+    """Columns minus their projection on an orthonormal basis, twice, so that rounding is removed too."""
+    for _ in range(2):
+        columns = columns - basis @ (basis.T @ columns)
+    return np.asarray(columns, dtype=np.float64)
+
+
+def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
+    """One QR for all records: each block, its nuisance projected out, is stacked under the last triangle.
+
+    Cost O(N (p + L)^2), memory that of the largest block. Raises ValueError when rows do not exceed p + L or
+    the input does not excite a regressor.
+    """
+    triangle: RealArray | None = None
+    n_rows = 0
+    p = length = 0
+    for block in blocks:
+        p, length = block.regressors.shape[1], block.kernel.shape[1]
+        basis = nuisance_basis(block.nuisance)
+        # The nuisance as the first columns: below its rows, the triangle is that of everything orthogonal
+        # to it, for the price of a few columns more.
+        rank = basis.shape[1]
+        upper = _triangle(np.column_stack([basis, block.regressors, block.kernel, block.output]))
+        upper = upper[rank : rank + p + length + 1, rank:]
+        n_rows += block.output.size - rank
+        triangle = upper if triangle is None else _triangle(np.vstack([triangle, upper]))
+    if triangle is None:
+        raise ValueError("need at least one record")
+    if n_rows <= p + length + 1:
+        raise ValueError(
+            f"{n_rows} usable samples do not determine {p} regressors and {length} kernel coefficients: "
+            "give a longer record or a smaller fir_length"
+        )
+    kept = _distinguishable(triangle[:p, :p])
+    if kept.size < p:
+        columns = np.concatenate([kept, np.arange(p, p + length + 1)])
+        triangle = _triangle(triangle[:, columns])
+    q = kept.size
+    return ReducedRegression(
+        r11=np.triu(triangle[:q, :q]),
+        r12=triangle[:q, q:-1],
+        r1=triangle[:q, -1],
+        r22=np.triu(triangle[q:-1, q:-1]),
+        z=triangle[q:-1, -1],
+        rest=float(triangle[-1, -1] ** 2),
+        n_rows=n_rows,
+        kept=kept,
+        n_columns=p,
+    )
+
+
+def _triangle(columns: RealArray) -> RealArray:
+    """R (n,n) of the QR decomposition of columns (T,n); rows of zeros where T < n.
+
+    LAPACK called directly: SciPy's qr copies the matrix twice and forms all T rows of R, which costs as much
+    as the decomposition.
+    """
+    n_rows, n = columns.shape
+    packed, _, _, info = lapack.dgeqrf(np.asfortranarray(columns), lwork=64 * n, overwrite_a=1)
+    if info != 0:
+        raise ArithmeticError(f"dgeqrf returned {info}")
+    upper = np.zeros((n, n))
+    upper[: min(n_rows, n)] = np.triu(packed[:n])
+    return upper
+
+
+def _distinguishable(r11: RealArray) -> npt.NDArray[np.intp]:
+    """Indices of the columns of an upper triangle that are not, to rounding, combinations of earlier ones."""
+    length = np.linalg.norm(r11, axis=0)
+    if np.any(length == 0):
+        raise ValueError(
+            f"the input does not excite regressor {int(np.argmax(length == 0)) + 1} of {length.size}"
+        )
+    return np.flatnonzero(np.abs(np.diag(r11)) > _EXCITATION * length)
+
+
+def tc_factor(lam: float, length: int) -> RealArray:
+    """B (L,L) with (B B^T)_ij = lam^max(i,j), i, j = 1..L: the tuned/correlated kernel of unit alpha."""
+    k = np.arange(1, length + 1, dtype=np.float64)
+    step = lam**k * (1 - lam)
+    step[-1] = lam**length
+    return np.asarray(np.triu(np.ones((length, length))) * np.sqrt(step))
+
+
+def exponential_factor(lam: float, length: int) -> RealArray:
+    """B (L,L) with B B^T = diag(lam^k), k = 1..L: the prior of the classical recipe."""
+    return np.diag(np.sqrt(lam ** np.arange(1, length + 1, dtype=np.float64)))
+
+
+@dataclass(frozen=True, eq=False)
+class KernelSpectrum:
+    """Singular value decomposition of R22 B for one kernel shape: every alpha then costs O(L).
+
+    Of the L taps those n are kept that have died out neither; R22 and B are upper triangular, so R22 B has
+    nothing outside its first n rows and columns. axes (n,n) = B V, singular d (n,), projected U^T z (n,), and
+    outside = squared norm of the rest of z.
+    """
+
+    lam: float
+    length: int
+    axes: RealArray
+    singular: RealArray
+    projected: RealArray
+    outside: float
+
+
+def kernel_spectrum(reduced: ReducedRegression, lam: float, factor: RealArray) -> KernelSpectrum:
+    """For an upper triangular factor B (L,L) whose columns die out with the tap."""
+    size = np.einsum("ij,ij->j", factor, factor)
+    n = int(np.flatnonzero(size > _DIED_OUT * size.max())[-1]) + 1
+    u, d, vt = svd(reduced.r22[:n, :n] @ factor[:n, :n], full_matrices=False, check_finite=False)
+    return KernelSpectrum(
+        lam=lam,
+        length=factor.shape[0],
+        axes=factor[:n, :n] @ vt.T,
+        singular=d,
+        projected=u.T @ reduced.z[:n],
+        outside=float(reduced.z[n:] @ reduced.z[n:]),
+    )
+
+
+def restricted_log_likelihood(
+    reduced: ReducedRegression, spectrum: KernelSpectrum, alpha: RealArray
+) -> tuple[RealArray, RealArray]:
+    """log L (up to a constant shared by all kernels) and s2, both (A,), for alpha (A,), C = s2 alpha B B^T.
+
+    -2 log L = nu log s2 + log det M + nu, M = I + R22 Ct R22^T, s2 = (S + z^T M^-1 z) / nu.
+    """
+    gain = 1.0 + alpha[:, None] * spectrum.singular**2
+    nu = reduced.degrees_of_freedom
+    s2 = (reduced.rest + spectrum.outside + np.sum(spectrum.projected**2 / gain, axis=1)) / nu
+    floor = np.finfo(np.float64).tiny
+    return -0.5 * (nu * np.log(np.maximum(s2, floor)) + np.sum(np.log(gain), axis=1) + nu), s2
+
+
+@dataclass(frozen=True, eq=False)
+class KernelGrid:
+    """Weights of all (lam, alpha) pairs and of alpha = 0, given the data."""
+
+    spectra: tuple[KernelSpectrum, ...]
+    alpha: RealArray  # (K, A)
+    noise_variance: RealArray  # (K, A)
+    log_likelihood: RealArray  # (K, A)
+    noise_variance_none: float
+    log_likelihood_none: float
+
+
+def evaluate_grid(
+    reduced: ReducedRegression, spectra: Iterable[KernelSpectrum], relative_alpha: RealArray
+) -> KernelGrid:
+    """Restricted likelihood over kernel shapes and alpha = relative_alpha / d_max^2.
+
+    Scaled by the largest singular value, a relative alpha of 1 is a remainder just as strong as the noise in
+    its best-excited direction, so that the grid fits any units of input and output.
+    """
+    spectra = tuple(spectra)
+    alpha = np.stack([relative_alpha / max(float(s.singular[0]) ** 2, 1e-300) for s in spectra])
+    values = [restricted_log_likelihood(reduced, s, a) for s, a in zip(spectra, alpha, strict=True)]
+    none, s2_none = restricted_log_likelihood(reduced, spectra[0], np.zeros(1))
+    return KernelGrid(
+        spectra=spectra,
+        alpha=alpha,
+        log_likelihood=np.stack([value[0] for value in values]),
+        noise_variance=np.stack([value[1] for value in values]),
+        noise_variance_none=float(s2_none[0]),
+        log_likelihood_none=float(none[0]),
+    )
+
+
+def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:
+    """log of the likelihood averaged over the prior of `grid_weights`."""
+    n = grid.log_likelihood.size
+    top = max(float(grid.log_likelihood.max()), grid.log_likelihood_none)
+    mean = (1 - prior_no_remainder) * float(np.sum(np.exp(grid.log_likelihood - top))) / n
+    return top + float(np.log(mean + prior_no_remainder * np.exp(grid.log_likelihood_none - top)))
+
+
+def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray, float]:
+    """Posterior weights (K,A) of the grid points and of alpha = 0; the prior is flat over the grid."""
+    n = grid.log_likelihood.size
+    log_grid = grid.log_likelihood + np.log((1 - prior_no_remainder) / n)
+    log_none = grid.log_likelihood_none + (np.log(prior_no_remainder) if prior_no_remainder > 0 else -np.inf)
+    top = max(float(log_grid.max()), log_none)
+    weights, none = np.exp(log_grid - top), float(np.exp(log_none - top))
+    total = float(weights.sum()) + none
+    return weights / total, none / total
+
+
+def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: float) -> KernelPosterior:
+    """Mean and covariance of eta given the data, averaged over the grid (the spread of the means included).
+
+    For one pair: m = Ct R22^T M^-1 z = alpha B V diag(d / (1 + alpha d^2)) U^T z and
+    s2 V = s2 alpha B V diag(1 / (1 + alpha d^2)) V^T B^T.
+    """
+    length = grid.spectra[0].length
+    mean, covariance = np.zeros(length), np.zeros((length, length))
+    means: list[tuple[RealArray, RealArray]] = []
+    for spectrum, alpha, s2, weight in zip(
+        grid.spectra, grid.alpha, grid.noise_variance, weights, strict=True
+    ):
+        # Grid points that together weigh less than a millionth are not worth their arithmetic.
+        kept = weight > 1e-6 / weights.size
+        if not np.any(kept):
+            continue
+        a, w = alpha[kept, None], weight[kept]
+        gain = 1.0 + a * spectrum.singular**2
+        n = spectrum.singular.size
+        of_point = np.zeros((w.size, length))
+        of_point[:, :n] = (a * spectrum.singular / gain * spectrum.projected) @ spectrum.axes.T
+        means.append((w, of_point))
+        mean += w @ of_point
+        covariance[:n, :n] += (spectrum.axes * ((w * s2[kept]) @ (a / gain))) @ spectrum.axes.T
+    if means:
+        apart = np.concatenate([np.sqrt(w)[:, None] * (of_point - mean) for w, of_point in means])
+        covariance += apart.T @ apart
+    covariance += weight_none * np.outer(mean, mean)
+    noise = weight_none * grid.noise_variance_none + float(np.sum(weights * grid.noise_variance))
+    best = np.unravel_index(int(np.argmax(weights)), weights.shape)
+    return KernelPosterior(
+        kernel_mean=mean,
+        kernel_factor=symmetric_factor(covariance),
+        noise_variance=noise,
+        alpha=float(grid.alpha[best]) if np.any(weights) else 0.0,
+        lam=grid.spectra[best[0]].lam,
+        probability_no_remainder=weight_none,
+        log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
+    )
+
+
+def prior_posterior(grid: KernelGrid) -> KernelPosterior:
+    """The classical recipe: alpha, lam of largest restricted likelihood, eta left at its prior."""
+    best = np.unravel_index(int(np.argmax(grid.log_likelihood)), grid.log_likelihood.shape)
+    spectrum = grid.spectra[best[0]]
+    s2, alpha = float(grid.noise_variance[best]), float(grid.alpha[best])
+    factor = np.zeros((spectrum.length, spectrum.singular.size))
+    factor[: spectrum.singular.size] = np.sqrt(s2 * alpha) * spectrum.axes  # B V (B V)^T = B B^T
+    return KernelPosterior(
+        kernel_mean=np.zeros(spectrum.length),
+        kernel_factor=factor,
+        noise_variance=s2,
+        alpha=alpha,
+        lam=spectrum.lam,
+        probability_no_remainder=0.0,
+        log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
+    )
+
+
+def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tuple[RealArray, RealArray]:
+    """Mean (P+L,) and covariance factor (P+L, P') of (theta, eta), P counting the columns left out too."""
+    p, length = reduced.n_regressors, posterior.kernel_mean.size
+    scale = np.linalg.norm(reduced.r11, axis=0)
+    right_hand = np.column_stack(
+        [
+            reduced.r1 - reduced.r12 @ posterior.kernel_mean,
+            np.sqrt(posterior.noise_variance) * np.eye(p),
+            -reduced.r12 @ posterior.kernel_factor,
+        ]
+    )
+    solved = solve_triangular(reduced.r11 / scale, right_hand, check_finite=False) / scale[:, None]
+    mean = np.zeros(reduced.n_columns + length)
+    factor = np.zeros((mean.size, p + posterior.kernel_factor.shape[1]))
+    mean[reduced.kept], factor[reduced.kept] = solved[:, 0], solved[:, 1:]
+    mean[reduced.n_columns :], factor[reduced.n_columns :, p:] = (
+        posterior.kernel_mean,
+        posterior.kernel_factor,
+    )
+    return mean, factor
+
+
+def symmetric_factor(covariance: RealArray) -> RealArray:
+    """Factor S (L,L') with S S^T = covariance, directions below rounding left out."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    kept = values > values[-1] * 1e-15 if values[-1] > 0 else np.zeros(values.size, dtype=np.bool_)
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))

@@ -1,0 +1,122 @@
+"""Records as rows of the embedding's regression: nuisance, regressors, kernel, output, all whitened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import toeplitz
+from scipy.signal import lfilter
+
+from ident.basis.functions import all_pass_signal, free_response, regressor
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure, filter_input
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.uncertainty.autoregression import first_rows, whitened
+from ident.uncertainty.embedding_algebra import RegressionBlock
+from ident.uncertainty.undetected_mode import PairBlock
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """One record: nuisance (T,n), regressors F (T,p), output y (T,), all whitened.
+
+    input (T,) is the input after integrators, delay and A(q); head (n,) its first samples before A(q), and
+    first (n,n) the matrix that whitens those rows: zero where they are dropped, and so are they.
+    """
+
+    nuisance: RealArray
+    regressors: RealArray
+    output: RealArray
+    input: RealArray
+    head: RealArray
+    first: RealArray
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddingRows:
+    """How to make the matrices; made anew for each pass, so that only one record's are in memory.
+
+    poles are those of the regressors (doubled for the tangent method), fir_length that of the kernel,
+    whitening the coefficients of A(q), [1] for white noise.
+    """
+
+    records: tuple[Record, ...]
+    structure: Structure
+    poles: Poles
+    fir_length: int
+    whitening: RealArray
+
+    def with_whitening(self, whitening: RealArray) -> EmbeddingRows:
+        """The same with another noise filter."""
+        return replace(self, whitening=whitening)
+
+    def with_pair(self, pair: complex) -> EmbeddingRows:
+        """The same with one more pair, twice: its first-order movement is in the regressors too."""
+        poles = Poles(self.poles.real, np.concatenate([self.poles.pairs, [pair, pair]]))
+        return replace(self, poles=poles)
+
+    def __iter__(self) -> Iterator[Rows]:
+        for record in self.records:
+            yield self._rows(record)
+
+    def blocks(self) -> Iterator[RegressionBlock]:
+        """Rows with kernel columns; those that are dropped are left out, for they count as data here."""
+        for rows in self:
+            kernel = _shifted(rows.input, self.fir_length)
+            n = len(rows.first)
+            if n:
+                kernel[:n] = rows.first @ _shifted(rows.head, self.fir_length)
+            used = slice(0 if np.any(rows.first) else n, None)
+            yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel[used], rows.output[used])
+
+    def pair_blocks(self) -> Iterator[PairBlock]:
+        """Rows with the signal that drives one more pair after all the poles."""
+        for rows in self:
+            yield PairBlock(
+                nuisance=rows.nuisance,
+                regressors=rows.regressors,
+                output=rows.output,
+                signal=all_pass_signal(self.poles, rows.input),
+                head=all_pass_signal(self.poles, rows.head),
+                first=rows.first,
+            )
+
+    def _rows(self, record: Record) -> Rows:
+        """Matrices of one record, every column whitened.
+
+        Columns driven by the input from rest commute with A(q), so for them the input is filtered; only the
+        nuisance columns and the first rows, which A(q) does not whiten, are made from plain signals.
+        """
+        structure, whitening = self.structure, self.whitening
+        n_samples, first = record.n_samples, first_rows(whitening)
+        plain = filter_input(record.input[:, 0], structure.integrators, structure.input_delay_samples)
+        head = plain[: len(first)]
+        u = plain if whitening.size == 1 else np.asarray(lfilter(whitening, np.ones(1), plain))
+        regressors = self._driven(u)
+        if first.size:
+            regressors[: len(first)] = first @ self._driven(head)
+        ramp = np.linspace(-1.0, 1.0, n_samples)
+        nuisance = [ramp[:, None] ** degree for degree in range(structure.n_polynomials)]
+        if structure.estimate_initial_state:
+            nuisance.append(free_response(self.poles, n_samples))
+        known = np.hstack(nuisance) if nuisance else np.zeros((n_samples, 0))
+        return Rows(
+            nuisance=whitened(known, whitening),
+            regressors=regressors,
+            output=whitened(record.output[:, 0], whitening),
+            input=u,
+            head=head,
+            first=first,
+        )
+
+    def _driven(self, u: RealArray) -> RealArray:
+        columns = regressor(self.poles, u)
+        return np.column_stack([columns, u]) if self.structure.feedthrough else columns
+
+
+def _shifted(u: RealArray, length: int) -> RealArray:
+    """(T, length): the input one, two, ... samples ago, zero before the record."""
+    return np.asarray(toeplitz(np.concatenate([np.zeros(1), u[:-1]]), np.zeros(length)), dtype=np.float64)

@@ -1,0 +1,108 @@
+"""Posterior of a response fitted to a measured frequency response: the tangent embedding of design 4.5.
+
+The rows are whitened frequencies instead of samples; the rest is the same: every searched pole twice, a short
+kernel (or none, by restricted likelihood) for what the poles leave, everything conditioned on the data.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.basis.poles import Poles
+from ident.basis.posterior import EmbeddingReport, ResponsePosterior
+from ident.fit.frf_regression import FrfRegression
+from ident.uncertainty.embedding import EmbeddingOptions
+from ident.uncertainty.embedding_algebra import (
+    RegressionBlock,
+    conditional_posterior,
+    evaluate_grid,
+    grid_weights,
+    joint_factor,
+    kernel_spectrum,
+    reduce_regression,
+    tc_factor,
+)
+
+# Kernel of 60 taps, as far as the frequencies can carry it.
+_DEFAULT_FIR_LENGTH = 60
+
+
+def embed_response(
+    data: FrfRegression,
+    poles: Poles,
+    fixed: Poles,
+    *,
+    integrators: int,
+    input_delay_samples: int,
+    options: EmbeddingOptions | None = None,
+    shared_gain_std: float = 0.0,
+) -> ResponsePosterior:
+    """Posterior around poles chosen from this response; `fixed` (first among `poles`) are not doubled.
+
+    The covariances of the measurement are taken as they are if the rest of the fit is no larger than they
+    explain, and multiplied by the estimated noise variance (in their units, Birge's ratio) if it is: the
+    posterior never claims more than the measurement. shared_gain_std is the relative standard deviation of a
+    real factor common to all frequencies; the fit is proportional to the measurement, so it adds exactly one
+    direction, that of the mean itself. Raises ValueError if the frequencies do not outnumber the unknowns, or
+    shared_gain_std is negative.
+    """
+    if not 0 <= shared_gain_std < np.inf:
+        raise ValueError(f"shared_gain_std must not be negative; got {shared_gain_std}")
+    options = options or EmbeddingOptions()
+    basis = _free_doubled(poles, fixed)
+    regressors = data.columns(basis)
+    spare = data.n_rows - regressors.shape[1]
+    length = options.fir_length or max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
+    taps = data.common[:, np.newaxis] * data.z[:, np.newaxis] ** -np.arange(1.0, length + 1)
+    measured = data.weight.ravel() > 0
+    reduced = reduce_regression(
+        [
+            RegressionBlock(
+                nuisance=np.zeros((data.n_rows, 0)),
+                regressors=regressors[measured],
+                kernel=data.whiten(taps)[measured],
+                output=data.y[measured],
+            )
+        ]
+    )
+    decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
+    spectra = [
+        kernel_spectrum(reduced, lam, tc_factor(lam, length)) for lam in np.exp(-1 / decay_samples).tolist()
+    ]
+    grid = evaluate_grid(reduced, spectra, np.geomspace(1e-2, 1e10, 49))
+    weights, none = grid_weights(grid, options.prior_no_remainder)
+    if options.hyperparameters == "maximum":
+        none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
+        weights = np.zeros_like(weights)
+        weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
+    kernel = conditional_posterior(grid, weights, none)
+    mean, factor = joint_factor(reduced, kernel)
+    widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
+    return ResponsePosterior(
+        poles=basis,
+        mean=mean,
+        covariance_factor=np.column_stack([widening * factor, shared_gain_std * mean]),
+        dt_s=data.dt_s,
+        fir_length=length,
+        has_feedthrough=data.feedthrough,
+        integrators=integrators,
+        input_delay_samples=input_delay_samples,
+        report=EmbeddingReport(
+            method="tangent embedding of a measured response",
+            noise_std=float(np.sqrt(kernel.noise_variance)),
+            alpha=kernel.alpha,
+            lam=kernel.lam,
+            probability_no_remainder=kernel.probability_no_remainder,
+            log_evidence=kernel.log_evidence,
+            n_rows=reduced.n_rows,
+            n_regressors=reduced.n_regressors,
+        ),
+    )
+
+
+def _free_doubled(poles: Poles, fixed: Poles) -> Poles:
+    """Every pole twice but the known ones, which nobody moved."""
+    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
+    return Poles(
+        np.concatenate([fixed.real, np.repeat(real, 2)]), np.concatenate([fixed.pairs, np.repeat(pairs, 2)])
+    )

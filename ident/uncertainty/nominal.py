@@ -1,0 +1,65 @@
+"""A low-order nominal model placed where the posterior is, not only where a least-squares fit left it."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ident.basis.functions import basis_response
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.data.ellipses import standard_axes
+
+# An ellipse thinner than this part of the response would let one frequency overrule all the others.
+_THINNEST = 1e-4
+
+
+def nominal_near(
+    posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike, *, feedthrough: bool | None = None
+) -> GobfModel:
+    """GOBF model on given poles whose response stays closest to the posterior mean, in units of its ellipses.
+
+    Coefficients (and the direct term; none given: as the posterior has one) minimise the sum over omega (F,)
+    of e^T P^-1 e, e the error of (Re, Im) and P the posterior covariance. Integrators and delay are the
+    posterior's. Take the posterior's own poles for the closest model, half of them for a low order; then
+    `posterior.at(omega).normalised_distance(...)` tells how far the nominal is off, and `offset_disc` what to
+    add. Raises ValueError when omega has too few frequencies for the coefficients.
+    """
+    uncertainty = posterior.at(omega_rad_s)
+    direct = posterior.has_feedthrough if feedthrough is None else feedthrough
+    omega = uncertainty.omega_rad_s
+    n_coefficients = poles.order + int(direct)
+    if 2 * omega.size < n_coefficients:
+        raise ValueError(f"{omega.size} frequencies do not determine {n_coefficients} coefficients")
+    columns = basis_response(poles, np.exp(1j * omega * posterior.dt_s))
+    if direct:
+        columns = np.column_stack([columns, np.ones(omega.size)])
+    common = ResponsePosterior(  # the integrators and the delay alone: one direct term of 1 and no poles
+        Poles(),
+        np.ones(1),
+        np.zeros((1, 1)),
+        posterior.dt_s,
+        has_feedthrough=True,
+        integrators=posterior.integrators,
+        input_delay_samples=posterior.input_delay_samples,
+    ).centre(omega)
+    s1, s2, u1 = standard_axes(uncertainty.covariance)
+    floor = _THINNEST * np.abs(uncertainty.centre)
+    aligned = (common * u1.conj())[:, None] * columns
+    target = uncertainty.centre * u1.conj()
+    along, across = 1 / np.hypot(s1, floor), 1 / np.hypot(s2, floor)
+    rows = np.vstack([along[:, None] * aligned.real, across[:, None] * aligned.imag])
+    solution, *_ = np.linalg.lstsq(
+        rows, np.concatenate([along * target.real, across * target.imag]), rcond=None
+    )
+    return GobfModel(
+        poles=poles,
+        coefficients=solution[: poles.order],
+        dt_s=posterior.dt_s,
+        feedthrough=float(solution[-1]) if direct else 0.0,
+        integrators=posterior.integrators,
+        input_delay_samples=posterior.input_delay_samples,
+        input_name=posterior.input_name,
+        output_name=posterior.output_name,
+    )

@@ -1,0 +1,107 @@
+"""How sure are frequency and damping? Intervals of the poles from the posterior of the response.
+
+The tangent posterior has every pole p twice, so near p its response is q/(z - p)^2 + r/(z - p) + analytic, q
+and r linear in the coefficients. To first order that is the simple pole moved to p + q/r: r/(z - p - d) =
+r/(z - p) + r d/(z - p)^2 + ... So the covariance of the coefficients gives that of the poles, with all that
+went into it: offset and initial state, coloured noise, dynamics left over. Delay and integrators multiply
+the response by a function without pole or zero at p, which changes nothing to first order.
+
+Intervals are symmetric in the logarithms of frequency, damping and decay, whose distributions are nearer to
+Gaussian than those of the numbers themselves, and which cannot come out negative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from ident.basis.functions import basis_response
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import ComplexArray, RealArray, readonly_real
+
+# Points of the circle on which the two coefficients are read off; 16 determine a Laurent series to rounding
+# when the next pole is three radii away (1/3^15 = 7e-8 of it is left, far below any interval).
+_POINTS = 16
+_SHARE_OF_DISTANCE = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class PoleIntervals:
+    """Ends (low, high) of confidence intervals, in the order of the poles.
+
+    omega_rad_s (P,2), zeta (P,2) of the pairs, decay_per_s (R,2) of the real poles; each holds the truth with
+    probability `level`, taken alone. (0, inf) where the records do not tell, NaN for a real pole a <= 0.
+    """
+
+    level: float
+    omega_rad_s: RealArray
+    zeta: RealArray
+    decay_per_s: RealArray
+
+    def __post_init__(self) -> None:
+        for name in ("omega_rad_s", "zeta", "decay_per_s"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+
+
+def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.95) -> PoleIntervals:
+    """Intervals around the poles of a model, from the tangent posterior made with them.
+
+    The posterior may have further poles. Raises ValueError unless it has each of these twice, and
+    0 < level < 1.
+    """
+    everything = posterior.poles.values
+    if any(np.count_nonzero(everything == pole) < 2 for pole in (*poles.real, *poles.pairs)):
+        raise ValueError("the posterior does not hold every one of these poles twice (method 'tangent')")
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1; got {level}")
+    width = float(norm.ppf(0.5 + level / 2))
+    omega, zeta = poles.omega_rad_s(posterior.dt_s), poles.zeta()
+    ends_omega, ends_zeta = np.empty((omega.size, 2)), np.empty((omega.size, 2))
+    for i, pole in enumerate(poles.pairs):
+        # d log p = d p / p; omega = |log p|, and d log(omega) = Re(d log p / log p).
+        slope = _pole_rows(posterior, pole, everything) / (pole * np.log(pole))
+        by_omega = slope.real
+        # zeta = -Re(log p)/|log p|: with log p = -zeta w + j w sqrt(1 - zeta^2),
+        # d zeta = Im(d log p / log p) sqrt(1 - zeta^2).
+        by_zeta = slope.imag * np.sqrt(1 - zeta[i] ** 2) / zeta[i]
+        ends_omega[i] = _interval(float(omega[i]), float(np.linalg.norm(by_omega)), width)
+        ends_zeta[i] = _interval(float(zeta[i]), float(np.linalg.norm(by_zeta)), width)
+    ends_decay = np.full((poles.real.size, 2), np.nan)
+    for i, a in enumerate(poles.real):
+        if a > 0:
+            decay = -float(np.log(a))
+            by_decay = _pole_rows(posterior, complex(a), everything).real / (a * decay)
+            ends_decay[i] = _interval(decay / posterior.dt_s, float(np.linalg.norm(by_decay)), width)
+    return PoleIntervals(level, ends_omega, np.minimum(ends_zeta, 1.0), ends_decay)
+
+
+def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexArray) -> ComplexArray:
+    """Deviation of the pole as a complex row (P',) on the columns of the covariance factor."""
+    away = np.abs(everything - pole)
+    others = away[away > 0]
+    # A pole that the basis has more often than twice has no displacement of its own.
+    if np.count_nonzero(away == 0) > 2:
+        return np.full(posterior.covariance_factor.shape[1], np.inf + 0j)
+    radius = _SHARE_OF_DISTANCE * float(others.min(initial=1.0))
+    turn = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
+    rows = basis_response(posterior.poles, pole + radius * turn)
+    simple = np.mean(rows * (radius * turn)[:, None], axis=0)
+    double = np.mean(rows * ((radius * turn) ** 2)[:, None], axis=0)
+    n = posterior.poles.order
+    mean, factor = posterior.mean[:n], posterior.covariance_factor[:n]
+    r, q = simple @ mean, double @ mean
+    if abs(r) == 0:
+        return np.full(factor.shape[1], np.inf + 0j)
+    # Derivative of q/r; q itself is zero at the optimum, up to what the kernel took over.
+    return np.asarray((double @ factor) / r - (simple @ factor) * q / r**2)
+
+
+def _interval(value: float, deviation: float, width: float) -> tuple[float, float]:
+    """value times exp(-+ width deviation); a deviation beyond a factor 20 is no knowledge at all."""
+    if not width * deviation < np.log(20):
+        return 0.0, float("inf")
+    factor = float(np.exp(width * deviation))
+    return value / factor, value * factor

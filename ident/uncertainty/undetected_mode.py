@@ -1,0 +1,413 @@
+"""One flexible mode that the pole search may have missed, averaged over (design 4.5).
+
+A mode whose signal stays below the price of an order criterion is left out of the model, and ellipses that
+do not know of it miss the truth around it. Here every pair of a grid over frequency and damping is a
+hypothesis "the poles, and this pair": its two amplitudes get a Gaussian prior, their scale a grid, so that
+every hypothesis has a restricted likelihood comparable with those of the kernel. The pairs stand after the
+all-pass of the model's poles, orthogonal to everything those can express: the prior then says nothing
+about the model's own coefficients, and a pair next to a pole of the model is as well conditioned as any
+other.
+
+Neglected: two missed modes at once, a missed mode together with a kernel, the missed mode's own initial
+state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_triangular
+
+from ident.basis.functions import basis_response, block_parameters
+from ident.basis.poles import Poles
+from ident.data.arrays import ComplexArray, RealArray, kernel_array, readonly_complex, readonly_real
+from ident.uncertainty.embedding_algebra import (
+    KernelPosterior,
+    ReducedRegression,
+    nuisance_basis,
+    symmetric_factor,
+)
+
+# Damping ratios of lightly damped structures; a true one half way (in ratio) between two of them or at 0.005
+# loses less than a tenth of its energy.
+_ZETA = (0.01, 0.03)
+# A candidate's own decay over the record, in time constants, is at least this.
+_DECAY = 2.0
+_FEWEST_PERIODS = 6.0
+# Highest frequency, rad/sample.
+_HIGHEST = 0.9 * np.pi
+# Neighbours in frequency are this many half bandwidths apart: a mode half way loses a tenth of its energy.
+_SPACING = 1.5
+# Prior of the missed mode's expected energy in the output, in noise variances: log-uniform from invisible to
+# what the order selection would have kept (4 ln nu, design 4.3), one tenth of the probability beyond, for
+# models whose order was not chosen from the data.
+_VISIBLE_SHARE = 0.1
+_LARGEST_ENERGY = 1e6
+# A missed mode around a frequency is averaged over from this probability on (the level of the confidence
+# regions that it could belong to); of the pairs that stand for it at most so many are kept.
+_LEAST_PROBABILITY = 0.05
+_NEGLIGIBLE = 1e-4
+_MOST_PAIRS = 12
+# Samples that are held at a time: a few megabytes, whatever the length of the records.
+_BLOCK = 512
+# Shares of a pair's columns (in energy) that are rounding, and that make it a hypothesis of its own.
+_ROUNDING = 1e-9
+_DISTINGUISHABLE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PairBlock:
+    """Rows of one record: nuisance (T,n), regressors F (T,p), output y (T,), all whitened.
+
+    signal (T,) is the whitened input after the all-pass of F's poles; the first n rows are those of the plain
+    signal, head (n,), times first (n,n), which is zero where the first rows are dropped.
+    """
+
+    nuisance: RealArray
+    regressors: RealArray
+    output: RealArray
+    signal: RealArray
+    head: RealArray
+    first: RealArray
+
+
+@dataclass(frozen=True, eq=False)
+class CandidatePairs:
+    """Poles (J,) of the upper half plane and prior weights (J,) that sum to 1."""
+
+    poles: ComplexArray
+    prior: RealArray
+
+
+@dataclass(frozen=True, eq=False)
+class PairStatistics:
+    """What the data say on each pair, nuisance and F projected out.
+
+    gram (J,2,2) = X^T X, projection (J,2) = X^T y, onto_regressors (J,p,2) = Q1^T X with Q1 the orthonormal
+    columns of F (F = Q1 R11); residual = |y|^2 with the same projections; size (J,) is the trace of X^T X
+    before them.
+    """
+
+    gram: RealArray
+    projection: RealArray
+    onto_regressors: RealArray
+    residual: float
+    size: RealArray
+
+    def axes(self) -> tuple[RealArray, RealArray, RealArray]:
+        """Eigenvalues (J,2), ascending, and eigenvectors of the gram matrices; projections (J,2) on them.
+
+        What is left of a column at the level of rounding says nothing: its projection is zero.
+        """
+        values, vectors = np.linalg.eigh(self.gram)
+        along = np.einsum("jki,jk->ji", vectors, self.projection)
+        floor = _ROUNDING * self.size[:, None]
+        return np.maximum(values, floor), vectors, np.where(values > floor, along, 0.0)
+
+    def distinguishable(self) -> npt.NDArray[np.bool_]:
+        """(J,) whether these records can tell the pair from the poles and the nuisance at all."""
+        return np.asarray(self.gram[:, 0, 0] + self.gram[:, 1, 1] > _DISTINGUISHABLE * self.size)
+
+
+@dataclass(frozen=True, eq=False)
+class PairEvidence:
+    """log likelihood (J,A) over pairs and scales, on the scale of `embedding_algebra`.
+
+    energy (A,) are the expected energies of the scales, in noise variances, and prior (A,) their weights;
+    mean (J,A,2), covariance (J,A,2,2) of the amplitudes and noise_variance (J,A) for each.
+    """
+
+    log_likelihood: RealArray
+    energy: RealArray
+    prior: RealArray
+    mean: RealArray
+    covariance: RealArray
+    noise_variance: RealArray
+
+
+@lru_cache(maxsize=16)
+def candidate_pairs(n_samples: int) -> CandidatePairs:
+    """Grid of lightly damped pairs, from six periods in the record to nine tenths of the Nyquist frequency.
+
+    Free oscillations of a candidate fall to e^-2 within the record, its damping is larger than the grid's
+    where that takes it: a sharper peak could stand between the frequencies that so short a record tells
+    apart, as high as one likes, and no data would contradict it. With fewer periods that damping is no longer
+    light, and what happens there is a matter for real poles.
+    """
+    low, high, rate = 2 * np.pi * _FEWEST_PERIODS / n_samples, _HIGHEST, _DECAY / n_samples
+    poles, prior = [], []
+    for lower, zeta in zip((0.0, *_ZETA[:-1]), _ZETA, strict=True):
+        group = []
+        omega = low if lower == 0 else max(low, rate / zeta)
+        while omega <= high:
+            damping = max(zeta, rate / omega)
+            group.append(np.exp(omega * (-damping + 1j * np.sqrt(1 - damping**2))))
+            omega *= 1 + _SPACING * damping
+        poles += group
+        prior += [1 / len(group)] * len(group)
+    return CandidatePairs(readonly_complex(poles), readonly_real(np.array(prior) / np.sum(prior)))
+
+
+def pair_statistics(
+    blocks: Iterable[PairBlock], reduced: ReducedRegression, poles: ComplexArray
+) -> PairStatistics:
+    """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs."""
+    q = reduced.n_regressors
+    gram = np.zeros((3, poles.size))
+    inner, size = np.zeros((2 * poles.size, q + 1)), np.zeros(poles.size)
+    parameters = block_parameters(Poles(np.zeros(0), poles))
+    scale = np.linalg.norm(reduced.r11, axis=0)
+    for block in blocks:
+        basis = nuisance_basis(block.nuisance)
+        regressors = block.regressors[:, reduced.kept]
+        for _ in range(2):
+            regressors = regressors - basis @ (basis.T @ regressors)
+        output = block.output - basis @ (basis.T @ block.output)
+        q1 = solve_triangular((reduced.r11 / scale).T, (regressors / scale).T, lower=True).T
+        others = np.ascontiguousarray(np.column_stack([basis, q1, output - q1 @ reduced.r1]))
+        n = basis.shape[1]
+        products = np.zeros((others.shape[1], 2 * poles.size))
+        gram_here, states = np.zeros((3, poles.size)), np.zeros((2, poles.size))
+        for start in range(0, block.signal.size, _BLOCK):
+            part = slice(start, start + _BLOCK)
+            x1, x2 = _pair_rows(parameters, kernel_array(block.signal[part]), states)
+            if start == 0 and block.head.size:
+                plain = _pair_rows(parameters, kernel_array(block.head), np.zeros((2, poles.size)))
+                x1[: block.head.size], x2[: block.head.size] = (block.first @ x for x in plain)
+            gram_here += _pair_gram(x1, x2)
+            products[:, 0::2] += others[part].T @ x1
+            products[:, 1::2] += others[part].T @ x2
+        size += gram_here[0] + gram_here[2]
+        first, second = products[:n, 0::2], products[:n, 1::2]
+        gram += gram_here - np.stack([np.sum(first**2, 0), np.sum(first * second, 0), np.sum(second**2, 0)])
+        inner += products[n:].T
+    onto = inner[:, :q].reshape(-1, 2, q).transpose(0, 2, 1)
+    matrices = gram[[0, 1, 1, 2]].T.reshape(-1, 2, 2) - onto.transpose(0, 2, 1) @ onto
+    residual = reduced.rest + float(reduced.z @ reduced.z)
+    return PairStatistics(matrices, inner[:, q].reshape(-1, 2), onto, residual, size)
+
+
+@numba.njit(cache=True, fastmath=True)
+def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
+    """The two basis functions of every pair alone, driven by the signal (T,): two arrays (T,J).
+
+    states (2,J) is where the pairs start, and afterwards where they stand. All pairs advance together, sample
+    by sample: neighbours in memory, which the processor takes four or eight at a time.
+    """
+    n_pairs = parameters.shape[0]
+    gb, gs = parameters[:, 0] * parameters[:, 1], parameters[:, 0] * parameters[:, 3]
+    beta, sg, sb = parameters[:, 1].copy(), parameters[:, 2].copy(), parameters[:, 3].copy()
+    out1, out2 = np.empty((signal.size, n_pairs)), np.empty((signal.size, n_pairs))
+    a, b = states[0], states[1]
+    for k in range(signal.size):
+        v = signal[k]
+        row1, row2 = out1[k], out2[k]
+        for i in range(n_pairs):
+            p, q = a[i], b[i]
+            row1[i] = p
+            row2[i] = q
+            a[i] = gb[i] * p - gs[i] * q + sg[i] * v
+            b[i] = sb[i] * p + beta[i] * q
+    return out1, out2
+
+
+@numba.njit(cache=True, fastmath=True)
+def _pair_gram(x1: Any, x2: Any) -> Any:
+    """Entries (0,0), (0,1), (1,1) of X^T X for every pair; (3, J)."""
+    out = np.zeros((3, x1.shape[1]))
+    aa, ab, bb = out[0], out[1], out[2]
+    for k in range(x1.shape[0]):
+        p, q = x1[k], x2[k]
+        for i in range(p.size):
+            aa[i] += p[i] * p[i]
+            ab[i] += p[i] * q[i]
+            bb[i] += q[i] * q[i]
+    return out
+
+
+def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEvidence:
+    """Restricted likelihood and posterior of a ~ N(0, s2 kappa I) for every pair and scale kappa.
+
+    -2 log L = nu log s2 + log det(I + kappa G) + nu with s2 = (|y|^2 - b^T (G + I / kappa)^-1 b) / nu, which
+    is the expression for the kernel with X in the place of Psi; kappa = energy / largest eigenvalue of G.
+    """
+    nu = degrees_of_freedom
+    edge = 4 * np.log(nu)
+    energy = np.concatenate([np.geomspace(1.0, edge, 6), np.geomspace(4 * edge, _LARGEST_ENERGY, 6)])
+    values, vectors, along = statistics.axes()
+    kappa = energy / values[:, 1:]
+    precision = values[:, None, :] + 1 / kappa[:, :, None]
+    explained = np.sum(along[:, None, :] ** 2 / precision, axis=2)
+    s2 = np.maximum(statistics.residual - explained, np.finfo(np.float64).tiny) / nu
+    log_det = np.sum(np.log1p(kappa[:, :, None] * values[:, None, :]), axis=2)
+    log_likelihood = -0.5 * (nu * np.log(s2) + log_det + nu)
+    return PairEvidence(
+        log_likelihood=np.where(statistics.distinguishable()[:, None], log_likelihood, -np.inf),
+        energy=energy,
+        prior=np.repeat([(1 - _VISIBLE_SHARE) / 6, _VISIBLE_SHARE / 6], 6),
+        mean=np.einsum("jki,jai->jak", vectors, along[:, None, :] / precision),
+        covariance=s2[:, :, None, None] * np.einsum("jki,jai,jli->jakl", vectors, 1 / precision, vectors),
+        noise_variance=s2,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PairMixture:
+    """The pairs worth keeping, as independent hypotheses.
+
+    poles (K,), weight (K,) their posterior probabilities, probability that of all pairs together (those not
+    kept included); mean (K,2), covariance (K,2,2), noise_variance (K,) of each, averaged over the scale; onto
+    (p,2K) = Q1^T X. visible is the likeliest pair if an order selection would have kept it and the kernel
+    does not explain it better, else None.
+    """
+
+    poles: ComplexArray
+    weight: RealArray
+    mean: RealArray
+    covariance: RealArray
+    noise_variance: RealArray
+    onto: RealArray
+    probability: float
+    visible: complex | None
+
+    def most_probable_rad_s(self, dt_s: float) -> float:
+        """Natural frequency of the likeliest pair; 0 when none was kept."""
+        if self.weight.size == 0:
+            return 0.0
+        return float(np.abs(np.log(self.poles[np.argmax(self.weight)])) / dt_s)
+
+
+def pair_mixture(
+    candidates: CandidatePairs,
+    statistics: PairStatistics,
+    degrees_of_freedom: int,
+    log_rest: float,
+    prior_odds: float,
+) -> PairMixture:
+    """Weights of the pairs against everything else.
+
+    log_rest is the log of prior times likelihood summed over all hypotheses without a missed mode, their
+    prior probabilities adding up to 1; prior_odds those of one missed mode against none. The weight of pairs
+    not kept is shared out among all the others.
+    """
+    evidence = pair_evidence(statistics, degrees_of_freedom)
+    logs = evidence.log_likelihood + np.log(prior_odds * candidates.prior[:, None] * evidence.prior)
+    top = max(float(logs.max()), log_rest)
+    joint = np.exp(logs - top)
+    per_pair = joint.sum(axis=1)
+    total = per_pair.sum() + np.exp(log_rest - top)
+    kept = _worth_keeping(candidates.poles, per_pair / total)
+    share = joint[kept] / per_pair[kept, None]
+    mean = np.einsum("ja,jak->jk", share, evidence.mean[kept])
+    apart = evidence.mean[kept] - mean[:, None, :]
+    covariance = np.einsum("ja,jakl->jkl", share, evidence.covariance[kept])
+    covariance += np.einsum("ja,jak,jal->jkl", share, apart, apart)
+    explained = _explained(statistics)
+    best = int(np.argmax(explained))
+    gain = -degrees_of_freedom * np.log1p(-min(float(explained[best]) / statistics.residual, 1 - 1e-15))
+    visible = gain > 4 * np.log(degrees_of_freedom) and per_pair.sum() > 0.5 * total
+    return PairMixture(
+        poles=candidates.poles[kept],
+        weight=per_pair[kept] / (total - per_pair.sum() + per_pair[kept].sum()),
+        mean=mean,
+        covariance=covariance,
+        noise_variance=np.sum(share * evidence.noise_variance[kept], axis=1),
+        onto=np.hstack(
+            [np.zeros((statistics.onto_regressors.shape[1], 0)), *statistics.onto_regressors[kept]]
+        ),
+        probability=float(per_pair.sum() / total),
+        visible=complex(candidates.poles[best]) if visible else None,
+    )
+
+
+def _worth_keeping(poles: ComplexArray, probability: RealArray) -> npt.NDArray[np.intp]:
+    """Indices of the likeliest pairs in neighbourhoods that are probable enough to matter, in grid order.
+
+    Neighbours of a pair resonate within two half bandwidths of it, whatever their damping. Moments of a
+    mixture, unlike its quantiles, feel a hypothesis however improbable it is, by the square of its distance;
+    one that all its neighbours do not make probable is outside every confidence region and left out.
+    """
+    frequency, decay = np.angle(poles), -np.log(np.abs(poles))
+    near = np.abs(frequency[:, None] - frequency) <= 2 * np.maximum(decay[:, None], decay)
+    candidates = np.flatnonzero((near @ probability > _LEAST_PROBABILITY) & (probability > _NEGLIGIBLE))
+    likeliest = candidates[np.argsort(probability[candidates])[::-1][:_MOST_PAIRS]]
+    return np.sort(likeliest)
+
+
+def refined_pair(
+    blocks: Callable[[], Iterable[PairBlock]], reduced: ReducedRegression, pair: complex
+) -> complex:
+    """The pair near this grid point that explains most: frequency and damping on grids that shrink around it.
+
+    Six rounds of 5 x 5 end within a hundredth of a half bandwidth; the tangent columns cover the rest.
+    """
+    rate = np.log(pair)
+    omega, zeta = float(np.abs(rate)), float(-np.real(rate) / np.abs(rate))
+    step_omega, step_zeta = 0.5 * _SPACING * zeta, 0.5 * np.log(_ZETA[1] / _ZETA[0])
+    offsets = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    for _ in range(6):
+        omegas = np.minimum(omega * np.exp(step_omega * offsets), _HIGHEST)
+        zetas = np.clip(zeta * np.exp(step_zeta * offsets), 1e-3, 0.6)
+        w, z = (grid.ravel() for grid in np.meshgrid(omegas, zetas))
+        trial = np.exp(w * (-z + 1j * np.sqrt(1 - z**2)))
+        best = int(np.argmax(_explained(pair_statistics(blocks(), reduced, trial))))
+        omega, zeta, pair = float(w[best]), float(z[best]), complex(trial[best])
+        step_omega, step_zeta = 0.5 * step_omega, 0.5 * step_zeta
+    return pair
+
+
+def _explained(statistics: PairStatistics) -> RealArray:
+    """Drop (J,) of the residual sum of squares by each pair with free amplitudes."""
+    values, _, along = statistics.axes()
+    return np.where(statistics.distinguishable(), np.sum(along**2 / values, axis=1), 0.0)
+
+
+def with_pairs(rest: KernelPosterior, mixture: PairMixture) -> KernelPosterior:
+    """Moments of (eta, a_1 .. a_K), a Gaussian in place of the mixture of `rest` and the pairs.
+
+    Under each hypothesis all the others' amplitudes are zero, so that the covariance between them is minus
+    the product of the weighted means.
+    """
+    length, k = rest.kernel_mean.size, mixture.weight.size
+    weight_rest = 1.0 - float(mixture.weight.sum())
+    mean = np.concatenate([weight_rest * rest.kernel_mean, (mixture.weight[:, None] * mixture.mean).ravel()])
+    second = np.zeros((length + 2 * k, length + 2 * k))
+    second[:length, :length] = weight_rest * (
+        rest.kernel_factor @ rest.kernel_factor.T + np.outer(rest.kernel_mean, rest.kernel_mean)
+    )
+    for i in range(k):
+        here = slice(length + 2 * i, length + 2 * i + 2)
+        second[here, here] = mixture.weight[i] * (
+            mixture.covariance[i] + np.outer(mixture.mean[i], mixture.mean[i])
+        )
+    return replace(
+        rest,
+        kernel_mean=mean,
+        kernel_factor=symmetric_factor(second - np.outer(mean, mean)),
+        noise_variance=weight_rest * rest.noise_variance + float(mixture.weight @ mixture.noise_variance),
+        probability_no_remainder=weight_rest * rest.probability_no_remainder,
+    )
+
+
+def cascade_coordinates(poles: ComplexArray) -> RealArray:
+    """(2K,2K): columns are the two basis functions of every pair alone, in the basis of the pairs in cascade.
+
+    A basis function of pair p is 2 Re(rho / (z - p)), and the inner product of 1 / (z - p) with a basis
+    function L of the cascade is L(1 / p) / p (Cauchy), so that no integral and no equation is solved. Exact:
+    both sets span the same space, and the cascade is orthonormal.
+    """
+    cascade = basis_response(Poles(np.zeros(0), poles), 1 / poles)
+    out = np.empty((2 * poles.size, 2 * poles.size))
+    for i, (p, (_, beta, sg, sb)) in enumerate(
+        zip(poles, block_parameters(Poles(np.zeros(0), poles)), strict=True)
+    ):
+        for column, numerator in ((2 * i, sg * (p - beta)), (2 * i + 1, sg * sb)):
+            rho = numerator / (2j * p.imag)
+            out[:, column] = 2 * np.real(rho * cascade[i] / p)
+    return out

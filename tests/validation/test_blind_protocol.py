@@ -1,0 +1,278 @@
+"""Cases, seal, opening: what a blind run promises; a quick stand-in diagnoses where it may."""
+
+from __future__ import annotations
+
+import json
+import stat
+import subprocess
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+
+from plant.effects import parse_effects
+from plant.rig import Rig
+from plant.simulate import simulate
+from validation.blind.cases import NOT_TOGETHER, SHARES, schedule
+from validation.blind.generate import answer_toml, folder_hash, generate, refuse_filled
+from validation.blind.protocol import diagnose_in_process, run_blind
+from validation.blind.rigs import TOLERANCES, draw_rig, draw_tolerances, rig_toml, stated
+from validation.blind.seal import COMMITMENT, close_seal, open_seal
+from validation.blind.truth import LISTED, UNLISTED
+from workflow.engine.errors import InputError
+from workflow.engine.storage import read_json
+
+LABELS = [{"case": "a", "verdict": "none", "size": 0.1}, {"case": "b", "verdict": "effect", "size": 2.0}]
+
+
+def test_a_seal_opens_to_what_was_put_in(tmp_path):
+    digest = close_seal(tmp_path, LABELS)
+    assert read_json(tmp_path / COMMITMENT)["sha256"] == digest
+    assert open_seal(tmp_path) == LABELS
+    mode = (tmp_path / "seal" / "labels.json").stat().st_mode
+    assert stat.S_IMODE(mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "seal").stat().st_mode) == 0o700
+
+
+def test_equal_labels_have_unequal_hashes(tmp_path):
+    # Without the salt whoever guesses the labels could check the guess against the commitment.
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    assert close_seal(tmp_path / "one", LABELS) != close_seal(tmp_path / "two", LABELS)
+
+
+@pytest.mark.parametrize("what", ["label", "salt", "order", "commitment"])
+def test_tampering_is_noticed(tmp_path, what):
+    close_seal(tmp_path, LABELS)
+    path = tmp_path / "seal" / "labels.json"
+    sealed = json.loads(path.read_text())
+    if what == "label":
+        sealed["labels"][1]["verdict"] = "none"
+    elif what == "salt":
+        sealed["salt"] = "0" * 64
+    elif what == "order":
+        sealed["labels"].reverse()
+    path.write_text(json.dumps(sealed))
+    if what == "commitment":
+        (tmp_path / COMMITMENT).write_text(json.dumps({"sha256": "0" * 64}))
+    with pytest.raises(InputError, match="the seal is broken"):
+        open_seal(tmp_path)
+
+
+def test_a_schedule_has_the_shares_and_every_effect():
+    plan = schedule(200, np.random.default_rng(1))
+    for sort, share in SHARES.items():
+        assert abs(sum(s == sort for s, _, _ in plan) - 200 * share) <= 1
+    assert {name for sort, _, name in plan if sort == "clear"} == set(LISTED)
+    assert {name for sort, _, name in plan if sort == "unlisted"} == set(UNLISTED)
+    assert abs(sum(exact for _, exact, _ in plan) - 100) <= 3
+    assert all({a, b} <= set(LISTED) for a, b in NOT_TOGETHER)
+
+
+def test_a_schedule_of_one_sort_has_nothing_else():
+    plan = schedule(31, np.random.default_rng(1), "none")
+    assert [(sort, name) for sort, _, name in plan] == [("none", "")] * 31
+    assert sum(exact for _, exact, _ in plan) == 16
+    assert {name for _, _, name in schedule(46, np.random.default_rng(1), "clear")} == set(LISTED)
+
+
+def test_rigs_are_arms_and_what_is_stated_is_off_by_tolerances():
+    rng = np.random.default_rng(2)
+    off = []
+    for _ in range(30):
+        rig = draw_rig(rng)
+        assert 0.4 <= rig["link"]["length_m"] <= 1.2
+        tolerances = draw_tolerances(rng)
+        shown = stated(rig, tolerances, rng)
+        read = Rig.model_validate({**tomllib.loads(rig_toml(shown, tolerances))})
+        assert set(read.tolerances) == set(TOLERANCES)
+        for key, t in tolerances.items():
+            section, name = key.split(".")
+            off.append((shown[section][name] / rig[section][name] - 1) / t)
+        assert shown["link"]["length_m"] == rig["link"]["length_m"]
+    assert np.max(np.abs(off)) < 2.01
+    # A normal deviate cut at two has a standard deviation of 0.88; 240 draws, four standard errors.
+    assert abs(np.std(off) - 0.88) < 0.16
+
+
+@pytest.mark.slow
+def test_generated_cases_hold_what_their_answers_say(tmp_path):
+    # Five cases: one of every sort.
+    answers = generate(5, 5, tmp_path / "open", open_cases=True)
+    assert [a["case"] for a in answers] == [f"case_{k:04d}" for k in range(1, 6)]
+    for answer in answers:
+        folder = tmp_path / "open" / answer["case"]
+        assert tomllib.loads((folder / "answer.toml").read_text())["verdict"] == answer["verdict"]
+        assert folder_hash(folder) == answer["sha256"]
+        exact = Rig.from_toml(folder / "rig_exact.toml")
+        if answer["nominal"] == "exact":
+            assert Rig.from_toml(folder / "rig.toml") == exact
+        if answer["sort"] == "faint":
+            # Tuned to a tenth; a parametric one of four tolerances may reach twice the range.
+            assert 0.25 < answer["max_ratio"] < 3.2
+        elif answer["sort"] == "clear":
+            assert answer["max_ratio"] > 2.6
+        if answer["verdict"] == "unknown":
+            continue
+        effects = parse_effects({"name": e["name"], **e["parameters"]} for e in answer["effects"])
+        case = tomllib.loads((folder / "case.toml").read_text())
+        for role in ("estimation", "held_out"):
+            whitened = []
+            for entry in case["experiments"]:
+                if entry["role"] != role:
+                    continue
+                data = np.loadtxt(folder / entry["file"], delimiter=",", skiprows=1)
+                assert data.shape == (entry["samples"], 4)
+                model = simulate(exact, data[:, 1], effects).output
+                whitened.append(((data[:, 2:] - model) / _noise(exact)).ravel())
+            rms = np.sqrt(np.mean(np.concatenate(whitened) ** 2))
+            # The plant, given rig and effect, explains the records as well as the simulator that made them;
+            # where something switches, two correct models may differ by some tenths of the noise.
+            names = {e["name"] for e in answer["effects"]}
+            switching = {"backlash", "quantisation", "coulomb_friction", "stribeck_friction"}
+            slack = 1.25 if names & switching else 1.03
+            assert rms < slack * answer["pooled_gap"][f"{role}_gap_after_oracle"]
+    again = generate(5, 5, tmp_path / "again", finished={a["case"]: a for a in answers[:-1]})
+    assert again == [*answers[:-1], {**answers[-1], "sha256": again[-1]["sha256"]}]
+    with pytest.raises(InputError, match="is not empty"):
+        refuse_filled(tmp_path / "open")
+
+
+def _noise(rig):
+    return np.array([rig.sensors.hub_angle_noise_rad, rig.sensors.tip_noise_m])
+
+
+def test_answers_without_effects_are_toml():
+    answer = {
+        "case": "a",
+        "verdict": "unknown",
+        "severity": "clear",
+        "max_ratio": 3.2,
+        "sort": "unlisted",
+        "nominal": "exact",
+        "effects": [],
+        "unlisted": [{"name": "air_drag", "coefficient_Ns2_m3": 0.2}],
+        "pooled_gap": {"held_out_gap_before": 2.0},
+        "experiments": {"01_prbs_low": {"hub_ratio": 1.0}},
+    }
+    assert tomllib.loads(answer_toml(answer))["unlisted"][0]["name"] == "air_drag"
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    """A run of two cases whose 'diagnosis' says none with p = 0.7."""
+    out = tmp_path_factory.mktemp("blind") / "run"
+    run_blind(2, 8, out, jobs=1, diagnose=_says_none)
+    return out
+
+
+def _says_none(folder, sealed):
+    assert not list(folder.rglob("answer*"))
+    assert sealed not in folder.parents
+    return {
+        "case": folder.name,
+        "verdict": "none",
+        "effects": [{"name": "none", "probability": 0.7}],
+        "gap_after": 1.0,
+        "cpu_s": 1.0,
+        "baselines": {"parameters only": {"case": folder.name, "verdict": "none", "effects": []}},
+    }
+
+
+@pytest.mark.slow
+def test_a_run_leaves_scores_and_a_verified_seal(finished_run):
+    document = json.loads((finished_run / "scores.json").read_text())
+    assert document["diagnosis"]["n_cases"] == 2
+    assert document["commitment"] == read_json(finished_run / COMMITMENT)["sha256"]
+    assert set(document["baselines"]) == {"parameters only"}
+    assert "commitment" in (finished_run / "scores.txt").read_text()
+    assert (finished_run / "confusion.png").is_file()
+    assert set(read_json(finished_run / "predictions.json")) == {"case_0001", "case_0002"}
+
+
+@pytest.mark.slow
+def test_a_finished_run_resumes_without_a_diagnosis_and_only_as_itself(finished_run):
+    def never(folder, sealed):
+        raise AssertionError("everything is there")
+
+    before = (finished_run / "scores.json").read_bytes()
+    run_blind(2, 8, finished_run, resume=True, diagnose=never)
+    assert (finished_run / "scores.json").read_bytes() == before
+    with pytest.raises(InputError, match="begun with seed = 8, not 9"):
+        run_blind(2, 9, finished_run, resume=True, diagnose=never)
+    with pytest.raises(InputError, match="--resume continues it"):
+        run_blind(2, 8, finished_run, diagnose=never)
+
+
+@pytest.mark.slow
+def test_records_exchanged_after_sealing_are_noticed(finished_run):
+    path = finished_run / "cases" / "case_0001" / "rig.toml"
+    before = path.read_bytes()
+    path.write_bytes(before + b"# changed\n")
+    try:
+        with pytest.raises(InputError, match="records of case_0001"):
+            run_blind(2, 8, finished_run, resume=True, diagnose=_says_none)
+    finally:
+        path.write_bytes(before)
+
+
+def test_bad_requests_are_one_line(tmp_path):
+    with pytest.raises(InputError, match="--cases must be at least 1"):
+        run_blind(0, 1, tmp_path / "a")
+    with pytest.raises(InputError, match="--simulator must be one of ritz, exudyn"):
+        run_blind(1, 1, tmp_path / "a", simulator="matlab")
+    with pytest.raises(InputError, match="--only must be one of none, faint, clear, pair, unlisted"):
+        run_blind(1, 1, tmp_path / "a", only="difficult")
+    with pytest.raises(InputError, match="no blind run to resume"):
+        run_blind(1, 1, tmp_path / "a", resume=True)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(InputError, match="is not empty"):
+        run_blind(1, 1, tmp_path / "full")
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_diagnosing_process_cannot_reach_the_labels(tmp_path):
+    close_seal(tmp_path, LABELS)
+    program = (
+        "import sys, pathlib, os\n"
+        "from validation.blind.worker import keep_out\n"
+        "place = pathlib.Path(sys.argv[1])\n"
+        "keep_out(place)\n"
+        "attempts = [lambda: open(place / 'seal' / 'labels.json'), lambda: os.listdir(place / 'seal'),\n"
+        "    lambda: os.open(place / 'seal' / 'labels.json', os.O_RDONLY),\n"
+        "    lambda: os.rename(place / 'seal', '/tmp/never'), lambda: os.system('true'),\n"
+        "    lambda: os.chdir(place), lambda: (place / 'commitment.json').read_text()]\n"
+        "for attempt in attempts:\n"
+        "    try:\n"
+        "        attempt()\n"
+        "    except PermissionError as error:\n"
+        "        print('refused', error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.count("refused") == 7, done.stdout
+
+
+def test_a_process_that_fails_counts_as_a_wrong_answer(tmp_path):
+    folder = tmp_path / "case_0001"
+    folder.mkdir()
+    (folder / "case.toml").write_text("case = 3\n")
+    document = diagnose_in_process(folder, tmp_path / "sealed")
+    assert document["verdict"] == "failed"
+    assert "case.toml" in document["reason"]
+
+
+@pytest.mark.slow
+def test_a_small_run_from_end_to_end(tmp_path):
+    from workflow.cli import main
+
+    assert main(["blind", "--cases", "2", "--seed", "4", "--out", str(tmp_path / "run"), "--jobs", "1"]) == 0
+    document = json.loads((tmp_path / "run" / "scores.json").read_text())
+    assert document["failed"] == {}
+    assert set(document["baselines"]) == {"parameters only", "residual correlation"}
+    for name in ("case_0001", "case_0002"):
+        prediction = read_json(tmp_path / "run" / "predictions" / f"{name}.json")
+        assert sum(e["probability"] for e in prediction["effects"]) == pytest.approx(1.0, abs=1e-9)

@@ -1,0 +1,229 @@
+"""The two simulators of the house agree: the blind protocol's elastica and the plant's linear modes."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import validation.blind
+from plant.effects import EFFECTS, GroundSpring, parse_effects
+from plant.rig import Rig
+from plant.simulate import simulate
+from validation.blind.beam import link_basis
+from validation.blind.truth import LISTED, UNLISTED, Feedback, Truth
+
+RIG = {
+    "link": {
+        "length_m": 0.8,
+        "width_m": 0.02,
+        "thickness_m": 0.003,
+        "density_kg_m3": 2700.0,
+        "youngs_modulus_Pa": 7e10,
+        "kelvin_voigt_s": 0.001,
+    },
+    "hub": {"inertia_kg_m2": 0.02, "radius_m": 0.05, "viscous_friction_Nms": 0.01},
+    "motor": {
+        "torque_constant_Nm_A": 0.025,
+        "back_emf_Vs_rad": 0.025,
+        "resistance_ohm": 2.5,
+        "gear_ratio": 25.0,
+    },
+    "payload": {"mass_kg": 0.01},
+    "sensors": {"hub_angle_noise_rad": 0.001, "tip_noise_m": 0.001},
+    "sampling": {"dt_s": 0.005},
+}
+# Sizes that change these records by 1 to 20 noise deviations.
+EFFECTS_HERE = {
+    "coulomb_friction": {"torque_Nm": 0.02},
+    "stribeck_friction": {
+        "static_torque_Nm": 0.03,
+        "coulomb_torque_Nm": 0.015,
+        "stribeck_velocity_rad_s": 0.08,
+    },
+    "viscous_friction": {"coefficient_Nms": 0.02},
+    "backlash": {"gap_rad": 0.01},
+    "actuator_saturation": {"limit_V": 0.9},
+    "actuator_dead_zone": {"width_V": 0.08},
+    "actuator_lag": {"time_constant_s": 0.008},
+    "input_delay": {"delay_s": 0.0123},
+    "actuator_gain": {"ratio": 1.1},
+    "torque_ripple": {"amplitude_Nm": 0.05, "cycles_per_rev": 12.0, "phase_rad": 0.7},
+    "joint_compliance": {"stiffness_Nm_rad": 60.0, "damping_Nms": 0.08},
+    "tip_payload": {"mass_kg": 0.02},
+    "link_stiffness": {"ratio": 0.9},
+    "structural_damping": {"ratio": 3.0},
+    "hardening_spring": {"cubic_Nm_rad3": 3.0},
+    "gravity": {"acceleration_m_s2": 0.5},
+    "sensor_lag": {"time_constant_s": 0.004},
+    "sensor_gain": {"ratio": 0.95},
+    "sensor_drift": {"rate_m_s": 0.002},
+    "quantisation": {"step_m": 0.004},
+    "periodic_disturbance": {"amplitude_Nm": 0.05, "frequency_Hz": 2.3, "phase_rad": 1.0},
+    "base_compliance": {"stiffness_Nm_rad": 120.0, "damping_Nms": 0.5, "inertia_kg_m2": 0.05},
+    "hub_inertia": {"ratio": 1.2},
+}
+
+
+def _voltage(T: int = 500) -> np.ndarray:
+    bits = np.random.default_rng(11).integers(0, 2, T)
+    return np.where(np.repeat(bits, 5)[:T] == 1, 1.2, -1.2)
+
+
+def _noise_deviations(ours: Truth, effects: list[dict[str, object]], voltage: np.ndarray) -> np.ndarray:
+    record = ours.record(voltage).measured(np.zeros((voltage.size, 2)))
+    plant = simulate(Rig.model_validate(RIG), voltage, parse_effects(effects)).output
+    return np.sqrt(np.mean(((record - plant) / ours.noise) ** 2, axis=0))
+
+
+def test_effects_of_the_list_are_all_there():
+    assert set(LISTED) == set(EFFECTS) == set(EFFECTS_HERE)
+    assert not set(LISTED) & set(UNLISTED)
+
+
+def test_the_truth_shares_no_code_with_plant():
+    folder = Path(validation.blind.__file__).parent
+    for name in ("truth.py", "kernel.py", "beam.py", "inputs.py", "rigs.py", "sizes.py", "cases.py"):
+        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
+            module = getattr(node, "module", "") or ""
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [module]
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                assert not any(entry.split(".")[0] in ("plant", "diagnosis") for entry in names), name
+
+
+def test_clamped_frequencies_are_those_of_the_uniform_beam():
+    # cos b cosh b = -1: Euler-Bernoulli, no tip mass. The fourth mode of ten polynomials is good to 2e-5.
+    omega = np.sqrt(link_basis(0.8, 3.0, 0.16, 0.0, 4).stiffness)
+    exact = np.array([1.8751041, 4.6940911, 7.8547574, 10.9955407]) ** 2 * np.sqrt(3.0 / 0.16) / 0.64
+    np.testing.assert_allclose(omega, exact, rtol=3e-5)
+
+
+@pytest.mark.parametrize("name", [n for n in LISTED if n not in ("backlash", "quantisation")])
+def test_every_effect_agrees_with_the_plants_to_a_small_part_of_the_noise(name):
+    effects = [{"name": name, **EFFECTS_HERE[name]}]
+    # Measured: at most 0.02 (what large deflections add to the linear model is most of it).
+    assert np.all(_noise_deviations(Truth(RIG, effects), effects, _voltage()) < 0.05)
+
+
+def test_a_spring_to_ground_agrees_with_the_plants():
+    # Beyond the list, but the diagnosis has to know it: gravity looks like it.
+    voltage = _voltage()
+    ours = Truth(RIG, [{"name": "ground_spring", "stiffness_Nm_rad": 0.5}])
+    record = ours.record(voltage).measured(np.zeros((voltage.size, 2)))
+    rig = Rig.model_validate(RIG)
+    plant = simulate(rig, voltage, [GroundSpring(stiffness_Nm_rad=0.5)]).output
+    nothing = simulate(rig, voltage).output
+    assert np.all(np.std(record - nothing, axis=0) > 5 * ours.noise)
+    assert np.all(np.sqrt(np.mean((record - plant) ** 2, axis=0)) < 0.05 * ours.noise)
+
+
+def test_no_effect_agrees_with_the_plant():
+    assert np.all(_noise_deviations(Truth(RIG), [], _voltage()) < 0.05)
+
+
+def test_quantisation_agrees_but_for_values_at_an_edge():
+    effects = [{"name": "quantisation", **EFFECTS_HERE["quantisation"]}]
+    ours = Truth(RIG, effects).record(_voltage()).measured(np.zeros((500, 2)))[:, 1]
+    plant = simulate(Rig.model_validate(RIG), _voltage(), parse_effects(effects)).tip_m
+    assert np.mean(np.abs(ours - plant) > 1e-9) < 0.02
+
+
+@pytest.mark.parametrize(
+    "further", [[], [{"name": "hardening_spring", "cubic_Nm_rad3": 20.0}]], ids=["alone", "spring"]
+)
+def test_backlash_agrees_while_the_sequence_of_contacts_is_the_same(further):
+    # Contact sequences are sensitive (0.2 noise deviations between correct solvers): a single pulse is not.
+    voltage = np.zeros(300)
+    voltage[5:60] = 1.0
+    effects = [{"name": "backlash", "gap_rad": 0.01}, *further]
+    assert np.all(_noise_deviations(Truth(RIG, effects), effects, voltage) < 0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("air_drag", {"coefficient_Ns2_m3": 0.2}),
+        ("cogging", {"relative_amplitude": 0.2, "cycles_per_rev": 12.0, "phase_rad": 0.3}),
+        ("ground_spring", {"stiffness_Nm_rad": 0.1}),
+        ("inductance", {"inductance_H": 0.02, "current_limit_A": 0.4}),
+        ("asymmetric_friction", {"torque_positive_Nm": 0.03, "torque_negative_Nm": 0.01}),
+        ("amplifier_cubic", {"cubic_1_V2": 0.1}),
+        ("sensor_clipping", {"limit_m": 0.03}),
+        ("winding_heat", {"rate_1_s": 0.1}),
+        ("encoder_eccentricity", {"amplitude_rad": 0.5, "phase_rad": 1.5}),
+    ],
+)
+def test_every_cause_beyond_the_list_changes_the_record(name, parameters):
+    voltage = _voltage()
+    nothing = Truth(RIG).record(voltage).measured(np.zeros((500, 2)))
+    something = Truth(RIG, [{"name": name, **parameters}]).record(voltage).measured(np.zeros((500, 2)))
+    assert np.max(np.abs(something - nothing)) > 1e-3
+    assert name in UNLISTED
+
+
+def test_even_levels_of_asymmetric_friction_are_coulomb_friction():
+    voltage = _voltage()
+    uneven = {"name": "asymmetric_friction", "torque_positive_Nm": 0.02, "torque_negative_Nm": 0.02}
+    even = {"name": "coulomb_friction", "torque_Nm": 0.02}
+    a, b = (Truth(RIG, [effect]).record(voltage) for effect in (uneven, even))
+    np.testing.assert_array_equal(a.tip_m, b.tip_m)
+
+
+def test_friction_holds_a_voltage_below_its_level():
+    # 0.2 V make 0.05 Nm; the hub may give way by the ten microradian of pre-sliding, no more.
+    voltage = np.full(400, 0.2)
+    record = Truth(RIG, [{"name": "coulomb_friction", "torque_Nm": 0.2}]).record(voltage)
+    assert np.max(np.abs(record.hub_angle_rad)) < 1e-5
+
+
+def test_a_slew_replayed_open_loop_is_the_same_record():
+    T = 400
+    reference = np.clip((np.arange(T) - 50) / 150, 0, 1) * 0.3
+    noise = np.random.default_rng(3).standard_normal(T) * 1e-3
+    machine = Truth(RIG)
+    slew = machine.record(np.zeros(T), Feedback(reference, 3.0, 0.2, 0.7), noise)
+    assert abs(slew.hub_angle_rad[-1] - 0.3) < 0.05
+    assert slew.voltage_V[0] == 0.0
+    replayed = machine.record(slew.voltage_V)
+    # The file carries the voltage to four digits behind the point, and the loop used just those.
+    np.testing.assert_allclose(replayed.hub_angle_rad, slew.hub_angle_rad, rtol=0, atol=1e-12)
+
+
+def test_bad_effects_are_refused_in_one_line():
+    with pytest.raises(ValueError, match="unknown effect 'gremlins'"):
+        Truth(RIG, [{"name": "gremlins"}])
+    with pytest.raises(ValueError, match="given twice"):
+        Truth(RIG, [{"name": "gravity", "acceleration_m_s2": 1.0}] * 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "none",
+        "gravity",
+        "input_delay",
+        "joint_compliance",
+        "periodic_disturbance",
+        "coulomb_friction_and_tip_payload",
+    ],
+)
+def test_recorded_cases_are_explained_to_the_noise(gap_cases, name):
+    # Records of a third rig, by others: driven by the logged voltage, slew under control included.
+    folder = gap_cases / "labelled" / name
+    rig = tomllib.loads((folder / "rig.toml").read_text())
+    answer = tomllib.loads((folder / "answer.toml").read_text())
+    machine = Truth(rig, [{"name": e["name"], **e["parameters"]} for e in answer.get("effects", [])])
+    for role in ("estimation", "held_out"):
+        left = []
+        for entry in tomllib.loads((folder / "case.toml").read_text())["experiments"]:
+            if entry["role"] == role:
+                data = np.loadtxt(folder / entry["file"], delimiter=",", skiprows=1)
+                clean = machine.record(data[:, 1]).measured(np.zeros((len(data), 2)))
+                left.append(((data[:, 2:] - clean) / machine.noise).ravel())
+        rms = np.sqrt(np.mean(np.concatenate(left) ** 2))
+        # Measured: equal to what the case's own answer states to four digits.
+        assert rms == pytest.approx(answer["pooled_gap"][f"{role}_gap_after_oracle"], rel=2e-3)

@@ -1,0 +1,238 @@
+"""`flexlink paper`: whole files or none, figures that read, sentences that follow the numbers."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import math
+import os
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.workflow.test_figures import panels
+from validation.paper import command
+from validation.paper.command import DRAWERS, OWN_FILES, PAGE, redraw_paper, write_all
+from validation.paper.experiments import run_experiments
+from validation.paper.findings import findings_of
+from validation.paper.methods import METHODS
+from validation.paper.page import page_html
+from validation.paper.quotes import OPEN_CHOICES, REPORTED
+from validation.paper.settings import PaperSettings
+from validation.paper.table import csv_text, documents, rows_of
+from workflow.engine.errors import InputError
+from workflow.engine.progress import Silence
+from workflow.figures import style
+
+# Everything once, and the searches long enough to find something.
+SMALL = PaperSettings(seed=7, repeats=2, searches=1, evaluations=200, surface_points=21, grids=(11, 21))
+
+
+@pytest.fixture(scope="module")
+def results():
+    return run_experiments(SMALL, Silence())
+
+
+@pytest.fixture(scope="module")
+def pictures(results):
+    return {number: style.render(draw(results)) for number, draw in DRAWERS.items()}
+
+
+@pytest.fixture
+def ready(monkeypatch, results, pictures):
+    """The command with its computation and its pictures done."""
+    monkeypatch.setattr(command, "run_experiments", lambda settings, progress: results)
+    monkeypatch.setattr(command, "DRAWERS", {number: lambda _, n=number: n for number in pictures})
+    monkeypatch.setattr(command, "render", pictures.__getitem__)
+
+
+def test_one_figure_for_each_of_the_paper(pictures):
+    assert list(pictures) == [item.number for item in REPORTED] == [1, 2, 3, 4, 5, 6, 7]
+    assert all(picture.kind == "svg" for picture in pictures.values())
+
+
+@pytest.mark.parametrize("number", list(DRAWERS))
+def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
+    figure = DRAWERS[number](results)
+    with style.house_style():
+        figure.draw_without_rendering()
+        renderer = figure.canvas.get_renderer()
+    shown = panels(figure)
+    for axes in shown:
+        for label in filter(None, (axes.get_xlabel(), axes.get_ylabel())):
+            assert re.search(r"\[.+\]", label), f"no unit in {label!r}"
+    words = [axes._left_title for axes in shown]
+    words += [axis.label for axes in shown for axis in (axes.xaxis, axes.yaxis)]
+    words += figure.legends[0].get_texts()
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in words if text.get_text()]
+    for text, box in boxes:  # 1.5 pixels: glyphs overhang their advance a little
+        assert box.x0 >= -1.5, text
+        assert box.y0 >= -1.5, text
+        assert box.x1 <= figure.bbox.x1 + 1.5, text
+        assert box.y1 <= figure.bbox.y1 + 1.5, text
+    for (one, first), (other, second) in itertools.combinations(boxes, 2):
+        overlap = (
+            min(first.x1, second.x1) - max(first.x0, second.x0),
+            min(first.y1, second.y1) - max(first.y0, second.y0),
+        )
+        assert min(overlap) <= 1.5, f"{one!r} overlaps {other!r}"
+    legend = figure.legends[0].get_window_extent(renderer)
+    assert not any(legend.overlaps(axes.get_window_extent(renderer)) for axes in shown)
+
+
+def test_page_stands_alone_and_says_both_sides(results, pictures):
+    rows, findings = rows_of(results), findings_of(results)
+    page = page_html(SMALL, pictures, findings, rows)
+    assert page.count("<svg ") == 7
+    assert "--seed 7" in page
+    assert page.count("The paper reports") == page.count("We find") == 7
+    for item in REPORTED:
+        assert page.count(item.place) >= 2  # beside the figure and over its table
+    for missing, _ in OPEN_CHOICES:
+        assert missing in page
+    # Nothing is fetched: names of XML dialects are no addresses to load from.
+    assert not re.search(r"""(src|href)=["'](?!#|data:)""", page.replace("xlink:href", "href"))
+    assert not re.search(r"\bnan\b", page)
+
+
+def test_sentences_and_rows_are_made_for_every_figure(results):
+    findings, rows = findings_of(results), rows_of(results)
+    assert len(findings) == len(REPORTED)
+    assert all(found.sentences and found.headline for found in findings)
+    assert {row.figure for row in rows} == {item.number for item in REPORTED}
+    assert len({(row.figure, row.quantity) for row in rows}) == len(rows)
+    assert all(row.ours for row in rows)
+    assert not any(math.isnan(row.value) for row in rows)
+
+
+def test_verdicts_follow_the_numbers(results):
+    """The sentence on OE turns when OE finds the mode: no result of ours is written down beforehand."""
+    simulation, experiment = results.simulation, results.experiment
+
+    def found_by(shown, names):
+        counts = {name: many["trials"] * (name in names) for name, many in shown.medians.items()}
+        marks = {name: {**many, "mode_found": counts[name]} for name, many in shown.medians.items()}
+        return replace(shown, medians=marks)
+
+    lucky = findings_of(replace(results, simulation=found_by(simulation, ("GOBF", "OE"))))[2]
+    assert not lucky.agrees
+    assert "OE" in lucky.headline
+    assert findings_of(replace(results, simulation=found_by(simulation, ("GOBF",))))[2].agrees
+    assert findings_of(replace(results, experiment=found_by(experiment, ("GOBF", "OE"))))[3].agrees
+    assert not findings_of(replace(results, experiment=found_by(experiment, METHODS)))[3].agrees
+    runaway = {**experiment.scores, "ARX": replace(experiment.scores["ARX"], fit_percent=-np.inf)}
+    away = replace(results, experiment=replace(experiment, scores=runaway))
+    assert "ARX runs away" in findings_of(away)[5].sentences[0]
+    assert any(row.ours == "runs away" for row in rows_of(away))
+
+
+def test_table_is_the_same_as_csv_and_json(results):
+    rows = rows_of(results)
+    read = list(csv.DictReader(csv_text(rows).splitlines()))
+    for line, document in zip(read, documents(rows), strict=True):
+        assert line["quantity"] == document["quantity"]
+        assert float(line["value"]) == pytest.approx(document["value"], rel=1e-8, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_numbers(results):
+    again = run_experiments(SMALL, Silence())
+    assert csv_text(rows_of(again)) == csv_text(rows_of(results))
+
+
+def test_command_writes_the_whole_directory(flexlink, ready, tmp_path):
+    out = tmp_path / "deep" / "paper"
+    answer = flexlink("paper", "--out", out, "--seed", 7, "--json")
+    assert answer.code == 0, answer
+    assert answer.err == ""
+    document = json.loads(answer.out)
+    assert document["report"] == str(out / PAGE)
+    assert sorted(os.listdir(out)) == sorted(
+        [*(f"figure-{n}.svg" for n in range(1, 8)), "table.csv", "table.json", PAGE]
+    )
+    assert json.loads((out / "table.json").read_text())["rows"] == document["numbers"]["rows"]
+    assert os.listdir(out.parent) == ["paper"]  # no traces beside it
+
+
+def test_terminal_shows_one_line_a_figure(flexlink, ready, tmp_path):
+    answer = flexlink("paper", "--out", tmp_path / "paper")
+    assert answer.code == 0
+    assert all(f"Fig. {n}" in answer.out for n in range(1, 8))
+    assert "table.csv" in answer.out
+
+
+def test_a_directory_with_something_in_it_is_refused_at_once(refused, monkeypatch, tmp_path):
+    monkeypatch.setattr(command, "run_experiments", lambda *_: pytest.fail("computed before looking"))
+    (tmp_path / "notes.txt").write_text("mine")
+    assert "not empty" in refused("paper", "--out", tmp_path)
+    assert "no redrawn paper" in refused("paper", "--out", tmp_path, "--replace")
+    assert "not a directory" in refused("paper", "--out", tmp_path / "notes.txt")
+    assert os.listdir(tmp_path) == ["notes.txt"]
+
+
+def test_replace_exchanges_our_files_and_no_others(flexlink, refused, ready, tmp_path):
+    out = tmp_path / "paper"
+    assert flexlink("paper", "--out", out).code == 0
+    (out / "figure-3.png").write_bytes(b"from another version")
+    (out / "notes.txt").write_text("mine")
+    before = (out / PAGE).stat().st_ino
+    assert "--replace" in refused("paper", "--out", out)
+    assert flexlink("paper", "--out", out, "--replace").code == 0
+    assert (out / PAGE).stat().st_ino != before
+    assert (out / "notes.txt").read_text() == "mine"
+    assert not (out / "figure-3.png").exists()
+
+
+def test_an_empty_directory_is_filled(flexlink, ready, tmp_path):
+    assert flexlink("paper", "--out", tmp_path).code == 0
+    assert PAGE in os.listdir(tmp_path)
+
+
+def test_nothing_is_left_when_the_disk_refuses(monkeypatch, tmp_path):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("workflow.engine.storage.os.fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_all(tmp_path / "paper", {PAGE: b"x"})
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_interrupted_computation_leaves_nothing(monkeypatch, tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "run_experiments", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        redraw_paper(tmp_path / "paper", SMALL)
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_page_comes_last(tmp_path):
+    """In a directory that was there files are exchanged one by one; until the last there is no page."""
+    out = tmp_path / "paper"
+    out.mkdir()
+    write_all(out, dict.fromkeys(OWN_FILES, b"old"))
+    seen = []
+    real = os.replace
+
+    def watched(source, target):
+        if str(target).startswith(str(out)):
+            seen.append((os.path.basename(target), (out / PAGE).exists()))
+        real(source, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("validation.paper.command.os.replace", watched)
+        write_all(out, dict.fromkeys(OWN_FILES, b"new"))
+    assert [name for name, _ in seen][-1] == PAGE
+    assert not any(page_there for _, page_there in seen)
+    assert {path.read_bytes() for path in out.iterdir()} == {b"new"}
+
+
+@pytest.mark.parametrize("change", [{"seed": -1}, {"repeats": 0}, {"evaluations": 5}, {"grids": ()}])
+def test_settings_that_make_no_sense_are_refused(change):
+    with pytest.raises(ValueError, match="need seed"):
+        PaperSettings(**change)

@@ -1,0 +1,188 @@
+"""Case folders in the format of the gap cases; answers go wherever the caller says, never into a folder.
+
+    python -m validation.blind.generate --cases 100 --seed 7 --out DIR --open
+
+writes open cases for development: DIR/<case>/answer.toml and rig_exact.toml lie beside the records then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from validation.blind.cases import SIMULATORS, BlindCase, Simulator, Sort, make_case, schedule
+from validation.blind.exudyn_truth import load_exudyn
+from validation.blind.rigs import rig_toml
+from workflow.engine.errors import InputError
+from workflow.engine.storage import write_text
+
+Answer = dict[str, Any]
+Plan = tuple[Sort, bool, str]
+
+
+def case_name(index: int) -> str:
+    return f"case_{index + 1:04d}"
+
+
+def draw_case(seed: int, index: int, plan: Plan, simulator: Simulator = "ritz") -> BlindCase:
+    """The case of this index and plan, whoever draws it."""
+    return make_case(*plan, np.random.default_rng([seed, 1, index]), simulator)
+
+
+def plan_cases(n_cases: int, seed: int, only: Sort | None = None) -> list[Plan]:
+    return schedule(n_cases, np.random.default_rng([seed, 0, n_cases]), only)
+
+
+def write_case(case: BlindCase, folder: Path) -> None:
+    """rig.toml, case.toml and experiments/*.csv; the answer is not among them."""
+    (folder / "experiments").mkdir(parents=True, exist_ok=True)
+    write_text(folder / "rig.toml", rig_toml(case.stated, case.tolerances))
+    lines = [f'case = "{folder.name}"']
+    for record in case.records:
+        plan = record.plan
+        rows = ["time_s,voltage_V,hub_angle_rad,tip_m"]
+        dt = case.stated["sampling"]["dt_s"]
+        for k, (volt, (hub, tip)) in enumerate(
+            zip(record.voltage_V.tolist(), record.measured.tolist(), strict=True)
+        ):
+            rows.append(f"{k * dt:.3f},{round(volt, 4):.6g},{hub:.6g},{tip:.6g}")
+        write_text(folder / "experiments" / f"{plan.name}.csv", "\n".join(rows) + "\n")
+        lines += [
+            "",
+            "[[experiments]]",
+            f'file = "experiments/{plan.name}.csv"',
+            f'kind = "{plan.kind}"',
+            f'role = "{plan.role}"',
+            f"samples = {record.voltage_V.size}",
+            f"closed_loop = {'true' if plan.feedback else 'false'}",
+            f'description = "{plan.description}"',
+        ]
+    write_text(folder / "case.toml", "\n".join(lines) + "\n")
+
+
+def folder_hash(folder: Path) -> str:
+    """SHA-256 over names and contents of every file of a case, so that none is exchanged afterwards."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        digest.update(f"{path.relative_to(folder).as_posix()}\0".encode())
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def answer_toml(answer: Mapping[str, Any]) -> str:
+    """Text of an answer file as the labelled cases have it (the true rig goes into a file of its own)."""
+    lines = [
+        f"{key} = {_toml(answer[key])}"
+        for key in ("case", "verdict", "severity", "max_ratio", "sort", "nominal")
+    ]
+    for effect in answer["effects"]:
+        lines += ["", "[[effects]]", f'name = "{effect["name"]}"', "[effects.parameters]"]
+        lines += [f"{key} = {_toml(value)}" for key, value in effect["parameters"].items()]
+    for effect in answer["unlisted"]:
+        lines += ["", "[[unlisted]]", *(f"{key} = {_toml(value)}" for key, value in effect.items())]
+    lines += ["", "[pooled_gap]", *(f"{k} = {_toml(v)}" for k, v in answer["pooled_gap"].items())]
+    for name, sizes in answer["experiments"].items():
+        lines += ["", f"[experiments.{name}]", *(f"{k} = {_toml(v)}" for k, v in sizes.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _one(seed: int, out: Path, open_cases: bool, simulator: Simulator, job: tuple[int, Plan]) -> Answer:
+    index, plan = job
+    case = draw_case(seed, index, plan, simulator)
+    folder = out / case_name(index)
+    write_case(case, folder)
+    answer = {"case": folder.name, **case.answer}
+    if open_cases:
+        write_text(folder / "rig_exact.toml", rig_toml(answer["true_rig"]))
+        write_text(folder / "answer.toml", answer_toml(answer))
+    return {**answer, "sha256": folder_hash(folder)}
+
+
+def generate(
+    n_cases: int,
+    seed: int,
+    out: Path,
+    *,
+    jobs: int = 1,
+    open_cases: bool = False,
+    simulator: Simulator = "ritz",
+    only: Sort | None = None,
+    finished: Mapping[str, Answer] | None = None,
+    keep: Callable[[Answer], None] | None = None,
+) -> list[Answer]:
+    """Write the cases of a seed below `out` and return their answers; the same seed gives the same bytes.
+
+    finished: answers of cases that are there already (case name -> answer) and are not drawn again.
+    keep: called with every answer as soon as its case is written.
+    """
+    if n_cases < 1 or seed < 0 or jobs < 1:
+        raise InputError(
+            f"cases and jobs must be at least 1, the seed at least 0; got {n_cases}, {jobs}, {seed}"
+        )
+    if simulator == "exudyn":
+        load_exudyn()
+    out.mkdir(parents=True, exist_ok=True)
+    answers = dict(finished or {})
+    work = partial(_one, seed, out, open_cases, simulator)
+    plans = plan_cases(n_cases, seed, only)
+    tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
+
+    def take(done: Iterable[Answer]) -> None:
+        for answer in done:
+            answers[answer["case"]] = answer
+            if keep:
+                keep(answer)
+
+    if jobs == 1 or len(tasks) == 1:
+        take(map(work, tasks))
+    elif tasks:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            take(pool.map(work, tasks))
+    return [answers[name] for name in sorted(answers)]
+
+
+def refuse_filled(out: Path) -> None:
+    """Raises InputError where `out` already holds something."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is not a directory")
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty: cases need a directory of their own")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--cases", type=int, required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--simulator", choices=SIMULATORS, default="ritz")
+    parser.add_argument("--open", action="store_true", help="write answers and exact rigs beside the records")
+    given = parser.parse_args()
+    try:
+        refuse_filled(given.out)
+        generate(
+            given.cases,
+            given.seed,
+            given.out,
+            jobs=given.jobs,
+            open_cases=given.open,
+            simulator=given.simulator,
+        )
+    except InputError as error:
+        parser.exit(2, f"{error}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,246 @@
+"""The whole blind run: cases, seal, diagnosis in processes that cannot see it, opening, scores.
+
+blind.json            number of cases, seed, simulator; a resumed run is held to them
+cases/<case>/         what a diagnosis sees
+seal/                 labels, for the owner only; commitment.json is their salted hash
+predictions/<case>.json, predictions.json (hash of each, written before the seal is opened)
+scores.json, scores.txt, confusion.png
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import workflow
+from validation.blind.cases import SIMULATORS, SORTS, Simulator, Sort
+from validation.blind.exudyn_truth import load_exudyn
+from validation.blind.generate import Answer, folder_hash, generate, refuse_filled
+from validation.blind.report import confusion_figure, summary, text
+from validation.blind.scores import scores
+from validation.blind.seal import (
+    COMMITMENT,
+    SEAL_DIRECTORY,
+    close_seal,
+    open_seal,
+    private_directory,
+    write_private,
+)
+from workflow.engine.errors import InputError, one_line
+from workflow.engine.progress import Progress, Silence
+from workflow.engine.storage import (
+    read_json,
+    sha256_of_file,
+    strict_json,
+    write_bytes,
+    write_json,
+    write_text,
+)
+from workflow.tasks.summary import RunSummary
+
+_FORMAT = "flexlink-blind-1"
+# Expected seconds per case: they shape the progress bar only.
+_CASE_S, _DIAGNOSIS_S = 8.0, 40.0
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+Diagnose = Callable[[Path, Path], dict[str, Any]]
+
+
+def run_blind(
+    n_cases: int,
+    seed: int,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    simulator: str = "ritz",
+    only: str | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+    diagnose: Diagnose | None = None,
+) -> RunSummary:
+    """Generate, seal, diagnose, open, score. Raises InputError, one line, for whatever was given wrongly.
+
+    only: cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
+    diagnose: (case folder, directory it must keep out of) -> document; the default starts a process.
+    """
+    progress = progress or Silence()
+    chosen = next((name for name in SIMULATORS if name == simulator), None)
+    if chosen is None:
+        raise InputError(f"--simulator must be one of {', '.join(SIMULATORS)}; got {simulator!r}")
+    if chosen == "exudyn":
+        load_exudyn()
+    sort = next((name for name in SORTS if name == only), None)
+    if only is not None and sort is None:
+        raise InputError(f"--only must be one of {', '.join(SORTS)}; got {only!r}")
+    if jobs is not None and jobs < 1:
+        raise InputError(f"--jobs must be at least 1, got {jobs}")
+    if n_cases < 1 or seed < 0:
+        raise InputError(f"--cases must be at least 1 and --seed at least 0; got {n_cases} and {seed}")
+    width = jobs or os.cpu_count() or 1
+    settings = {"format": _FORMAT, "cases": n_cases, "seed": seed, "simulator": simulator}
+    _begin(out, settings if sort is None else {**settings, "only": sort}, resume)
+    progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
+    _sealed_cases(out, n_cases, seed, width, chosen, sort, progress)
+    names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
+    _predict(out, names, width, diagnose or diagnose_in_process, progress)
+    predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
+    write_json(
+        out / "predictions.json",
+        {name: sha256_of_file(out / "predictions" / f"{name}.json") for name in names},
+    )
+    labels = open_seal(out)
+    _check_cases(out, labels)
+    document = _scored(predictions, labels)
+    document["commitment"] = read_json(out / COMMITMENT)["sha256"]
+    document["settings"] = read_json(out / "blind.json")
+    write_text(out / "scores.json", json.dumps(strict_json(document), indent=1, allow_nan=False) + "\n")
+    write_text(out / "scores.txt", text(document))
+    write_bytes(out / "confusion.png", confusion_figure(document["diagnosis"]))
+    return summary(document, out)
+
+
+def _begin(out: Path, settings: Mapping[str, Any], resume: bool) -> None:
+    manifest = out / "blind.json"
+    if manifest.is_file():
+        before = read_json(manifest)
+        if not resume:
+            raise InputError(f"{out} holds a blind run already; --resume continues it")
+        for key in {**before, **settings}:
+            begun, value = before.get(key), settings.get(key)
+            if begun != value:
+                raise InputError(
+                    f"{out}: cannot resume, the run was begun with {key} = {begun!r}, not {value!r}"
+                )
+        return
+    if resume:
+        raise InputError(f"{out} holds no blind run to resume")
+    refuse_filled(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot use {out}: {error.strerror or error}") from error
+    write_json(manifest, settings)
+
+
+def _sealed_cases(
+    out: Path,
+    n_cases: int,
+    seed: int,
+    jobs: int,
+    simulator: Simulator,
+    only: Sort | None,
+    progress: Progress,
+) -> None:
+    """Cases and closed seal; an interrupted generation goes on where it stopped."""
+    progress.start("cases")
+    started = time.monotonic()
+    taken_up = (out / COMMITMENT).is_file()
+    if not taken_up:
+        parts = private_directory(private_directory(out / SEAL_DIRECTORY) / "parts")
+        finished: dict[str, Answer] = {path.stem: read_json(path) for path in sorted(parts.glob("*.json"))}
+        count = len(finished)
+
+        def keep(answer: Answer) -> None:
+            nonlocal count
+            write_private(parts / f"{answer['case']}.json", json.dumps(answer) + "\n")
+            count += 1
+            progress.update("cases", count / n_cases, f"{count} of {n_cases}")
+
+        answers = generate(
+            n_cases,
+            seed,
+            out / "cases",
+            jobs=jobs,
+            simulator=simulator,
+            only=only,
+            finished=finished,
+            keep=keep,
+        )
+        close_seal(out, answers)
+        shutil.rmtree(parts)
+    progress.finish("cases", time.monotonic() - started, taken_up=taken_up)
+
+
+def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, progress: Progress) -> None:
+    progress.start("diagnosis")
+    started = time.monotonic()
+    folder = out / "predictions"
+    folder.mkdir(exist_ok=True)
+    todo = [name for name in names if not (folder / f"{name}.json").is_file()]
+    done = len(names) - len(todo)
+
+    def one(name: str) -> tuple[str, dict[str, Any]]:
+        # Under a neutral path: not even the name of the run is known to the process.
+        with tempfile.TemporaryDirectory() as room:
+            copy = Path(room) / name
+            shutil.copytree(out / "cases" / name, copy)
+            return name, diagnose(copy, out)
+
+    pool = ThreadPoolExecutor(max(1, min(jobs, len(todo))))
+    try:
+        for name, document in pool.map(one, todo):
+            write_json(folder / f"{name}.json", document)
+            done += 1
+            progress.update("diagnosis", done / len(names), f"{done} of {len(names)}")
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    progress.finish("diagnosis", time.monotonic() - started, taken_up=not todo)
+
+
+def diagnose_in_process(folder: Path, sealed: Path) -> dict[str, Any]:
+    """A fresh interpreter gets the folder and is kept out of the run's directory.
+
+    A process that fails leaves a document with the verdict "failed": it counts as a wrong answer.
+    """
+    environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}
+    root = str(Path(workflow.__file__).resolve().parents[1])
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, "-m", "validation.blind.worker", str(folder), "--keep-out", str(sealed.resolve())],
+        cwd=folder.parent,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode == 0:
+        document: dict[str, Any] = json.loads(done.stdout)
+        return document
+    reason = one_line(done.stderr.strip().splitlines()[-1]) if done.stderr.strip() else "no message"
+    return {
+        "case": folder.name,
+        "verdict": "failed",
+        "effects": [],
+        "combination": [],
+        "gap_after": None,
+        "reason": f"exit code {done.returncode}: {reason}",
+    }
+
+
+def _check_cases(out: Path, labels: Sequence[Answer]) -> None:
+    for label in labels:
+        if folder_hash(out / "cases" / label["case"]) != label["sha256"]:
+            raise InputError(f"{out}: records of {label['case']} are not those the labels were sealed for")
+
+
+def _scored(predictions: Sequence[Mapping[str, Any]], labels: Sequence[Answer]) -> dict[str, Any]:
+    document: dict[str, Any] = {"diagnosis": scores(predictions, labels), "baselines": {}}
+    methods = {name: None for p in predictions for name in p.get("baselines", {})}
+    for method in methods:
+        answers = [
+            p.get("baselines", {}).get(method)
+            or {"case": p["case"], "verdict": "failed", "effects": [], "combination": []}
+            for p in predictions
+        ]
+        document["baselines"][method] = scores(answers, labels)
+    document["failed"] = {p["case"]: p["reason"] for p in predictions if p["verdict"] == "failed"}
+    return document

@@ -1,0 +1,262 @@
+"""Effects to hide in a case: parameters as functions of one size, in units that come from the rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from validation.blind.inputs import Planned
+from validation.blind.rigs import rounded
+from validation.blind.truth import LISTED, UNLISTED, RigTable
+
+Table = dict[str, Any]
+
+FAMILY = {
+    "actuator": ("actuator_saturation", "actuator_dead_zone", "actuator_lag", "input_delay", "actuator_gain"),
+    "joint": (
+        "coulomb_friction",
+        "stribeck_friction",
+        "viscous_friction",
+        "backlash",
+        "torque_ripple",
+        "joint_compliance",
+        "hardening_spring",
+        "periodic_disturbance",
+        "base_compliance",
+        "hub_inertia",
+    ),
+    "link": ("tip_payload", "link_stiffness", "structural_damping", "gravity"),
+    "sensor": ("sensor_lag", "sensor_gain", "sensor_drift", "quantisation"),
+}
+# Effects that multiply or add to a stated parameter, and the tolerances that could explain them away.
+PARAMETRIC: Mapping[str, tuple[str, ...]] = {
+    "hub_inertia": ("hub.inertia_kg_m2",),
+    "link_stiffness": ("link.youngs_modulus_Pa",),
+    "structural_damping": ("link.kelvin_voigt_s",),
+    "viscous_friction": ("hub.viscous_friction_Nms",),
+    "actuator_gain": ("motor.torque_constant_Nm_A", "motor.resistance_ohm"),
+}
+# Pairs that no record of this kind could tell from one of them, or that the format leaves undefined.
+NOT_TOGETHER = (
+    {"coulomb_friction", "stribeck_friction"},
+    {"input_delay", "actuator_lag"},
+    {"actuator_gain", "viscous_friction"},
+    {"hub_inertia", "tip_payload"},
+    {"link_stiffness", "joint_compliance"},
+    {"backlash", "hardening_spring"},
+)
+
+
+@dataclass(frozen=True)
+class Sizable:
+    """An effect of which only the size is open: parameters(size), growing with it from nothing at 0."""
+
+    name: str
+    first: float
+    largest: float
+    parameters: Callable[[float], Table]
+
+    def at(self, size: float) -> Table:
+        values = {key: rounded(float(value)) for key, value in self.parameters(size).items()}
+        return {"name": self.name, **values}
+
+
+def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random.Generator) -> Sizable:
+    """An effect with everything but its size drawn; plans give the voltages it has to be felt at."""
+    s = _Scales.of(rig, plans)
+    sign = float(rng.choice([-1.0, 1.0]))
+    phase = rng.uniform(0, 2 * pi)
+
+    def ratio(size: float) -> Table:
+        return {"ratio": 1 + size if sign > 0 else 1 / (1 + size)}
+
+    def log(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    def simple(parameter: str, unit: float, first: float, largest: float) -> Sizable:
+        return Sizable(name, first, largest, lambda size: {parameter: size * unit})
+
+    if name == "coulomb_friction":
+        return simple("torque_Nm", s.torque, 0.05, 0.6)
+    if name == "stribeck_friction":
+        share, speed = rng.uniform(0.35, 0.75), log(0.02, 0.3)
+        return Sizable(
+            name,
+            0.05,
+            0.8,
+            lambda size: {
+                "static_torque_Nm": size * s.torque,
+                "coulomb_torque_Nm": share * size * s.torque,
+                "stribeck_velocity_rad_s": speed,
+            },
+        )
+    if name == "viscous_friction":
+        return simple("coefficient_Nms", s.viscous, 0.5, 20.0)
+    if name == "backlash":
+        return simple("gap_rad", 1.0, 0.01, 0.06)
+    if name == "actuator_saturation":
+        return Sizable(name, 0.2, 3.0, lambda size: {"limit_V": s.peak * np.exp(-size)})
+    if name == "actuator_dead_zone":
+        return simple("width_V", s.voltage, 0.03, 0.7)
+    if name in ("actuator_lag", "sensor_lag"):
+        return simple("time_constant_s", s.dt, 0.5, 12.0)
+    if name == "input_delay":
+        return simple("delay_s", s.dt, 0.5, 8.0)
+    if name in ("actuator_gain", "hub_inertia"):
+        return Sizable(name, 0.1, 1.0, ratio)
+    if name == "link_stiffness":
+        return Sizable(name, 0.05, 1.0, ratio)
+    if name == "structural_damping":
+        return Sizable(name, 1.0, 9.0, ratio)
+    if name == "sensor_gain":
+        return Sizable(name, 0.02, 0.5, ratio)
+    if name == "torque_ripple":
+        cycles = float(rng.integers(4, 41))
+        return Sizable(
+            name,
+            0.05,
+            0.5,
+            lambda size: {"amplitude_Nm": size * s.torque, "cycles_per_rev": cycles, "phase_rad": phase},
+        )
+    if name == "joint_compliance":
+        time = log(0.0005, 0.003)
+        return Sizable(
+            name,
+            0.1,
+            1.5,
+            lambda size: {
+                "stiffness_Nm_rad": s.link_spring / size,
+                "damping_Nms": time * s.link_spring / size,
+            },
+        )
+    if name == "tip_payload":
+        return simple("mass_kg", s.link_mass, 0.05, 1.5)
+    if name == "hardening_spring":
+        return simple("cubic_Nm_rad3", s.inertia, 5.0, 3000.0)
+    if name == "gravity":
+        return simple("acceleration_m_s2", 1.0, 0.05, 9.81)
+    if name == "sensor_drift":
+        return simple("rate_m_s", sign * s.tip_noise, 0.5, 20.0)
+    if name == "quantisation":
+        return simple("step_m", s.tip_noise, 3.0, 60.0)
+    if name == "periodic_disturbance":
+        frequency = log(0.5, 12.0)
+        return Sizable(
+            name,
+            0.05,
+            1.0,
+            lambda size: {"amplitude_Nm": size * s.torque, "frequency_Hz": frequency, "phase_rad": phase},
+        )
+    if name == "base_compliance":
+        base, damping = s.inertia * log(0.3, 3.0), rng.uniform(0.03, 0.15)
+        # Size 1: the base swings at 6 Hz.
+        stiffness = (s.inertia + base) * (2 * pi * 6.0) ** 2
+
+        def compliant(size: float) -> Table:
+            k = stiffness / size
+            return {
+                "stiffness_Nm_rad": k,
+                "damping_Nms": 2 * damping * np.sqrt(k * (s.inertia + base)),
+                "inertia_kg_m2": base,
+            }
+
+        return Sizable(name, 0.3, 8.0, compliant)
+    return _unlisted(name, s, sign, phase, rng)
+
+
+def _unlisted(name: str, s: _Scales, sign: float, phase: float, rng: np.random.Generator) -> Sizable:
+    if name == "air_drag":
+        unit = 4 * (s.viscous + s.braking) / s.length**4
+        return Sizable(name, 0.1, 20.0, lambda size: {"coefficient_Ns2_m3": size * unit})
+    if name == "cogging":
+        cycles = float(rng.integers(6, 31))
+        return Sizable(
+            name,
+            0.1,
+            0.7,
+            lambda size: {"relative_amplitude": size, "cycles_per_rev": cycles, "phase_rad": phase},
+        )
+    if name == "ground_spring":
+        return Sizable(name, 0.1, 60.0, lambda size: {"stiffness_Nm_rad": size * s.inertia})
+    if name == "inductance":
+        return Sizable(
+            name,
+            0.3,
+            3.0,
+            lambda size: {
+                "inductance_H": size * s.resistance * s.dt,
+                "current_limit_A": s.peak / s.resistance * np.exp(-size),
+            },
+        )
+    if name == "asymmetric_friction":
+        uneven = rng.uniform(0.3, 0.8)
+        return Sizable(
+            name,
+            0.05,
+            0.6,
+            lambda size: {
+                "torque_positive_Nm": size * s.torque * (1 + sign * uneven),
+                "torque_negative_Nm": size * s.torque * (1 - sign * uneven),
+            },
+        )
+    if name == "amplifier_cubic":
+        # Monotone up to the largest voltage also with a falling gain.
+        return Sizable(name, 0.05, 0.3, lambda size: {"cubic_1_V2": sign * size / s.peak**2})
+    if name == "sensor_clipping":
+        return Sizable(name, 0.2, 2.0, lambda size: {"limit_m": s.tip_peak * np.exp(-size)})
+    if name == "winding_heat":
+        return Sizable(name, 0.03, 0.3, lambda size: {"rate_1_s": size})
+    if name == "encoder_eccentricity":
+        # Phases that would mostly scale the angle are left out: a gain is another effect.
+        offset = 0.5 * pi * sign + rng.uniform(-0.6, 0.6)
+        return Sizable(name, 0.03, 0.5, lambda size: {"amplitude_rad": size, "phase_rad": offset})
+    raise ValueError(f"unknown effect {name!r}; known: {', '.join(LISTED + UNLISTED)}")
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """Magnitudes of a rig and its planned voltages."""
+
+    voltage: float
+    peak: float
+    torque: float
+    viscous: float
+    braking: float
+    inertia: float
+    link_mass: float
+    link_spring: float
+    length: float
+    resistance: float
+    dt: float
+    tip_noise: float
+    tip_peak: float
+
+    @classmethod
+    def of(cls, rig: RigTable, plans: tuple[Planned, ...]) -> _Scales:
+        link, hub, motor = rig["link"], rig["hub"], rig["motor"]
+        L, r = link["length_m"], hub["radius_m"]
+        mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * L
+        bending = link["youngs_modulus_Pa"] * link["width_m"] * link["thickness_m"] ** 3 / 12
+        rms = float(np.median([np.sqrt(np.mean(p.voltage_V**2)) for p in plans if p.feedback is None]))
+        peak = max(float(np.max(np.abs(p.voltage_V))) for p in plans)
+        per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
+        inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
+        return cls(
+            voltage=rms,
+            peak=peak,
+            torque=per_volt * rms,
+            viscous=hub["viscous_friction_Nms"],
+            braking=per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"],
+            inertia=inertia + rig["payload"]["mass_kg"] * (r + L) ** 2,
+            link_mass=mass,
+            link_spring=3 * bending / L,
+            length=L,
+            resistance=motor["resistance_ohm"],
+            dt=rig["sampling"]["dt_s"],
+            tip_noise=rig["sensors"]["tip_noise_m"],
+            tip_peak=(r + L) * 0.35,
+        )

@@ -1,0 +1,323 @@
+"""The machine that makes the records of the blind protocol: a rig, effects of the list, and some beyond it.
+
+Equations as in the case format's description, written anew: nothing is taken from `plant`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import pi
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from validation.blind.beam import LinkBasis, link_basis
+from validation.blind.kernel import BASE, HUB, MOTOR, ROOT, Physics, run
+
+Real = npt.NDArray[np.float64]
+RigTable = Mapping[str, Mapping[str, float]]
+Effects = Sequence[Mapping[str, Any]]
+
+LISTED = (
+    "coulomb_friction",
+    "stribeck_friction",
+    "viscous_friction",
+    "backlash",
+    "actuator_saturation",
+    "actuator_dead_zone",
+    "actuator_lag",
+    "input_delay",
+    "actuator_gain",
+    "torque_ripple",
+    "joint_compliance",
+    "tip_payload",
+    "link_stiffness",
+    "structural_damping",
+    "hardening_spring",
+    "gravity",
+    "sensor_lag",
+    "sensor_gain",
+    "sensor_drift",
+    "quantisation",
+    "periodic_disturbance",
+    "base_compliance",
+    "hub_inertia",
+)
+# Causes that no list names: the right answer to each is "unknown".
+UNLISTED = (
+    "air_drag",  # -c |v| v per unit length of the link
+    "cogging",  # torque constant Kt (1 + a cos(N theta + p))
+    "ground_spring",  # linear spring from hub to ground
+    "inductance",  # L di/dt in the winding, current limited
+    "asymmetric_friction",  # dry friction of another level in each direction
+    "amplifier_cubic",  # V + c V^3
+    "sensor_clipping",  # tip reading ends at +-limit
+    "winding_heat",  # resistance grows linearly in time during a record
+    "encoder_eccentricity",  # a (sin(theta + p) - sin p) added to the hub angle
+)
+
+PRE_SLIDING_RAD = 1e-5
+_CONTACT_HZ = 180.0
+_FASTEST_MODE_HZ = 300.0
+# Substeps: enough for stability and a local error far below the noise; contacts want more.
+_FEWEST, _FEWEST_CONTACT, _MOST = 16, 128, 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """PD control of the noisy hub angle, one sample ahead; reference (T,)."""
+
+    reference_rad: Real
+    proportional_V_rad: float
+    derivative_Vs_rad: float
+    filter_pole: float
+
+
+@dataclass(frozen=True, eq=False)
+class Clean:
+    """A record without noise (T,) each, before quantisation; voltage_V is what was commanded."""
+
+    voltage_V: Real
+    hub_angle_rad: Real
+    tip_m: Real
+    step_m: float
+    clip_m: float
+
+    def measured(self, noise: Real) -> Real:
+        """(T, 2) with noise (T, 2) added and the tip quantised or clipped where its sensor does so."""
+        hub, tip = self.hub_angle_rad + noise[:, 0], self.tip_m + noise[:, 1]
+        tip = np.clip(tip, -self.clip_m, self.clip_m)
+        if self.step_m > 0:
+            tip = self.step_m * np.rint(tip / self.step_m)
+        return np.column_stack([hub, tip])
+
+
+class Truth:
+    """A machine at rest, ready for any number of records; `effects` are tables with a name and parameters."""
+
+    def __init__(self, rig: RigTable, effects: Effects = ()) -> None:
+        by_name = {str(e["name"]): e for e in effects}
+        if len(by_name) != len(effects):
+            raise ValueError(f"an effect is given twice: {[e['name'] for e in effects]}")
+        for name in by_name:
+            if name not in LISTED and name not in UNLISTED:
+                raise ValueError(f"unknown effect {name!r}; known: {', '.join(LISTED + UNLISTED)}")
+        self.rig = rig
+        self.dt_s = float(rig["sampling"]["dt_s"])
+        self.noise = np.array([rig["sensors"]["hub_angle_noise_rad"], rig["sensors"]["tip_noise_m"]])
+
+        def get(name: str, parameter: str, absent: float) -> float:
+            return float(by_name[name][parameter]) if name in by_name else absent
+
+        self._get = get
+        link, hub = rig["link"], rig["hub"]
+        stiffness_ratio = get("link_stiffness", "ratio", 1.0)
+        section = link["width_m"] * link["thickness_m"]
+        bending = link["youngs_modulus_Pa"] * section * link["thickness_m"] ** 2 / 12 * stiffness_ratio
+        line = link["density_kg_m3"] * section
+        tip_mass = rig["payload"]["mass_kg"] + get("tip_payload", "mass_kg", 0.0)
+        self._basis = _basis(link["length_m"], bending, line, tip_mass)
+        self._lumps = np.append(line * self._basis.weights_m, tip_mass)
+        self._couple = _couple(set(by_name))
+        J = hub["inertia_kg_m2"] * get("hub_inertia", "ratio", 1.0)
+        backlash = "backlash" in by_name
+        contact = 0.21 * J * (2 * pi * _CONTACT_HZ) ** 2
+        motor = rig["motor"]
+        levels = ("torque_positive_Nm", "torque_negative_Nm")
+        uneven = [get("asymmetric_friction", level, 0.0) for level in levels]
+        if uneven[0] and "coulomb_friction" in by_name:
+            raise ValueError(
+                "coulomb_friction and asymmetric_friction use the same contact: give one of them"
+            )
+        self._physics = Physics(
+            radius_m=float(hub["radius_m"]),
+            length_m=float(link["length_m"]),
+            kelvin_voigt_s=link["kelvin_voigt_s"] * get("structural_damping", "ratio", 1.0),
+            motor_inertia=0.3 * J if backlash else 0.0,
+            hub_inertia=0.7 * J if backlash else J,
+            viscous=hub["viscous_friction_Nms"] + get("viscous_friction", "coefficient_Nms", 0.0),
+            gear=float(motor["gear_ratio"]),
+            torque_constant=float(motor["torque_constant_Nm_A"]),
+            back_emf=float(motor["back_emf_Vs_rad"]),
+            resistance=float(motor["resistance_ohm"]),
+            gravity=get("gravity", "acceleration_m_s2", 0.0),
+            dry_static=get("coulomb_friction", "torque_Nm", uneven[0]),
+            dry_minus=get("coulomb_friction", "torque_Nm", uneven[1]),
+            stribeck_static=get("stribeck_friction", "static_torque_Nm", 0.0),
+            stribeck_coulomb=get("stribeck_friction", "coulomb_torque_Nm", 0.0),
+            stribeck_velocity=get("stribeck_friction", "stribeck_velocity_rad_s", 1.0),
+            pre_sliding=PRE_SLIDING_RAD,
+            ripple=get("torque_ripple", "amplitude_Nm", 0.0),
+            ripple_cycles=get("torque_ripple", "cycles_per_rev", 1.0),
+            ripple_phase=get("torque_ripple", "phase_rad", 0.0),
+            disturbance=get("periodic_disturbance", "amplitude_Nm", 0.0),
+            disturbance_omega=2 * pi * get("periodic_disturbance", "frequency_Hz", 0.0),
+            disturbance_phase=get("periodic_disturbance", "phase_rad", 0.0),
+            cubic_spring=get("hardening_spring", "cubic_Nm_rad3", 0.0),
+            linear_spring=get("ground_spring", "stiffness_Nm_rad", 0.0),
+            joint_stiffness=get("joint_compliance", "stiffness_Nm_rad", 0.0),
+            joint_damping=get("joint_compliance", "damping_Nms", 0.0),
+            base_stiffness=get("base_compliance", "stiffness_Nm_rad", 0.0),
+            base_damping=get("base_compliance", "damping_Nms", 0.0),
+            base_inertia=get("base_compliance", "inertia_kg_m2", 0.0),
+            play=get("backlash", "gap_rad", -1.0),
+            contact_stiffness=contact,
+            contact_damping=0.8 * float(np.sqrt(0.3 * J * contact)),
+            lag=get("actuator_lag", "time_constant_s", 0.0),
+            inductance=get("inductance", "inductance_H", 0.0),
+            current_limit=get("inductance", "current_limit_A", 1e9),
+            cogging=get("cogging", "relative_amplitude", 0.0),
+            cogging_cycles=get("cogging", "cycles_per_rev", 0.0),
+            cogging_phase=get("cogging", "phase_rad", 0.0),
+            heating_1_s=get("winding_heat", "rate_1_s", 0.0),
+            drag=get("air_drag", "coefficient_Ns2_m3", 0.0),
+            sensor_lag=get("sensor_lag", "time_constant_s", 0.0),
+        )
+        self.substeps = self._substeps()
+
+    def record(
+        self, voltage_V: npt.ArrayLike, feedback: Feedback | None = None, hub_noise_rad: Real | None = None
+    ) -> Clean:
+        """Drive the machine from rest; with a feedback the voltage is the controller's (and T its length).
+
+        Raises ValueError where the motion leaves every bound (an unstable loop).
+        """
+        get, p = self._get, self._physics
+        commanded = np.array(voltage_V, dtype=np.float64)
+        static = self.amplifier
+        acting = amplified(commanded, static)
+        whole, late = _delay(get("input_delay", "delay_s", 0.0), self.dt_s)
+        if feedback is None:
+            gains, reference = np.zeros(0), np.zeros(0)
+            noise = np.zeros(0)
+        else:
+            gains = np.array([feedback.proportional_V_rad, feedback.derivative_Vs_rad, feedback.filter_pole])
+            reference = np.array(feedback.reference_rad)
+            noise = np.zeros(commanded.size) if hub_noise_rad is None else np.array(hub_noise_rad)
+            commanded[:], acting[:] = 0.0, 0.0
+        basis = self._basis
+        outputs = np.zeros((commanded.size, 2))
+        fine = run(
+            p, self._couple, basis.angle, basis.integral, self._lumps, basis.weights_m, basis.stiffness,
+            acting, commanded, late, self.dt_s, self.substeps, gains, static, noise, reference, whole,
+            outputs,
+        )  # fmt: skip
+        if not fine or not np.all(np.isfinite(outputs)):
+            raise ValueError("the motion leaves every bound: the loop is unstable or the voltage too high")
+        return self.sensed(commanded, outputs)
+
+    @property
+    def amplifier(self) -> Real:
+        """(gain, dead zone, limit, cubic part) of the voltage's static path."""
+        get = self._get
+        return np.array(
+            [
+                get("actuator_gain", "ratio", 1.0),
+                get("actuator_dead_zone", "width_V", 0.0),
+                get("actuator_saturation", "limit_V", 1e9),
+                get("amplifier_cubic", "cubic_1_V2", 0.0),
+            ]
+        )
+
+    def sensed(self, commanded: Real, outputs: Real) -> Clean:
+        """The record as sensors see it, but for noise, clipping and quantisation; outputs (T, 2)."""
+        get = self._get
+        hub, tip = outputs.T
+        a, phase = (
+            get("encoder_eccentricity", "amplitude_rad", 0.0),
+            get("encoder_eccentricity", "phase_rad", 0.0),
+        )
+        hub = hub + a * (np.sin(hub + phase) - np.sin(phase))
+        time = np.arange(commanded.size) * self.dt_s
+        tip = get("sensor_gain", "ratio", 1.0) * tip + get("sensor_drift", "rate_m_s", 0.0) * time
+        return Clean(
+            commanded,
+            hub,
+            tip,
+            get("quantisation", "step_m", 0.0),
+            get("sensor_clipping", "limit_m", float("inf")),
+        )
+
+    def _substeps(self) -> int:
+        """Substeps per sample from the fastest eigenvalue of the machine at rest, contacts closed."""
+        p, basis, couple = self._physics, self._basis, self._couple
+        R, n = couple.shape[1], basis.stiffness.size
+        size = R + n
+        M, K, C = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
+        shapes = np.column_stack(
+            [p.radius_m + basis.integral @ np.ones(basis.weights_m.size), basis.integral @ basis.angle]
+        )
+        to_link = np.zeros((1 + n, size))
+        to_link[0, :R] = couple[ROOT]
+        to_link[1:, R:] = np.eye(n)
+        M += to_link.T @ (shapes.T @ (self._lumps[:, None] * shapes)) @ to_link
+        K[R:, R:] += np.diag(basis.stiffness)
+        C[R:, R:] += p.kelvin_voigt_s * np.diag(basis.stiffness)
+
+        def spring(one: Real, other: Real, k: float, c: float) -> None:
+            d = np.zeros(size)
+            d[:R] = one - other
+            K[...] += k * np.outer(d, d)
+            C[...] += c * np.outer(d, d)
+
+        bodies = (
+            (BASE, p.base_inertia),
+            (MOTOR, p.motor_inertia),
+            (HUB, p.hub_inertia),
+        )
+        for body, inertia in bodies:
+            M[:R, :R] += inertia * np.outer(couple[body], couple[body])
+        ground = np.zeros(R)
+        dry = (p.dry_static + p.stribeck_static) / p.pre_sliding
+        motor = p.gear**2 * p.torque_constant * p.back_emf / p.resistance
+        spring(couple[MOTOR], couple[BASE], dry, p.viscous + motor)
+        spring(couple[BASE], ground, p.base_stiffness, p.base_damping)
+        spring(couple[ROOT], couple[HUB], p.joint_stiffness, p.joint_damping)
+        if p.play >= 0:
+            spring(couple[MOTOR], couple[HUB], p.contact_stiffness, p.contact_damping)
+        A = np.zeros((2 * size, 2 * size))
+        A[:size, size:] = np.eye(size)
+        A[size:, :size] = -np.linalg.solve(M, K)
+        A[size:, size:] = -np.linalg.solve(M, C)
+        fastest = float(np.max(np.abs(np.linalg.eigvals(A))))
+        if p.inductance > 0:
+            fastest = max(fastest, p.resistance / p.inductance)
+        fewest = _FEWEST_CONTACT if p.play >= 0 else _FEWEST
+        return int(np.clip(np.ceil(self.dt_s * fastest / 0.9), fewest, _MOST))
+
+
+def amplified(voltage_V: Real, static: Real) -> Real:
+    """Gain, cubic part, dead zone and limit; see `Truth.amplifier`."""
+    value = static[0] * voltage_V
+    value = value + static[3] * value**3
+    return np.asarray(np.sign(value) * np.clip(np.abs(value) - static[1], 0.0, static[2]))
+
+
+def _basis(length: float, bending: float, line: float, tip_mass: float) -> LinkBasis:
+    every = link_basis(length, bending, line, tip_mass, 7)
+    wanted = int(np.sum(np.sqrt(every.stiffness) / (2 * pi) < _FASTEST_MODE_HZ))
+    return link_basis(length, bending, line, tip_mass, min(max(wanted, 4), 6))
+
+
+def _couple(names: set[str]) -> Real:
+    """(4, R): base, motor side, hub and link root as functions of the free angles."""
+    columns = []
+    groups = [[BASE]] if "base_compliance" in names else []
+    rigid = [[MOTOR], [HUB], [ROOT]]
+    if "joint_compliance" not in names:
+        rigid = [[MOTOR], [HUB, ROOT]]
+    if "backlash" not in names:
+        rigid = [rigid[0] + rigid[1], *rigid[2:]]
+    for group in groups + rigid:
+        column = np.zeros(4)
+        column[group] = 1.0
+        columns.append(column)
+    return np.ascontiguousarray(np.column_stack(columns))
+
+
+def _delay(delay_s: float, dt_s: float) -> tuple[int, float]:
+    """Whole samples and the rest in seconds."""
+    whole = int(np.floor(delay_s / dt_s + 1e-12))
+    return whole, max(delay_s - whole * dt_s, 0.0)

@@ -1,0 +1,170 @@
+"""Figs. 2, 3, 4 and 7 redrawn: frequency responses, in the paper's decibels and degrees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+
+from ident.data.arrays import ComplexArray, RealArray
+from ident.uncertainty import FrequencyUncertainty
+from validation.paper.bounds import BoundsStudy
+from validation.paper.colours import METHOD_LINES, OUR_WAY, PAPER_WAY, RECIPE_LINE, TRUTH_LINE
+from validation.paper.experiments import Comparison, PaperResults
+from validation.paper.methods import JUDGED_BAND_RAD_S, METHODS
+from workflow.figures import style
+from workflow.figures.bands import response_band, unwrapped_degrees
+
+# Where the phases of two curves are brought to the same turn.
+_COMMON_TURN_RAD_S = (0.5, 5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One response (F,) with its line and its entry in the legend."""
+
+    label: str
+    response: ComplexArray
+    line: Mapping[str, Any]
+
+
+def draw_simulation(results: PaperResults) -> Figure:
+    """Fig. 2: the simulated plant, GOBF as we search, and GOBF as the paper searched."""
+    shown = results.simulation
+    omega = shown.omega_rad_s
+    curves = [
+        Curve("simulated plant", shown.truth, TRUTH_LINE),
+        Curve(
+            "GOBF, DIRECT alone in the raw box",
+            results.recipe.frequency_response(omega),
+            RECIPE_LINE,
+        ),
+        Curve("GOBF, this project", shown.models["GOBF"].frequency_response(omega), METHOD_LINES["GOBF"]),
+    ]
+    return _bode(shown, curves, "Simulation: plant and GOBF model of order 4")
+
+
+def draw_simulation_peers(results: PaperResults) -> Figure:
+    """Fig. 3: the same plant with ARX, ARMAX and OE from the usual starts."""
+    shown = results.simulation
+    curves = [Curve("simulated plant", shown.truth, TRUTH_LINE), *_methods(shown, METHODS[1:])]
+    return _bode(shown, curves, "Simulation: plant and ARX, ARMAX, OE of order 4, usual starts")
+
+
+def draw_experiment(results: PaperResults) -> Figure:
+    """Fig. 4: the nonlinear arm's models, and the linear arm for truth."""
+    shown = results.experiment
+    curves = [Curve("true linear arm", shown.truth, TRUTH_LINE), *_methods(shown, METHODS)]
+    return _bode(shown, curves, "Experiment (nonlinear arm): models of order 4")
+
+
+def _methods(shown: Comparison, names: tuple[str, ...]) -> list[Curve]:
+    return [
+        Curve(name, shown.models[name].frequency_response(shown.omega_rad_s), METHOD_LINES[name])
+        for name in names
+    ]
+
+
+def _bode(shown: Comparison, curves: list[Curve], title: str) -> Figure:
+    omega, reference = shown.omega_rad_s, curves[0].response
+    with style.house_style():
+        figure = style.new_figure(6.0)
+        gain, phase = figure.subplots(2, 1, sharex=True, height_ratios=[1.25, 1.0])
+        for curve in curves:
+            gain.plot(omega, decibels(np.abs(curve.response)), **curve.line, label=curve.label)
+            phase.plot(omega, _phase(omega, curve.response, reference), **curve.line)
+        _frequency_axes(gain, phase, omega)
+        gain.set_title(title)
+        gain.set_ylabel(f"gain [dB re 1 {shown.machine.gain_unit}]")
+        phase.set_ylabel("phase [deg]")
+        phase.yaxis.set_major_locator(MultipleLocator(180))
+        figure.align_ylabels()
+        style.finish(figure, gain, columns=4)
+    return figure
+
+
+def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
+    """Fig. 7: two-sigma bounds of both recipes on one record, the truth, and its distance from the centre."""
+    colours = {"classical": PAPER_WAY, "tangent": OUR_WAY}
+    with style.house_style():
+        figure = style.new_figure(7.4)
+        grid = figure.subplots(3, 2, sharex=True, sharey="row", height_ratios=[1.5, 1.1, 0.9])
+        floor = decibels(np.abs(study.truth).min()) - 20
+        for column, (name, bound) in enumerate(study.bounds.items()):
+            gain, phase, distance = grid[:, column]
+            _band(gain, phase, bound, study.truth, colours[name], name, float(floor))
+            distance.axhspan(1e-3, 1.0, color=colours[name], alpha=0.15, lw=0)
+            for values, words, line in (
+                (study.distance[name], "distance, this record", {"ls": "-"}),
+                (study.distance_frictionless[name], "distance, same arm without friction", {"ls": ":"}),
+            ):
+                shown = np.maximum(values, 1e-3)
+                distance.plot(study.omega_rad_s, shown, color=style.REFERENCE, lw=1.2, **line, label=words)
+            distance.set_yscale("log")
+            distance.set_xlabel("frequency [rad/s]")
+            _frequency_axes(gain, distance, study.omega_rad_s)
+            share = study.inside_percent[name][0]
+            low, high = JUDGED_BAND_RAD_S
+            gain.set_title(f"{name}: truth inside at {share:.0f} % of {low:.0f} to {high:.0f} rad/s")
+        grid[0, 0].set_ylabel(f"gain [dB re 1 {gain_unit}]")
+        grid[1, 0].set_ylabel("phase [deg]")
+        grid[1, 0].yaxis.set_major_locator(MultipleLocator(180))
+        grid[2, 0].set_ylabel("distance of\ntruth [2 sigma]")
+        largest = max(float(values.max()) for values in study.distance.values())
+        grid[2, 0].set_ylim(0.05, max(100.0, 1.5 * largest))
+        grid[0, 0].set_ylim(floor, decibels(np.abs(study.truth).max()) + 10)
+        span = unwrapped_degrees(study.truth)
+        grid[1, 0].set_ylim(span.min() - 200, span.max() + 100)
+        figure.align_ylabels()
+        style.finish(figure, [*grid[0], grid[2, 0]], columns=4)
+    return figure
+
+
+def _band(
+    gain: Axes,
+    phase: Axes,
+    bound: FrequencyUncertainty,
+    truth: ComplexArray,
+    colour: str,
+    name: str,
+    floor: float,
+) -> None:
+    band = response_band(bound)
+    low = np.maximum(decibels(np.maximum(band.gain_low, 1e-300)), floor - 50)
+    fill: dict[str, Any] = {"color": colour, "alpha": 0.35, "lw": 0}
+    omega = band.omega_rad_s
+    gain.fill_between(omega, low, decibels(band.gain_high), **fill, label=f"2 sigma, {name}")
+    gain.plot(omega, decibels(band.gain), color=colour, lw=1.4, label=f"centre, {name}")
+    gain.plot(omega, decibels(np.abs(truth)), **TRUTH_LINE, label="true linear arm")
+    turn = _turn(omega, band.phase_deg, unwrapped_degrees(truth))
+    phase.fill_between(omega, band.phase_low_deg + turn, band.phase_high_deg + turn, **fill)
+    phase.plot(omega, band.phase_deg + turn, color=colour, lw=1.4)
+    phase.plot(omega, unwrapped_degrees(truth), **TRUTH_LINE)
+
+
+def _frequency_axes(top: Axes, bottom: Axes, omega: RealArray) -> None:
+    top.set_xscale("log")
+    top.set_xlim(omega[0], omega[-1])
+    style.hertz_axis(top)
+    bottom.set_xlabel("frequency [rad/s]")
+
+
+def _phase(omega: RealArray, response: ComplexArray, reference: ComplexArray) -> RealArray:
+    phase, target = unwrapped_degrees(response), unwrapped_degrees(reference)
+    return phase + _turn(omega, phase, target)
+
+
+def _turn(omega: RealArray, phase: RealArray, target: RealArray) -> float:
+    """Whole turns that bring a phase nearest to the target at low frequency, where all models know it."""
+    near = (omega >= _COMMON_TURN_RAD_S[0]) & (omega <= _COMMON_TURN_RAD_S[1])
+    return float(360 * np.round(np.median(target[near] - phase[near]) / 360))
+
+
+def decibels(gain: Any) -> Any:
+    """20 log10."""
+    return 20 * np.log10(gain)

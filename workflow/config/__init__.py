@@ -1,0 +1,1 @@
+"""Configuration of a run, checked with the offending key named."""

@@ -1,0 +1,108 @@
+"""What is asked about a design beyond its margins: any order's reach, whole responses, a prefilter."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from control_design.convex.reference_filter import PrefilterOptions
+from control_design.convex.youla import YoulaOptions
+from control_design.specification import RationalWeight
+
+FEWEST_DRAWS = 100
+_LASTING = 100.0  # how much more than a passing error one weighs that lasts
+
+
+class CertificateOptions(BaseModel):
+    """[certificate]: what is said of whole responses, of which the ellipses know one frequency at a time."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    joint_coverage: float = Field(
+        0.95, gt=0, lt=1, description="share of whole responses for which the worst case shall hold"
+    )
+    joint_draws: int = Field(
+        2000, ge=0, le=100_000, description="whole responses drawn from the posterior; 0: none"
+    )
+    calibrate: bool = Field(
+        False,
+        description="certify over ellipses of the level at which the worst case holds for joint_coverage of "
+        "the whole responses, where that is above the level of the ellipses, and design so that 99.9 % of "
+        "them are stable; false: say what the worst case holds for",
+    )
+
+    @model_validator(mode="after")
+    def _enough_draws(self) -> Self:
+        if 0 < self.joint_draws < FEWEST_DRAWS:
+            raise ValueError(f"joint_draws must be 0 or at least {FEWEST_DRAWS}; got {self.joint_draws}")
+        if self.calibrate and not self.joint_draws:
+            raise ValueError("calibrate needs joint_draws")
+        return self
+
+
+class YardstickOptions(YoulaOptions):
+    """[yardstick]: what a controller of any order could reach (Youla bracket), how finely it is sought."""
+
+    compute: bool = Field(True, description="false: the design is not compared with other orders")
+
+
+class PrefilterSettings(PrefilterOptions):
+    """[prefilter]: second degree of freedom, u = K (F r - y), designed after K to follow a model."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    corner_rad_s: float | None = Field(
+        None, gt=0, description="the model is 1/(s/corner + 1)^model_order; this or model"
+    )
+    model_order: int = Field(2, ge=1, le=6, description="order of that model")
+    model: RationalWeight | None = Field(
+        None, description="the model itself: numerator and denominator in s, e.g. of a step with overshoot"
+    )
+    weight: Literal["steps", "flat"] | RationalWeight = Field(
+        "steps",
+        description="weight of the matching error. steps: (s + w)/(s + w/100), w the corner of the model, so "
+        "that errors which last weigh most; flat: 1, the largest error at any frequency, which a filter may "
+        "then keep for seconds; or numerator and denominator in s",
+    )
+
+    @model_validator(mode="after")
+    def _one_model(self) -> Self:
+        if (self.corner_rad_s is None) == (self.model is None):
+            raise ValueError("give either corner_rad_s or model")
+        if self.model is not None and "model_order" in self.model_fields_set:
+            raise ValueError("model_order goes with corner_rad_s")
+        return self
+
+    @property
+    def error_weight(self) -> RationalWeight | None:
+        """W(s) of the matching error; None is 1."""
+        if self.weight == "flat":
+            return None
+        if isinstance(self.weight, RationalWeight):
+            return self.weight
+        corner = self.corner_rad_s or self._corner()
+        return RationalWeight(numerator=(1.0, corner), denominator=(1.0, corner / _LASTING))
+
+    def _corner(self) -> float:
+        """Where the model has fallen by 3 dB, rad/s; its fastest pole where it never does."""
+        model = self.reference_model
+        poles = np.abs(np.roots(model.denominator))
+        omega = np.geomspace(1e-3 * poles.min(initial=1.0), 1e3 * poles.max(initial=1.0), 4000)
+        size = np.abs(model.at(1j * omega))
+        below = np.flatnonzero(size < size[0] / np.sqrt(2))
+        return float(omega[below[0]] if below.size else poles.max(initial=1.0))
+
+    @property
+    def reference_model(self) -> RationalWeight:
+        """T_ref(s)."""
+        if self.model is not None:
+            return self.model
+        assert self.corner_rad_s is not None
+        denominator = [1.0]
+        for _ in range(self.model_order):
+            # times (s/corner + 1)
+            scaled = [value / self.corner_rad_s for value in denominator] + [0.0]
+            denominator = [a + b for a, b in zip(scaled, [0.0, *denominator], strict=True)]
+        return RationalWeight(numerator=(1.0,), denominator=tuple(denominator))

@@ -1,0 +1,361 @@
+"""`RunConfig`: everything a run depends on, from one TOML file; every key has a default where one makes
+sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from control_design.specification import Specification
+from control_design.synthesis.synthesis import SynthesisOptions
+from ident.basis.options import IdentOptions
+from ident.uncertainty.embedding import EmbeddingOptions
+from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.excitations import Excitation
+from workflow.config.rig_settings import EffectTable, RigChoice
+from workflow.config.settings import InputPath, check, read_toml
+
+Role = Literal["estimation", "validation", "repeat"]
+Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
+
+
+class Section(BaseModel):
+    """Unknown keys are refused by name; nothing changes after loading; nan and inf are no settings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class RunSection(Section):
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)] = Field(
+        "run", description="names the default output directory; letters, digits, '_', '-' and '.'"
+    )
+    title: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$", max_length=120)] = Field(
+        "", description="headline of the report; the name if empty"
+    )
+    seed: int = Field(2006, ge=0, description="root of every random stream of the run")
+
+
+# -- where records come from
+# -----------------------------------------------------------------------------------
+
+
+class SimulatedRecord(Section):
+    """One experiment on the simulated arm."""
+
+    name: Name
+    role: Role = "estimation"
+    condition: str | None = Field(None, description="records with the same label are repeats of one another")
+    remark: str = Field("", description="shown beside the record in the report")
+    excitation: Excitation
+
+
+class SimulatedSource(Section):
+    kind: Literal["simulated"]
+    rig: RigChoice = Field("paper_link", description="preset 'paper_link', or the path of a rig TOML file")
+    modes: int | None = Field(
+        None, ge=1, le=20, description="flexible modes; default: all below Nyquist, at least 3"
+    )
+    effects: tuple[EffectTable, ...] = Field(
+        (), description="what the nominal rig does not have, e.g. coulomb_friction"
+    )
+    encoder_step_rad: float = Field(0.0, ge=0, description="resolution of the hub encoder; 0 is none")
+    records: tuple[SimulatedRecord, ...] = Field(min_length=1)
+
+
+class FileRecord(Section):
+    """One log file; keys left out are taken from [source]."""
+
+    path: InputPath = Field(
+        description="csv, npz or mat; relative to this file; ${FLEXLINK_DATA} is expanded"
+    )
+    name: Name | None = Field(None, description="default: the file name without its ending")
+    role: Role = "estimation"
+    condition: str | None = None
+    remark: str = ""
+    time: str | None = Field(None, description="name of the time column [s]")
+    dt_s: float | None = Field(None, gt=0, description="sampling period, where there is no time column")
+    references: tuple[str, ...] | None = None
+    start_sample: int = Field(0, ge=0, description="first row used, counted from 0")
+    stop_sample: int | None = Field(None, ge=1, description="row after the last one used")
+    mirrored: bool = Field(
+        False, description="take every signal with its sign changed (all of them, so G is the same)"
+    )
+
+
+class FileSource(Section):
+    kind: Literal["files"]
+    time: str | None = Field(None, description="name of the time column [s]; give this or dt_s")
+    dt_s: float | None = Field(None, gt=0, description="sampling period [s]; give this or time")
+    references: tuple[str, ...] = Field((), description="reference columns of logs made in closed loop")
+    units: Mapping[str, str] = Field(
+        default_factory=dict, description="unit of a column, for axes: {theta_rad = 'rad'}"
+    )
+    records: tuple[FileRecord, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _time_is_known(self) -> Self:
+        if self.time is not None and self.dt_s is not None:
+            raise ValueError("give time (a column) or dt_s (a number), not both")
+        for index, record in enumerate(self.records):
+            if record.time is not None and record.dt_s is not None:
+                raise ValueError(f"records[{index}]: give time (a column) or dt_s (a number), not both")
+            if not any((self.time, self.dt_s, record.time, record.dt_s)):
+                raise ValueError(
+                    f"records[{index}] has no time base: give time = 'column name' or dt_s = seconds in "
+                    "[source]"
+                )
+            if record.stop_sample is not None and record.stop_sample <= record.start_sample:
+                raise ValueError(
+                    f"records[{index}].stop_sample must be above start_sample {record.start_sample}, "
+                    f"got {record.stop_sample}"
+                )
+        return self
+
+
+Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
+
+
+# -- what is made of them
+# --------------------------------------------------------------------------------------
+
+
+class UncertaintyOptions(EmbeddingOptions):
+    """How the ellipses around an identified response are made (design 4.5)."""
+
+    method: Literal["tangent", "records", "conditions", "classical"] = Field(
+        "tangent",
+        description="tangent: covers noise; records: tangent per record plus the scatter between records, "
+        "for arms that differ from run to run or with amplitude (four records or more); conditions: the same "
+        "between records of different condition; classical: the published recipe, for comparison",
+    )
+    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
+
+
+def _ordered(band: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < band[0] < band[1]:
+        raise ValueError(f"a band needs 0 < low < high in rad/s; got {band[0]}, {band[1]}")
+    return band
+
+
+Band = Annotated[tuple[float, float], AfterValidator(_ordered)]
+
+
+class Channel(Section):
+    """One input to one output."""
+
+    input: str = Field(min_length=1, description="column or signal name")
+    output: str = Field(min_length=1, description="column or signal name")
+    name: Name | None = Field(None, description="default: the output's name")
+    purpose: Literal["control", "performance"] | None = Field(
+        None,
+        description="'control' is measured and fed back, 'performance' is what should not swing; "
+        "default: control for the first channel, performance for the others",
+    )
+    increments: bool = Field(
+        False,
+        description="fit sample-to-sample differences of input and output: the response is the same, "
+        "drift and friction weigh less",
+    )
+    band_rad_s: Band | None = Field(
+        None,
+        description="fit inside this band: input and output go through the same filter, which leaves the "
+        "response as it is and takes drift, friction and noise outside the band away",
+    )
+    bounds_band_rad_s: Band | None = Field(
+        None, description="band of the data behind the ellipses, where it is wider than that of the poles"
+    )
+    identification: IdentOptions = Field(default_factory=IdentOptions)
+    uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
+
+    @model_validator(mode="after")
+    def _one_filter(self) -> Self:
+        if self.input == self.output:
+            raise ValueError(f"input and output are the same column, {self.input!r}")
+        if self.increments and (self.band_rad_s or self.bounds_band_rad_s):
+            raise ValueError("give increments or a band, not both: each is a filter of its own")
+        if self.bounds_band_rad_s is not None and self.band_rad_s is None:
+            raise ValueError("bounds_band_rad_s goes with band_rad_s, the band of the fit")
+        return self
+
+    @property
+    def label(self) -> str:
+        return self.name or self.output
+
+
+class ClosedLoopData(Section):
+    """How logs made under feedback are used."""
+
+    method: Literal["direct", "two_stage"] = Field(
+        "direct",
+        description="direct: the logged input as it is; two_stage: the input explained by the reference",
+    )
+
+
+class ClosedLoopOptions(Section):
+    """The check in closed loop."""
+
+    machine: Literal["simulated", "identified"] | None = Field(
+        None,
+        description="'simulated': nonlinear arm of [source]; 'identified': plants drawn from the identified "
+        "uncertain model; default: simulated where the records are",
+    )
+    effects: tuple[EffectTable, ...] = Field(
+        (), description="further effects on the simulated arm, e.g. tip_payload"
+    )
+    reference_step: float | None = Field(
+        None,
+        gt=0,
+        description="in units of the measured output; default: half its spread in the estimation records",
+    )
+    disturbance: float | None = Field(
+        None,
+        description="step at the plant's input half-way, its units; default: a tenth of the input's spread",
+    )
+    quantisation: float = Field(
+        0.0, ge=0, description="step of the converter at the plant's input, in its units"
+    )
+    measurement_step: float = Field(0.0, ge=0, description="step of the measured output, e.g. an encoder's")
+    duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
+    draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
+    sensitivity: bool = Field(True, description="on the simulated arm: measure S, predicted beside measured")
+    conditions: bool = Field(
+        True,
+        description="on the simulated arm: run slew, push at the tip, payloads 0 to 200 %, delay, friction, "
+        "coarse converters and a step beyond the voltage limit",
+    )
+
+
+class Notes(Section):
+    """What is known and not known about the rig; shown in the report as written."""
+
+    known: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
+
+
+class RunConfig(Section):
+    """A whole run. Load with `load_config`."""
+
+    run: RunSection = Field(default_factory=RunSection)
+    source: Source
+    channels: tuple[Channel, ...] = Field(min_length=1)
+    closed_loop_data: ClosedLoopData = Field(default_factory=ClosedLoopData)
+    specification: Specification
+    synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
+    certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
+    yardstick: YardstickOptions = Field(default_factory=lambda: YardstickOptions.model_validate({}))
+    prefilter: PrefilterSettings | None = Field(
+        None, description="second degree of freedom; none: the reference goes to the loop as it is"
+    )
+    closed_loop: ClosedLoopOptions = Field(default_factory=ClosedLoopOptions)
+    notes: Notes = Field(default_factory=Notes)
+
+    @model_validator(mode="after")
+    def _parts_fit_together(self) -> Self:
+        labels = [channel.label for channel in self.channels]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ValueError(f"two channels are called {label!r}: give them different names")
+        control = [label for index, label in enumerate(labels) if self.purpose_of(index) == "control"]
+        if len(control) != 1:
+            raise ValueError(
+                f"exactly one channel has purpose 'control' (the one fed back); found {len(control)}"
+            )
+        if len({channel.input for channel in self.channels}) > 1:
+            raise ValueError("all channels must have the same input: the controller drives one actuator")
+        names = self.record_names
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two records are called {name!r}: give them different names")
+        self._refuse_the_same_rows_twice()
+        if not any(record.role == "estimation" for record in self.source.records):
+            raise ValueError("no record has role 'estimation': there is nothing to identify from")
+        if self.closed_loop.machine == "simulated" and self.source.kind != "simulated":
+            raise ValueError("closed_loop.machine = 'simulated' needs [source] kind = 'simulated'")
+        if self.closed_loop.effects and self.machine != "simulated":
+            raise ValueError("closed_loop.effects act on the simulated arm only")
+        if self.closed_loop_data.method == "two_stage" and not self._has_references:
+            raise ValueError(
+                "closed_loop_data.method = 'two_stage' needs references in [source] for every record"
+            )
+        return self
+
+    def _refuse_the_same_rows_twice(self) -> None:
+        """Rows counted twice shrink every bound, and rows that were fitted validate nothing."""
+        if not isinstance(self.source, FileSource):
+            return
+        for first, second in combinations(self.source.records, 2):
+            ends = [math.inf if r.stop_sample is None else r.stop_sample for r in (first, second)]
+            overlap = first.start_sample < ends[1] and second.start_sample < ends[0]
+            if first.path == second.path and overlap:
+                raise ValueError(
+                    f"records {record_name(first)!r} and {record_name(second)!r} share rows of "
+                    f"{first.path.name}: use each row once"
+                )
+
+    @property
+    def _has_references(self) -> bool:
+        if isinstance(self.source, SimulatedSource):
+            return False
+        return all(self.source.references or record.references for record in self.source.records)
+
+    @property
+    def record_names(self) -> list[str]:
+        return [record_name(record) for record in self.source.records]
+
+    @property
+    def machine(self) -> Literal["simulated", "identified"]:
+        """What the closed loop is checked on."""
+        return self.closed_loop.machine or ("simulated" if self.source.kind == "simulated" else "identified")
+
+    @property
+    def control_channel(self) -> Channel:
+        """The channel that is fed back."""
+        return self.channels[self.control_index]
+
+    def purpose_of(self, index: int) -> Literal["control", "performance"]:
+        """Purpose of a channel with the default filled in."""
+        return self.channels[index].purpose or ("control" if index == 0 else "performance")
+
+    @property
+    def control_index(self) -> int:
+        """Position of the control channel."""
+        return next(index for index in range(len(self.channels)) if self.purpose_of(index) == "control")
+
+    @property
+    def performance_index(self) -> int | None:
+        """Position of the first performance channel, the one the damping requirement is about."""
+        found = [index for index in range(len(self.channels)) if self.purpose_of(index) == "performance"]
+        return found[0] if found else None
+
+    @property
+    def input_files(self) -> list[Path]:
+        """Every file the run reads besides its configuration."""
+        if isinstance(self.source, FileSource):
+            return sorted({record.path for record in self.source.records})
+        return [self.source.rig] if isinstance(self.source.rig, Path) else []
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON-able, every default filled in; `from_document` gives back an equal configuration."""
+        return self.model_dump(mode="json")
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], *, source: str) -> RunConfig:
+        """Inverse of `to_document`; input files may have moved away since (a report needs them no more)."""
+        return check(cls, document, source=source, context={"may_be_gone": True})
+
+
+def record_name(record: SimulatedRecord | FileRecord) -> str:
+    """Name of a record with the default filled in."""
+    return record.name if record.name is not None else record.path.stem
+
+
+def load_config(path: Path) -> tuple[RunConfig, str]:
+    """Configuration and its text. Raises InputError: one line naming file, dotted key and what was
+    expected."""
+    text, document = read_toml(path)
+    return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text

@@ -1,0 +1,195 @@
+"""TOML files checked by pydantic, with every complaint on one line: file, dotted key, what was expected."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ValidationError, ValidationInfo
+from pydantic_core import ErrorDetails
+
+from workflow.engine.errors import InputError
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+_VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
+
+
+def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
+    """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows like to put a mark in front
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+    try:
+        return text, tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+
+
+def check(
+    model: type[ModelT], document: Any, *, source: str, context: Mapping[str, Any] | None = None
+) -> ModelT:
+    """`document` as a `model`. Raises InputError: one line with `source`, the dotted key and what was
+    expected."""
+    try:
+        found = model.model_validate(document, context=dict(context or {}))
+    except ValidationError as error:
+        raise InputError(f"{source}: {_first_complaint(model, error)}") from error
+    converted = _first_converted(document, found)
+    if converted:
+        raise InputError(f"{source}: {converted}")
+    return found
+
+
+def _first_converted(given: Any, found: Any, where: str = "") -> str | None:
+    """Complaint about the first value that pydantic took for a number or a switch although it was written as
+    something else.
+
+    `true` is no 1.0 and `"2"` no 2; pydantic's own strict mode would refuse TOML's lists for tuples as well.
+    """
+    if isinstance(given, Mapping):
+        for key, value in given.items():
+            inner = found.get(key) if isinstance(found, Mapping) else getattr(found, str(key), None)
+            complaint = _first_converted(value, inner, f"{where}.{key}" if where else str(key))
+            if complaint:
+                return complaint
+    elif isinstance(given, (list, tuple)) and isinstance(found, (list, tuple)) and len(given) == len(found):
+        for index, (value, inner) in enumerate(zip(given, found, strict=True)):
+            complaint = _first_converted(value, inner, f"{where}[{index}]")
+            if complaint:
+                return complaint
+    elif isinstance(found, bool) and not isinstance(given, bool):
+        return f"{where}: input should be true or false, got {_short(given)}"
+    elif isinstance(found, (int, float)) and not isinstance(found, bool) and isinstance(given, (bool, str)):
+        return f"{where}: input should be a number, got {_short(given)}"
+    return None
+
+
+def _first_complaint(model: type[BaseModel], error: ValidationError) -> str:
+    # A misspelt key is also a missing one: the unknown key is what the reader can act on, so it goes first.
+    details = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
+    if len(details) > 1 and all(item["type"] == "missing" for item in details):
+        return "missing keys " + ", ".join(_walk(model, item["loc"])[0] for item in details)
+    rest = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    return _complaint(model, details[0]) + rest
+
+
+def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
+    kind, message = detail["type"], detail["msg"]
+    key, known = _walk(model, detail["loc"])
+    if kind == "extra_forbidden":
+        close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else "known keys: " + ", ".join(sorted(known))
+        return f"unknown key {key} ({hint})"
+    if kind == "missing":
+        return f"missing key {key}"
+    if kind == "union_tag_not_found":
+        return f"missing key {key}.{_bare(detail['ctx']['discriminator'])}"
+    if kind == "union_tag_invalid":
+        context = detail["ctx"]
+        discriminator = _bare(context["discriminator"])
+        return f"{key}.{discriminator}: expected one of {context['expected_tags']}, got {context['tag']!r}"
+    message = message.removeprefix("Value error, ")
+    where = f"{key}: " if key else ""
+    if kind == "value_error":
+        return where + message
+    message = message[:1].lower() + message[1:]
+    return f"{where}{message}, got {_short(detail['input'])}"
+
+
+def _bare(text: object) -> str:
+    return str(text).strip("'")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _walk(model: type[BaseModel], location: Iterable[int | str]) -> tuple[str, list[str]]:
+    """Dotted key as the user wrote it, and the keys known where it stands.
+
+    pydantic puts the tag of a discriminated union into the location; the user never wrote it, so it is left
+    out.
+    """
+    parts: list[str] = []
+    here: list[type[BaseModel]] = [model]
+    known = _keys(here)
+    for step in location:
+        if isinstance(step, int):
+            parts.append(f"[{step}]")
+            continue
+        tagged = [candidate for candidate in here if step in _tags(candidate)]
+        if tagged and not any(step in candidate.model_fields for candidate in here):
+            here = tagged
+            known = _keys(here)
+            continue
+        known = _keys(here)
+        parts.append(f".{step}" if parts else step)
+        annotations = [c.model_fields[step].annotation for c in here if step in c.model_fields]
+        here = [found for annotation in annotations for found in _models_in(annotation)]
+    return "".join(parts), known
+
+
+def _keys(models: Iterable[type[BaseModel]]) -> list[str]:
+    return sorted({field.alias or name for model in models for name, field in model.model_fields.items()})
+
+
+def _tags(model: type[BaseModel]) -> set[str]:
+    field = model.model_fields.get("kind")
+    return {str(value) for value in get_args(field.annotation)} if field else set()
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _models_in(part)]
+
+
+def expand(text: str) -> str:
+    """`${NAME}` replaced from the environment. Raises ValueError naming a variable that is not set."""
+
+    def value(match: re.Match[str]) -> str:
+        name = match.group(1)
+        found = os.environ.get(name)
+        if not found:
+            raise ValueError(
+                f"environment variable {name} is not set; set it to the folder meant by {text!r}"
+            )
+        return found
+
+    return _VARIABLE.sub(value, text)
+
+
+def _expand_before(value: Any) -> Any:
+    return expand(value) if isinstance(value, str) else value
+
+
+def resolve(path: Path, info: ValidationInfo, *, kind: str = "file") -> Path:
+    """Relative to the `base` of the validation context; must be a file unless `may_be_gone` is set there.
+
+    Raises ValueError saying what was found instead.
+    """
+    context = info.context or {}
+    base = context.get("base")
+    resolved = Path(os.path.normpath(Path(base) / path)) if base else path
+    if not context.get("may_be_gone") and not resolved.is_file():
+        if resolved.is_dir():
+            raise ValueError(f"expected a {kind}, found a directory: {resolved}")
+        raise ValueError(f"no such {kind}: {resolved}")
+    return resolved
+
+
+def _input_path(path: Path, info: ValidationInfo) -> Path:
+    return resolve(path, info)
+
+
+InputPath = Annotated[Path, BeforeValidator(_expand_before), AfterValidator(_input_path)]

@@ -1,0 +1,1 @@
+"""Storage, run directories, errors, progress, random streams."""

@@ -1,0 +1,1 @@
+"""The steps from a log or an arm to a certified controller."""

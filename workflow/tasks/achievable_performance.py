@@ -1,0 +1,110 @@
+"""How far a design is from what a controller of any order could reach: the Youla bracket, found and told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from control_design.convex.youla import YoulaBracket, YoulaOptions, youla_bracket
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification, SpecificationError
+from workflow.config.design_options import YardstickOptions
+
+# Requirements that the bracket does not know: a bracket of other values of these is the same.
+UNKNOWN_TO_BRACKET = (
+    "controller_order",
+    "structure",
+    "controller_damping",
+    "delay_margin_s",
+    "mode_damping",
+    "input_limit",
+    "rate_limit",
+)
+
+
+def find_bracket(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: YardstickOptions,
+    progress: Callable[[float, str], None] | None = None,
+) -> dict[str, Any]:
+    """{bracket: YoulaBracket.to_dict() or null, reason: null or why there is none}."""
+    if not options.compute:
+        return {"bracket": None, "reason": "not asked for ([yardstick] compute = false)"}
+    youla = YoulaOptions(**options.model_dump(exclude={"compute"}))
+    try:
+        bracket = youla_bracket(plants, specification, youla, progress=progress)
+    except SpecificationError as impossible:
+        return {"bracket": None, "reason": str(impossible)}
+    except (ValueError, ArithmeticError) as unfit:
+        return {"bracket": None, "reason": f"the parametrisation does not take this plant: {unfit}"}
+    return {"bracket": bracket.to_dict(), "reason": None}
+
+
+def bracket_of(document: Mapping[str, Any]) -> YoulaBracket | None:
+    """The bracket of `find_bracket`'s answer; None also for an empty document (a run made before)."""
+    found = document.get("bracket")
+    if found is None:
+        return None
+    # In the document both "infinite" and "no hull sought" are null; the second is what a missing hull means.
+    plants = [
+        {key: value for key, value in plant.items() if key != "hull" or value is not None}
+        for plant in found["plants"]
+    ]
+    return YoulaBracket.from_dict({"plants": plants})
+
+
+def bracket_numbers(document: Mapping[str, Any], gamma: float | None) -> dict[str, Any]:
+    """Numbers for JSON and tables: what any order reaches, the floor, how far gamma is above in percent."""
+    bracket = bracket_of(document)
+    if bracket is None:
+        return {"reached": None, "floor": None, "above_percent": None, "reason": document.get("reason")}
+    reached, floor = _finite(bracket.ellipse), _finite(bracket.floor)
+    known = gamma is not None and math.isfinite(gamma) and reached is not None
+    return {
+        "reached": reached,
+        "floor": floor,
+        "above_percent": 100.0 * (gamma / reached - 1.0) if known and gamma and reached else None,
+        "reason": None,
+        "bracket": bracket.to_dict(),
+    }
+
+
+def yardstick_words(document: Mapping[str, Any], gamma: float | None, order: int) -> str | None:
+    """One sentence on the order chosen; None where there is nothing to say."""
+    bracket = bracket_of(document)
+    if bracket is None:
+        reason = document.get("reason")
+        return f"not compared with other orders: {reason}" if reason else None
+    if gamma is None or not math.isfinite(gamma):
+        if not math.isfinite(bracket.ellipse):
+            return "no controller of any order is known to stabilise every member of the ellipses"
+        return f"a controller of any order is known to reach gamma {bracket.ellipse:.4g}"
+    return bracket.sentence(gamma, order)
+
+
+def order_advice(document: Mapping[str, Any], gamma: float, order: int) -> str | None:
+    """Whether a higher order could meet what was missed; None where the bracket says nothing.
+
+    The bracket knows neither structure nor damping of the controller's poles, and with several plants it is
+    what one controller per plant reaches: more than that no order gives.
+    """
+    bracket = bracket_of(document)
+    if bracket is None or not math.isfinite(bracket.ellipse):
+        return None
+    reached = bracket.ellipse
+    if reached > 1.0:
+        return (
+            f"a higher order does not help: a controller of very high order reaches {reached:.4g} here "
+            f"(this one {gamma:.4g}, 1 is needed); ask for less"
+        )
+    several = ", one for each plant" if len(bracket.plants) > 1 else ""
+    return (
+        f"controller_order = {order} is too low: controllers of very high order{several} reach {reached:.4g} "
+        f"(this one {gamma:.4g}, at most 1 is needed)"
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

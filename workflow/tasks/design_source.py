@@ -1,0 +1,487 @@
+"""Plants for `flexlink design`, from whatever file describes them, with what the design file says of them.
+
+A source is one of
+    a run directory;
+    .npz written by `flexlink identify --out` (model and posterior);
+    .json or .mat written by `flexlink identify --export` (model and ellipses);
+    .json, .mat or .npz with plain A, B, C, D and dt_s of a user's own discrete model;
+    .csv with a measured frequency response: with variances, or repeated points.
+Several sources are several plants that one controller has to serve.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import control
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from control_design.plants.plant_set import UncertainPlant, count_integrators
+from control_design.plants.stated_uncertainty import StatedDiscs
+from control_design.specification import RationalWeight, Specification
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from ident.basis.model import GobfModel
+from ident.basis.model_files import FORMAT, ModelFile
+from ident.basis.options import IdentOptions
+from ident.data.frf_records import FrfRepeats
+from ident.data.mat_files import mat_variables
+from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.run_config import RunConfig, Section
+from workflow.config.settings import InputPath, ModelT, check, read_toml
+from workflow.engine import storage
+from workflow.engine.errors import InputError, naming
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.pipeline import config_of
+from workflow.tasks.stages.results import load_plant
+
+_SAMPLING_TIME = ("dt_s", "dt", "Ts")
+_STATE_SPACE_FILES = (".json", ".mat", ".npz")
+
+
+class PlantSection(Section):
+    """[plant] of a design file: what a file with a plant does not say itself."""
+
+    integrators: int = Field(0, ge=0, le=2, description="poles at z = 1 that the plant is known to have")
+    dt_s: float | None = Field(None, gt=0, description="sampling period behind a measured response [s]")
+    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse of a measured response")
+    ellipses: Literal["measured", "fitted"] = Field(
+        "measured",
+        description="of a measured response: its own covariances at its own frequencies, or the posterior of "
+        "a model fitted to it, known at every frequency",
+    )
+    nominal: InputPath | None = Field(
+        None,
+        description="model (state space) whose poles stand for a measured response; none: one is fitted",
+    )
+    fit: IdentOptions = Field(
+        default_factory=IdentOptions, description="how a model is fitted to a measured response"
+    )
+    pool_neighbours: int = Field(
+        0, ge=0, le=50, description="repeats: frequencies on either side whose scatter is pooled"
+    )
+    outlier_threshold: float | None = Field(
+        None, gt=0, description="repeats: points farther out, in robust standard deviations, are dropped"
+    )
+    between_points: Literal["nothing", "linear"] = Field(
+        "nothing",
+        description="what the certificate may assume of ellipses between their own frequencies",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if "integrators" in self.fit.model_fields_set:
+            raise ValueError("fit.integrators: say integrators in [plant] itself")
+        if self.ellipses == "fitted" and self.nominal is not None:
+            raise ValueError("ellipses = 'fitted' makes its own nominal: leave nominal out")
+        return self
+
+
+class StatedUncertainty(Section):
+    """[uncertainty] of a design file: how far a plant may be from a plain state space."""
+
+    multiplicative: RationalWeight | None = Field(
+        None, description="|G - G_nom|/|G_nom| at most this: a number, or numerator and denominator in s"
+    )
+    additive: RationalWeight | None = Field(
+        None, description="|G - G_nom| at most this: a number, or numerator and denominator in s"
+    )
+
+    @field_validator("multiplicative", "additive", mode="before")
+    @classmethod
+    def _constant(cls, value: Any) -> Any:
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not 0 < value < np.inf:
+                raise ValueError(f"a constant radius must be positive and finite; got {value}")
+            return {"numerator": [float(value)], "denominator": [1.0]}
+        return value
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.multiplicative is None) == (self.additive is None):
+            raise ValueError("give either multiplicative or additive")
+        return self
+
+    def around(self, nominal: control.StateSpace) -> StatedDiscs:
+        """The discs around a nominal."""
+        if self.multiplicative is not None:
+            return StatedDiscs(nominal, self.multiplicative, "multiplicative")
+        assert self.additive is not None
+        return StatedDiscs(nominal, self.additive, "additive")
+
+
+@dataclass(frozen=True)
+class DesignFile:
+    """What a design file says; specification None where there is no file."""
+
+    specification: Specification | None = None
+    synthesis: SynthesisOptions | None = None
+    plant: PlantSection = field(default_factory=PlantSection)
+    uncertainty: StatedUncertainty | None = None
+    certificate: CertificateOptions | None = None
+    yardstick: YardstickOptions | None = None
+    prefilter: PrefilterSettings | None = None
+    path: Path | None = None
+
+    @property
+    def name(self) -> str:
+        return "a design file (--spec FILE)" if self.path is None else str(self.path)
+
+
+def read_design_file(path: Path) -> DesignFile:
+    """TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
+    [uncertainty], [synthesis], [certificate], [yardstick] and [prefilter]; of a run's configuration all of
+    these but the first two are taken. Raises InputError."""
+    _, document = read_toml(path)
+    known = {
+        "specification",
+        "plant",
+        "uncertainty",
+        "synthesis",
+        "certificate",
+        "yardstick",
+        "prefilter",
+    }
+    if "specification" not in document:
+        wanted = {key: value for key, value in document.items() if key not in known}
+    else:
+        wanted = document["specification"]
+        unknown = sorted(set(document) - known)
+        if unknown and "channels" not in document:
+            raise InputError(f"{path}: unknown key {unknown[0]} (known keys: {', '.join(sorted(known))})")
+
+    def table(name: str, model: type[ModelT]) -> ModelT | None:
+        if name not in document:
+            return None
+        base = {"base": path.absolute().parent}
+        return check(model, document[name], source=f"{path} [{name}]", context=base)
+
+    return DesignFile(
+        specification=check(Specification, wanted, source=str(path)),
+        synthesis=table("synthesis", SynthesisOptions),
+        plant=table("plant", PlantSection) or PlantSection.model_validate({}),
+        uncertainty=table("uncertainty", StatedUncertainty),
+        certificate=table("certificate", CertificateOptions),
+        yardstick=table("yardstick", YardstickOptions),
+        prefilter=table("prefilter", PrefilterSettings),
+        path=path,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class DesignSource:
+    """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
+    options (`config`)."""
+
+    plant: UncertainPlant
+    origin: str
+    remarks: tuple[str, ...] = ()
+    config: RunConfig | None = None
+
+    @property
+    def specification(self) -> Specification | None:
+        """What the run was asked for."""
+        return None if self.config is None else self.config.specification
+
+
+def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
+    """All plants, by different names and with one sampling time. Raises InputError: one line that names the
+    file."""
+    paths = [Path(path) for path in paths]
+    for number, path in enumerate(paths):
+        if path.absolute() in [other.absolute() for other in paths[:number]]:
+            raise InputError(f"{path} is given twice: every plant counts once")
+    sources = [load_source(path, design) for path in paths]
+    stated = [source for source in sources if isinstance(source.plant.uncertainty, StatedDiscs)]
+    if design.uncertainty is not None and not stated:
+        raise InputError(
+            f"{design.name} [uncertainty]: nothing to state it for: {paths[0]} brings its own ellipses"
+        )
+    if len(sources) == 1:
+        return sources
+    for path, source in zip(paths[1:], sources[1:], strict=True):
+        if not np.isclose(source.plant.dt_s, sources[0].plant.dt_s, rtol=1e-9, atol=0):
+            raise InputError(
+                f"{path}: sampling time {source.plant.dt_s:.6g} s, but {paths[0]} has "
+                f"{sources[0].plant.dt_s:.6g} s: one controller runs at one"
+            )
+    names = [path.stem if path.suffix else path.name for path in paths]
+    if len(set(names)) < len(names):
+        names = [f"{path.absolute().parent.name}/{path.name}" for path in paths]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in paths]
+    return [
+        replace(source, plant=replace(source.plant, name=name))
+        for source, name in zip(sources, names, strict=True)
+    ]
+
+
+def load_source(path: Path, design: DesignFile) -> DesignSource:
+    """One plant. Raises InputError: one line that names the file."""
+    if path.is_dir():
+        run = RunDirectory.open(path)
+        config = config_of(run)
+        return DesignSource(load_plant(run, config), "run directory", config=config)
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return _measured(path, design)
+    if suffix not in _STATE_SPACE_FILES:
+        known = ", ".join((*_STATE_SPACE_FILES, ".csv"))
+        raise InputError(f"{path}: not a run directory, and the ending is none of {known}")
+    document = _read_document(path, suffix)
+    if "posterior/mean" in document or "model/coefficients" in document:
+        return DesignSource(_with_posterior(path, document), "model and posterior of flexlink identify")
+    if document.get("format") == FORMAT:
+        return _exported(path, suffix, design)
+    return _plain(path, document, design)
+
+
+def _read_document(path: Path, suffix: str) -> dict[str, Any]:
+    """Top-level names and values of a .npz, .json or .mat file."""
+    if suffix == ".npz":
+        return dict(storage.read_npz(path))
+    content = _read_bytes(path)
+    if suffix == ".json":
+        try:
+            document = json.loads(content.decode("utf-8-sig"))
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+        except json.JSONDecodeError as error:
+            raise InputError(
+                f"{path}, line {error.lineno}, column {error.colno}: not JSON ({error.msg})"
+            ) from error
+        if not isinstance(document, dict):
+            raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
+        return document
+    with naming(str(path)):
+        raw = mat_variables(content, path)
+    return {
+        name: "".join(value.ravel().tolist()) if np.asarray(value).dtype.kind == "U" else value
+        for name, value in raw.items()
+    }
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
+
+
+def _with_posterior(path: Path, arrays: Mapping[str, Any]) -> UncertainPlant:
+    """Inverse of `workflow.tasks.log_identification.plant_arrays`."""
+
+    def under(prefix: str) -> dict[str, Any]:
+        return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+
+    try:
+        model = GobfModel.from_arrays(under("model/"))
+        posterior = ResponsePosterior.from_arrays(under("posterior/"))
+        level = float(arrays["level"])
+    except KeyError as error:
+        raise InputError(
+            f"{path}: not written by flexlink identify --out: {error.args[0]!r} is missing"
+        ) from error
+    with naming(str(path)):
+        return UncertainPlant(model.output_name, model.to_control(), posterior, level=level)
+
+
+def _exported(path: Path, suffix: str, design: DesignFile) -> DesignSource:
+    """A model of `flexlink identify --export`: its ellipses, or the stated uncertainty."""
+    content = _read_bytes(path)
+    with naming(str(path)):
+        if suffix == ".json":
+            found = ModelFile.from_json(content.decode("utf-8-sig"), source=str(path))
+        else:
+            found = ModelFile.from_mat(content, source=str(path))
+        nominal, ellipses = found.model.to_control(), found.ellipses
+        if ellipses is None:
+            return _stated(path, found.model.output_name, nominal, design, "exported model")
+        plant = UncertainPlant(found.model.output_name, nominal, ellipses, level=ellipses.level)
+    return DesignSource(plant, "exported model with ellipses", _grid_remarks(plant))
+
+
+def _plain(path: Path, document: Mapping[str, Any], design: DesignFile) -> DesignSource:
+    """A user's own state space."""
+    nominal = read_state_space(path, document)
+    _refuse_untold_integrators(path, nominal, design)
+    return _stated(path, path.stem, nominal, design, "state space")
+
+
+def _stated(
+    path: Path, name: str, nominal: control.StateSpace, design: DesignFile, origin: str
+) -> DesignSource:
+    with naming(str(path)):
+        if design.uncertainty is None:
+            remark = "no uncertainty is stated ([uncertainty] in the design file): the design and its "
+            remark += "certificate hold for exactly this model"
+            return DesignSource(UncertainPlant(name, nominal), origin, (remark,))
+        with naming(f"{design.name} [uncertainty]"):
+            discs = design.uncertainty.around(nominal)
+        return DesignSource(UncertainPlant(name, nominal, discs), origin)
+
+
+def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSpace:
+    """A, B, C, D and dt_s (or dt, Ts) of a file; D may be left out. Raises InputError."""
+    if str(document.get("format", "")).startswith("flexlink-controller"):
+        raise InputError(f"{path}: holds a controller, expected a plant")
+    given = [name for name in _SAMPLING_TIME if name in document]
+    missing = [name for name in "ABC" if name not in document]
+    if missing:
+        raise InputError(
+            f"{path}: no {missing[0]} in it: a plant needs the matrices A, B, C, D and dt_s, found "
+            f"{', '.join(sorted(document)) or 'nothing'}"
+        )
+    if not given:
+        raise InputError(
+            f"{path}: no dt_s in it: the design is discrete, sample a continuous model first (c2d in MATLAB, "
+            "sample in python-control)"
+        )
+    matrices = {name: _matrix(path, name, document[name]) for name in "ABCD" if name in document}
+    dt_s = _matrix(path, given[0], document[given[0]])
+    if dt_s.size != 1 or not dt_s.item() > 0:
+        raise InputError(f"{path}: {given[0]} must be one positive number, the sampling time in seconds")
+    n = round(np.sqrt(matrices["A"].size))
+    wanted = {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}
+    for name, matrix in matrices.items():
+        flat_vector = name != "A" and matrix.ndim < 2
+        if not (matrix.shape == wanted[name] or (matrix.size == np.prod(wanted[name]) and flat_vector)):
+            raise InputError(
+                f"{path}: {name} is {'x'.join(map(str, matrix.shape)) or 'a number'}, expected "
+                f"{wanted[name][0]}x{wanted[name][1]}: one input, one output, A square"
+            )
+        matrices[name] = matrix.reshape(wanted[name])
+    return control.ss(
+        matrices["A"],
+        matrices["B"],
+        matrices["C"],
+        matrices.get("D", np.zeros((1, 1))),
+        dt_s.item(),
+        remove_useless_states=False,
+    )
+
+
+def _matrix(path: Path, name: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    try:
+        matrix = np.asarray(value)
+        if matrix.dtype.kind not in "fiu":
+            raise ValueError
+    except ValueError:
+        raise InputError(f"{path}: {name} must be a matrix of real numbers") from None
+    if not np.all(np.isfinite(matrix)):
+        raise InputError(f"{path}: {name} has a value that is not finite")
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def _refuse_untold_integrators(path: Path, nominal: control.StateSpace, design: DesignFile) -> None:
+    """A pole on the circle decides how often the Nyquist curve has to turn: it is never guessed."""
+    poles = np.asarray(nominal.poles(), dtype=np.complex128)
+    found, told = count_integrators(poles), design.plant.integrators
+    if found == told:
+        return
+    nearest = np.sort(np.abs(poles - 1.0))[: max(told, 1)]
+    if found > told:
+        raise InputError(
+            f"{path}: {found} {'poles' if found > 1 else 'pole'} at z = 1 (integration), "
+            f"[plant] says {told}: write integrators = {found} in [plant] of {design.name} if that is meant"
+        )
+    raise InputError(
+        f"{path}: [plant] says {told} integrators, the model has {found} at z = 1 (nearest pole "
+        f"{nearest[-1]:.3g} away)"
+        if nearest.size
+        else f"{path}: [plant] says {told} integrators, found none"
+    )
+
+
+def _measured(path: Path, design: DesignFile) -> DesignSource:
+    """A measured frequency response with variances, or as repeated points."""
+    about = design.plant
+    if about.dt_s is None:
+        raise InputError(
+            f"{path}: a frequency response does not say at which period the controller runs: write dt_s in "
+            f"[plant] of {design.name}"
+        )
+    with naming(str(path)):
+        response = _read_response(path, about)
+        if response.omega_rad_s.size < 2:
+            raise InputError(f"{path}: one frequency is no response; expected many")
+    if about.nominal is not None:
+        nominal_path = about.nominal
+        suffix = nominal_path.suffix.lower()
+        if suffix not in _STATE_SPACE_FILES:
+            raise InputError(f"{nominal_path}: the ending must be one of {', '.join(_STATE_SPACE_FILES)}")
+        nominal = read_state_space(nominal_path, _read_document(nominal_path, suffix))
+        if not np.isclose(float(nominal.dt), about.dt_s, rtol=1e-9, atol=0):
+            raise InputError(
+                f"{nominal_path}: dt_s = {float(nominal.dt):.6g}, but [plant] says {about.dt_s:.6g}"
+            )
+        _refuse_untold_integrators(nominal_path, nominal, design)
+        with naming(str(path)):
+            plant = UncertainPlant(path.stem, nominal, response, level=response.level)
+        return DesignSource(plant, "measured response", _grid_remarks(plant))
+    from ident.frequency_fit import identify_frf
+
+    options = about.fit.model_copy(update={"integrators": about.integrators})
+    with naming(str(path)):
+        found = identify_frf(response, options)
+        nominal = found.model.to_control()
+        said = tuple(found.verdicts) + tuple(found.warnings)
+        if about.ellipses == "fitted":
+            plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
+            return DesignSource(plant, "model fitted to a measured response", said)
+        plant = UncertainPlant(path.stem, nominal, response, level=response.level)
+    return DesignSource(plant, "measured response, poles of a fitted model", (*said, *_grid_remarks(plant)))
+
+
+def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
+    assert about.dt_s is not None
+    try:
+        header = path.read_text(encoding="utf-8-sig").partition("\n")[0]
+    except (OSError, UnicodeDecodeError):
+        header = "variance_real"  # whoever reads it in earnest complains properly
+    if "variance_real" in header:
+        _refuse_strange_spread(path, header)
+        return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level)
+    repeats = FrfRepeats.from_csv(path)
+    try:
+        return FrequencyUncertainty.from_frf_repeats(
+            repeats.omega_rad_s,
+            repeats.response,
+            about.dt_s,
+            level=about.level,
+            pool_neighbours=about.pool_neighbours,
+            outlier_threshold=about.outlier_threshold,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _refuse_strange_spread(path: Path, header: str) -> None:
+    """A covariance under another name would be left out in silence, and the ellipses be wrong."""
+    known = {"variance_real", "variance_imag", "covariance_real_imag"}
+    for column in (name.strip().strip('"') for name in header.split(",")):
+        if column not in known and ("covar" in column.lower() or "varian" in column.lower()):
+            raise InputError(
+                f"{path}, line 1: unknown column {column!r}; the spread stands in {', '.join(sorted(known))}"
+            )
+
+
+def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:
+    """How well the nominal, which brings the poles, agrees with the ellipses on their own grid."""
+    own: Any = plant.uncertainty
+    assert isinstance(own, FrequencyUncertainty)
+    inside = own.omega_rad_s > 0
+    at = FrequencyUncertainty(
+        own.omega_rad_s[inside], own.centre[inside], own.covariance[inside], own.dt_s, own.level, own.method
+    )
+    away = at.normalised_distance(plant.channel.nominal_response(at.omega_rad_s))
+    worst = int(np.argmax(away))
+    return (
+        f"nominal model inside {100 * float(np.mean(away <= 1)):.3g} % of the {own.omega_rad_s.size} "
+        f"ellipses, at most {away[worst]:.3g} of one from the centre ({at.omega_rad_s[worst]:.4g} rad/s)",
+    )

@@ -1,0 +1,366 @@
+"""One library call per command: files and options in, a table of numbers out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from control_design.analysis.certificate import Certificate
+from control_design.controllers.c_code import c_source
+from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification, SpecificationError
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_result import Outcome
+from ident.data.record import Record
+from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.run_config import RunConfig, SimulatedSource, load_config
+from workflow.engine import storage
+from workflow.engine.errors import InputError, naming
+from workflow.engine.progress import Progress
+from workflow.engine.randomness import stage_rng
+from workflow.engine.run_directory import RunDirectory, default_directory
+from workflow.tasks.achievable_performance import bracket_numbers, find_bracket, order_advice
+from workflow.tasks.design_source import DesignFile, DesignSource, load_sources, read_design_file
+from workflow.tasks.joint_coverage import certify_whole, joint_numbers, open_words, synthesise_asked
+from workflow.tasks.pipeline import config_of, run_pipeline
+from workflow.tasks.reference_filter import (
+    check_prefilter,
+    find_prefilter,
+    prefilter_bytes,
+    prefilter_file,
+    prefilter_of,
+)
+from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
+from workflow.tasks.summary import (
+    Row,
+    RunSummary,
+    Section,
+    certificate_rows,
+    design_rows,
+    gamma_of,
+    prefilter_sections,
+    whole_rows,
+    yardstick_rows,
+)
+
+BetweenPoints = Literal["nothing", "linear"]
+
+
+def built_in_config() -> tuple[RunConfig, str]:
+    """The default arm: configuration and its text."""
+    with resources.as_file(resources.files("workflow") / "data" / "default_arm.toml") as path:
+        return load_config(path)
+
+
+def run_from_files(
+    config_path: Path | None,
+    out: Path | None,
+    *,
+    resume: bool = False,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> RunSummary:
+    """Load a configuration and run it; see `run_pipeline`.
+
+    Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
+    without `out` a new directory below runs/ is made. Raises InputError.
+    """
+    if resume and replace:
+        raise InputError("--resume and --replace contradict each other")
+    if (resume or replace) and out is None:
+        raise InputError(
+            f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
+        )
+    if config_path is not None:
+        config, text = load_config(config_path)
+    elif resume and out is not None and (out / "manifest.json").is_file():
+        config, text = config_of(RunDirectory.open(out)), ""
+    else:
+        config, text = built_in_config()
+    return run_pipeline(
+        config,
+        out if out is not None else default_directory(config.run.name),
+        config_text=text,
+        resume=resume,
+        replace=replace,
+        progress=progress,
+    )
+
+
+def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
+    """Simulate the experiments of a configuration; one CSV per record, named after it.
+
+    Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises
+    InputError.
+    """
+    config, _ = load_config(config_path) if config_path is not None else built_in_config()
+    if not isinstance(config.source, SimulatedSource):
+        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
+    out = Path(out)
+    RunDirectory.check_free(out)
+    records = []
+    for index, entry in enumerate(config.source.records):
+        with naming(f"source.records[{index}] ({entry.name})"):
+            records.append(simulate_record(config.source, entry, config.run.seed).record)
+    existed = out.is_dir()
+    files: list[Path] = []
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for number, record in enumerate(records, start=1):
+            path = out / f"{number:02d}_{file_name(record.name)}.csv"
+            storage.write_text(path, csv_text(record))
+            files.append(path)
+    except (OSError, InputError) as error:
+        for path in files:  # all of the experiments or none
+            path.unlink()
+        if not existed and out.is_dir():
+            out.rmdir()
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot write {out}: {error.strerror or error}") from error
+    return files
+
+
+def file_name(name: str) -> str:
+    """A record's name in a file name: all but letters, digits, '_', '.' and '-' becomes '_'."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)
+
+
+def csv_text(record: Record) -> str:
+    """The record as CSV with one header line; nine digits, far below any sensor's noise."""
+    lines = [",".join(("time_s", INPUT_NAME, *OUTPUT_NAMES))]
+    table = np.column_stack([record.time_s, record.input, record.output])
+    lines += [",".join(f"{value:.9g}" for value in row) for row in table]
+    return "\n".join(lines) + "\n"
+
+
+def _mat_bytes(controller: Controller) -> bytes:
+    stream = BytesIO()
+    controller.save_mat(stream)
+    return stream.getvalue()
+
+
+_NO_CONTROLLER = (
+    "there is no controller and no certificate; lower bandwidth_rad_s, raise controller_order, or improve "
+    "the model where its ellipses are widest"
+)
+_CONTROLLER_FILES: dict[str, Callable[[Controller], bytes]] = {
+    ".json": lambda controller: controller.to_json().encode(),
+    ".mat": _mat_bytes,
+    ".c": lambda controller: c_source(controller).encode("ascii"),
+}
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What a design is to be: from the design file, else from the first plant's run, else the defaults."""
+
+    specification: Specification
+    synthesis: SynthesisOptions
+    certificate: CertificateOptions
+    yardstick: YardstickOptions
+    prefilter: PrefilterSettings | None
+
+    @classmethod
+    def of(cls, file: DesignFile, run: RunConfig | None, paths: Sequence[Path]) -> _Asked:
+        """Raises InputError where nothing says what to design for."""
+        specification = file.specification
+        if specification is None:
+            if len(paths) > 1:
+                raise InputError(f"{len(paths)} plants, no specification for all of them: give --spec FILE")
+            if run is None:
+                raise InputError(f"{paths[0]} holds no specification: give --spec FILE")
+            specification = run.specification
+        if run is None:
+            return cls(
+                specification,
+                file.synthesis or SynthesisOptions(),
+                file.certificate or CertificateOptions.model_validate({}),
+                file.yardstick or YardstickOptions.model_validate({}),
+                file.prefilter,
+            )
+        return cls(
+            specification,
+            file.synthesis or run.synthesis,
+            file.certificate or run.certificate,
+            file.yardstick or run.yardstick,
+            # A design file without [prefilter] asks for none; it has no other way to.
+            run.prefilter if file.path is None else file.prefilter,
+        )
+
+
+@dataclass(frozen=True)
+class _Designed:
+    """Documents of a design, as the stages of a run leave them, and the controller itself."""
+
+    design: dict[str, Any]
+    yardstick: dict[str, Any]
+    certificate: Certificate | None = None
+    controller: Controller | None = None
+    whole: Mapping[str, Any] = field(default_factory=dict)
+    prefilter: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _design(
+    plants: Sequence[UncertainPlant], asked: _Asked, between_own_points: BetweenPoints, seed: int
+) -> _Designed:
+    with naming("design"):
+        try:
+            result, jointly = synthesise_asked(
+                plants, asked.specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
+            )
+        except SpecificationError as impossible:
+            reason = f"specification not met: {impossible}"
+            return _Designed({"synthesis": None, "met": False, "reason": reason}, {})
+        design = {
+            "synthesis": result.to_dict(),
+            "met": result.gamma <= 1.0,
+            "reason": result.explain(),
+            "jointly": jointly,
+        }
+        yardstick = find_bracket(plants, asked.specification, asked.yardstick)
+        if result.outcome is Outcome.NOT_CONVERGED:
+            return _Designed(design, yardstick)
+        certificate, whole = certify_whole(
+            result.controller,
+            plants,
+            asked.specification,
+            asked.certificate,
+            stage_rng(seed, "certify"),
+            between_own_points=between_own_points,
+        )
+        prefilter = find_prefilter(result.controller, plants, asked.prefilter)
+        return _Designed(design, yardstick, certificate, result.controller, whole, prefilter)
+
+
+def design_controller(
+    sources: Path | Sequence[Path],
+    specification_path: Path | None,
+    *,
+    out: Path | None = None,
+    seed: int = 2006,
+) -> RunSummary:
+    """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
+
+    Without a design file the source must be a run directory, whose own specification is taken. With `out` the
+    controller is written, by its ending as JSON, MAT file or C source, and beside it a prefilter if there is
+    one; a controller that is not certified carries that in its name. A specification that no controller can
+    meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
+    """
+    paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(path) for path in sources]
+    if not paths:
+        raise InputError("nothing to design for: give at least one run directory or file with a plant")
+    if out is not None:
+        _check_out(out, paths)
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"cannot read {path}: no such file or directory")
+    file = read_design_file(specification_path) if specification_path is not None else DesignFile()
+    found = load_sources(paths, file)
+    asked = _Asked.of(file, found[0].config, paths)
+    plants = [source.plant for source in found]
+    check_prefilter(asked.prefilter, plants[0].dt_s, str(file.path or paths[0]))
+    done = _design(plants, asked, file.plant.between_points, seed)
+    certificate, order = done.certificate, asked.specification.controller_order
+    certified = certificate is not None and certificate.certified
+    files = _write_controller(done, out) if out is not None and done.controller is not None else []
+    gamma, advice = gamma_of(done.design), None
+    if gamma is not None and gamma > 1:
+        advice = order_advice(done.yardstick, gamma, order)
+    reason = _reason(done, advice)
+    verdict = {
+        "certificate": None if certificate is None else certificate.to_dict(),
+        "certified": certified,
+        "reason": reason,
+    }
+    names = [plant.name for plant in plants]
+    about = [
+        {"file": str(path), "plant": source.plant.name, "origin": source.origin, "remarks": source.remarks}
+        for path, source in zip(paths, found, strict=True)
+    ]
+    return RunSummary(
+        title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
+        sections=(
+            Section("plants", tuple(row for source in found for row in _plant_rows(source))),
+            Section(
+                "design",
+                (
+                    *design_rows(done.design),
+                    *yardstick_rows(done.yardstick, done.design, order),
+                    *([Row("order", advice)] if advice else []),
+                ),
+            ),
+            Section(
+                "certificate",
+                (*certificate_rows(verdict), *whole_rows(done.whole), *_not_checked_rows(done)),
+            ),
+            *prefilter_sections(done.prefilter),
+            *([Section("written", tuple(Row("", str(path)) for path in files))] if files else []),
+        ),
+        numbers={
+            "plants": about,
+            "design": {**done.design, "order_advice": advice},
+            "yardstick": bracket_numbers(done.yardstick, gamma),
+            **verdict,
+            "whole_responses": joint_numbers(done.whole),
+            "prefilter": done.prefilter.get("prefilter"),
+            "file": str(files[0]) if files else None,
+            "prefilter_file": str(files[1]) if len(files) > 1 else None,
+        },
+        certified=certified,
+        verdict=reason,
+    )
+
+
+def _check_out(out: Path, sources: Sequence[Path]) -> None:
+    """Refuse a place for the controller before anything is computed."""
+    if out.suffix.lower() not in _CONTROLLER_FILES:
+        raise InputError(f"--out {out}: the ending must be one of {', '.join(_CONTROLLER_FILES)}")
+    storage.check_writable(out)
+    for path in (out, prefilter_file(out)):
+        if path.absolute() in [source.absolute() for source in sources]:
+            raise InputError(f"--out {out}: {path} is a source; give the controller a name of its own")
+
+
+def _write_controller(done: _Designed, out: Path) -> list[Path]:
+    """The controller, and beside it the prefilter; the files written."""
+    written, suffix = done.controller, out.suffix.lower()
+    assert written is not None
+    if done.certificate is None or not done.certificate.certified:
+        written = replace(written, name=f"{written.name} (NOT CERTIFIED)")
+    content = {out: _CONTROLLER_FILES[suffix](written)}
+    prefilter = prefilter_of(done.prefilter)
+    if prefilter is not None:
+        content[prefilter_file(out)] = prefilter_bytes(prefilter, suffix)
+    for path, data in content.items():
+        storage.write_bytes(path, data)
+    return list(content)
+
+
+def _reason(done: _Designed, advice: str | None) -> str:
+    """How the design stands, in one line."""
+    certificate, reason = done.certificate, str(done.design["reason"])
+    if certificate is None:
+        return reason if done.design["synthesis"] is None else f"{reason}; {_NO_CONTROLLER}"
+    if certificate.certified:
+        return reason
+    missed = [item.sentence() for item in certificate.items if not item.met]
+    text = "not certified: " + ("; ".join(missed) or "unstable, or an ellipse reaches -1")
+    return f"{text}; {advice}" if advice else text
+
+
+def _not_checked_rows(done: _Designed) -> list[Row]:
+    words = [] if done.certificate is None else open_words(done.certificate.not_checked, done.whole)
+    return [Row("not checked" if number == 0 else "", text) for number, text in enumerate(words)]
+
+
+def _plant_rows(source: DesignSource) -> list[Row]:
+    return [Row(source.plant.name, source.origin), *(Row("", remark) for remark in source.remarks)]

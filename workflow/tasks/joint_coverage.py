@@ -1,0 +1,172 @@
+"""The certificate, and for how many whole responses of the posterior its worst case holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from control_design.analysis.certificate import Certificate, certify
+from control_design.analysis.joint_coverage import JointCoverage, ResponseDraws, joint_coverage
+from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
+from control_design.synthesis.joint_synthesis import synthesise_jointly
+from control_design.synthesis.synthesis import synthesise
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_result import SynthesisResult
+from ident.uncertainty import ResponsePosterior
+from workflow.config.design_options import CertificateOptions
+from workflow.tasks.proportions import wilson_interval
+
+
+def synthesise_asked(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    synthesis: SynthesisOptions,
+    options: CertificateOptions,
+    rng: np.random.Generator,
+    progress: Callable[[float, str], None] | None = None,
+) -> tuple[SynthesisResult, str | None]:
+    """The design; with `calibrate`, and plants to draw from, one whose sampled responses are stable as often
+    as the certificate then asks. Second: what became of that, in one sentence."""
+    if not options.calibrate or undrawable(plants) is not None:
+        return synthesise(plants, specification, synthesis, rng=rng, progress=progress), None
+    found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
+    return found.result, found.sentence()
+
+
+def certify_whole(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: CertificateOptions,
+    rng: np.random.Generator,
+    *,
+    between_own_points: Literal["nothing", "linear"] = "nothing",
+) -> tuple[Certificate, dict[str, Any]]:
+    """Certificate, and {joint: JointCoverage.to_dict() or null, calibrated, reason: null or why none}.
+
+    Without `calibrate` the certificate is that of the ellipses at their own level, whatever the draws say;
+    with it the ellipses are of the calibrated level where that is higher, and the share of stable draws is an
+    item of the certificate.
+    """
+    reason = undrawable(plants) if options.joint_draws else "no responses were drawn (joint_draws = 0)"
+    if reason is None and options.calibrate:
+        certificate = certify(
+            controller,
+            plants,
+            specification,
+            between_own_points=between_own_points,
+            joint_coverage=options.joint_coverage,
+            rng=rng,
+            joint_draws=options.joint_draws,
+        )
+        assert certificate.joint is not None
+        return certificate, {"joint": certificate.joint.to_dict(), "calibrated": True, "reason": None}
+    certificate = certify(controller, plants, specification, between_own_points=between_own_points)
+    if reason is not None:
+        return certificate, {"joint": None, "calibrated": False, "reason": reason}
+    joint = joint_coverage(
+        controller,
+        plants,
+        specification,
+        rng=rng,
+        coverage=options.joint_coverage,
+        draws=options.joint_draws,
+    )
+    return certificate, {"joint": joint.to_dict(), "calibrated": False, "reason": None}
+
+
+def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
+    """Why whole responses of these plants cannot be drawn; None where they can."""
+    drawn = False
+    for plant in plants:
+        for channel in (plant.channel, plant.performance):
+            uncertainty = None if channel is None else channel.uncertainty
+            if uncertainty is None:
+                continue
+            if not isinstance(uncertainty, ResponsePosterior | ResponseDraws):
+                known = (
+                    "known at its own frequencies only"
+                    if plant.own_grid is not None
+                    else "a bound, not a distribution"
+                )
+                return f"whole responses of {plant.name} cannot be drawn: its uncertainty is {known}"
+            drawn = True
+    return None if drawn else "no uncertainty is stated: there is nothing to draw from"
+
+
+def open_words(not_checked: Sequence[str], whole: Mapping[str, Any]) -> list[str]:
+    """What a certificate did not check, with what sampling said of it meanwhile."""
+    sampled = "joint level: sampled, not certified; see the whole responses"
+    known = joint_of(whole) is not None
+    return [sampled if known and words.startswith("joint level") else words for words in not_checked]
+
+
+def joint_of(document: Mapping[str, Any]) -> JointCoverage | None:
+    """The calibration in a document of `certify_whole`; None also where there is no such document."""
+    found = document.get("joint")
+    return None if found is None else JointCoverage.from_dict(found)
+
+
+def joint_numbers(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers for JSON and tables; shares with Wilson intervals at 95 %."""
+    joint = joint_of(document)
+    if joint is None:
+        return {"reason": document.get("reason")}
+    held, stable = (_counted(share, joint.draws) for share in (joint.coverage_given, joint.stable_share))
+    return {
+        **joint.to_dict(),
+        "calibrated": bool(document["calibrated"]),
+        "held_share": held[0],
+        "held_interval": list(held[1]),
+        "stable_interval": list(stable[1]),
+        "reason": None,
+    }
+
+
+def joint_words(document: Mapping[str, Any]) -> str | None:
+    """One sentence on whole responses; None where there is nothing to say."""
+    joint = joint_of(document)
+    if joint is None:
+        reason = document.get("reason")
+        return f"not sampled: {reason}" if reason else None
+    of = f"{joint.draws} whole responses drawn from the posterior"
+    _, stable = _counted(joint.stable_share, joint.draws)
+    loop = f"{_percent(joint.stable_share)} stable (95 % interval {_between(stable)})"
+    if not math.isfinite(joint.gamma_given):
+        return f"{of}: {loop}; no worst case of the ellipses to compare with"
+    _, held = _counted(joint.coverage_given, joint.draws)
+    words = (
+        f"{of}: the worst case of the {_percent(joint.given_level)} ellipses, gamma {joint.gamma_given:.4g}, "
+        f"holds for {_percent(joint.coverage_given)} (95 % interval {_between(held)}), {loop}"
+    )
+    wanted = _percent(joint.coverage)
+    if document["calibrated"] and joint.level <= joint.given_level:
+        return f"{words}; the ellipses were certified as they are: {_percent(joint.level)} would do"
+    if document["calibrated"]:
+        return (
+            f"{words}; certified over ellipses of {_percent(joint.level)}, whose worst case "
+            f"{joint.gamma:.4g} holds for {wanted}"
+        )
+    if joint.level > joint.given_level:
+        return (
+            f"{words}, short of {wanted}: ellipses of {_percent(joint.level)} (gamma {joint.gamma:.4g}) "
+            "would hold for that many ([certificate] calibrate = true)"
+        )
+    return words
+
+
+def _counted(share: float, draws: int) -> tuple[float, tuple[float, float]]:
+    return share, wilson_interval(round(share * draws), draws)
+
+
+def _between(interval: tuple[float, float]) -> str:
+    return f"{_percent(interval[0]).removesuffix(' %')} to {_percent(interval[1])}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.4g} %"

@@ -1,0 +1,327 @@
+"""The loop on the nonlinear arm under conditions it was not designed in, each beside the same prediction.
+
+The prediction is always the identified model with the controller and its limits: payload, delay, friction and
+steps of the converters are what it does not know. Only the push at the tip needs more: a model from voltage
+to angle says nothing of forces at the tip, so the free arm's answer to the push (computed without friction)
+enters the predicted loop as a disturbance of the output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.analysis.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate
+from control_design.controllers.controller import Controller
+from control_design.convex.reference_filter import Prefilter
+from ident.uncertainty import ResponsePosterior
+from plant import Rig, parse_effect
+from plant import simulate as simulate_arm
+from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
+from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
+from workflow.tasks.simulated_rig import EncodedArm
+
+Real = npt.NDArray[np.float64]
+
+_FRICTION = ("coulomb_friction", "stribeck_friction", "viscous_friction")
+_FORCES = ("torque_Nm", "static_torque_Nm", "coulomb_torque_Nm", "coefficient_Nms")
+_LINEAR = ("viscous_friction", "tip_payload", "link_stiffness", "structural_damping", "hub_inertia")
+_SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
+_OVERDRIVEN = 2.0  # times the voltage limit that the large step would need
+_PUSH_S = 0.1
+_SETTLED = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """One run beside its prediction: reference, predicted and achieved (T,), the commands of both, and the
+    share of samples at a limit. `size` is what errors are measured by: the move, or the predicted swing."""
+
+    name: str
+    words: str
+    reference: Real
+    predicted: ClosedLoopTrajectory
+    achieved: ClosedLoopTrajectory
+    size: float
+
+    def row(self) -> dict[str, Any]:
+        """Numbers for tables, errors in percent of `size`."""
+        error = 100 * (self.reference - self.achieved.measured) / self.size
+        away = 100 * (self.achieved.measured - self.predicted.measured) / self.size
+        tail = error[-max(1, error.size // 10) :]
+        moves = bool(np.any(self.reference != 0))
+        passed = 100 * float(np.max(self.achieved.measured) - np.max(self.reference)) / self.size
+        return {
+            "name": self.name,
+            "words": self.words,
+            "size": self.size,
+            "largest_difference_percent": float(np.max(np.abs(away))),
+            "rms_difference_percent": float(np.sqrt(np.mean(away**2))),
+            "overshoot_percent": max(0.0, passed) if moves else None,
+            "error_left_percent": float(np.mean(tail)),
+            "peak_command": float(np.max(np.abs(self.achieved.command))),
+            "limited_fraction": float(np.mean(self.achieved.limited)),
+            "settled": bool(np.ptp(tail) <= 100 * _SETTLED),
+        }
+
+
+def condition_arrays(conditions: Sequence[Condition]) -> dict[str, npt.NDArray[Any]]:
+    """(C, T) arrays of all conditions for the stage file."""
+    if not conditions:
+        return {}
+    return {
+        "conditions/reference": np.stack([c.reference for c in conditions]),
+        "conditions/predicted": np.stack([c.predicted.measured for c in conditions]),
+        "conditions/achieved": np.stack([c.achieved.measured for c in conditions]),
+        "conditions/predicted_command": np.stack([c.predicted.command for c in conditions]),
+        "conditions/achieved_command": np.stack([c.achieved.command for c in conditions]),
+    }
+
+
+class _Pushed:
+    """The arm with a force at its tip, sample by sample."""
+
+    def __init__(self, arm: EncodedArm, tip_force_N: Real) -> None:
+        self._arm, self._force = arm, tip_force_N
+        self.reset()
+
+    @property
+    def dt_s(self) -> float:
+        return self._arm.dt_s
+
+    def reset(self) -> None:
+        self._arm.reset()
+        self._sample = 0
+
+    def measure(self) -> Real:
+        return self._arm.measure()
+
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        self._arm.advance(u, hub_torque_Nm=hub_torque_Nm, tip_force_N=float(self._force[self._sample]))
+        self._sample += 1
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionBench:
+    """Everything the conditions share.
+
+    reference: (T,) step after a lead-in; prefilter: what every reference goes through, if any; options:
+    effects and steps of the closed-loop check; rng: noise of run number k comes from the k-th spawned
+    generator.
+    """
+
+    controller: Controller
+    posterior: ResponsePosterior
+    source: SimulatedSource
+    options: ClosedLoopOptions
+    rig: Rig
+    reference: Real
+    measured: int
+    rng: np.random.Generator
+    prefilter: Prefilter | None = None
+
+    @property
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """Effects of the arm the controller meets, by name."""
+        return {str(e["name"]): dict(e) for e in (*self.source.effects, *self.options.effects)}
+
+    def run_all(self) -> list[Condition]:
+        """Every condition that this arm and controller allow."""
+        found = [self.slew(), self.push(), *self.payloads(), self.late(), *self.frictions(), self.coarse()]
+        return [*found, *self.overdriven()]
+
+    def predict(
+        self,
+        reference: Real,
+        *,
+        law: Controller | None = None,
+        output_disturbance: Real | None = None,
+        clip: float | None = None,
+    ) -> ClosedLoopTrajectory:
+        """The loop on the posterior mean."""
+        law = law or self.controller
+        a, b, c, d = realise(self.posterior, self.posterior.mean)
+        holds = d != 0.0
+        model = StateSpaceMachine(a, b, c, d, self.posterior.dt_s, holds_input=holds)
+        if holds:
+            law = replace(law, computational_delay_samples=law.computational_delay_samples - 1)
+        machine: SampledMachine = model if clip is None else ClippedMachine(model, clip)
+        run = simulate(law, machine, self._given(reference), output_disturbance=output_disturbance)
+        if holds:
+            return replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
+        return run
+
+    def achieve(
+        self,
+        reference: Real,
+        *,
+        effects: Mapping[str, Mapping[str, Any]] | None = None,
+        law: Controller | None = None,
+        rig: Rig | None = None,
+        steps: tuple[float, float] | None = None,
+        tip_force_N: Real | None = None,
+        clip: float | None = None,
+    ) -> ClosedLoopTrajectory:
+        """The loop on the arm, with effects exchanged by name; steps: of measurement and command."""
+        extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
+        arm = EncodedArm(self.source, extra, self.rng.spawn(1)[0], rig=rig or self.rig)
+        machine: SampledMachine = arm if tip_force_N is None else _Pushed(arm, tip_force_N)
+        machine = ClippedMachine(machine, FINITE if clip is None else clip)
+        measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
+        return simulate(
+            law or self.controller,
+            machine,
+            self._given(reference),
+            measured_index=self.measured,
+            measurement_step=measurement,
+            command_step=command,
+        )
+
+    def _given(self, reference: Real) -> Real:
+        """What the loop is given for a reference."""
+        return reference if self.prefilter is None else self.prefilter.filtered(reference)
+
+    @property
+    def step(self) -> float:
+        return float(self.reference[-1])
+
+    def slew(self) -> Condition:
+        """A smooth move, as large as the voltage allows."""
+        n = self.reference.size
+        start, length = n // 20, max(2, round(0.4 * n))
+        x = np.clip((np.arange(n) - start) / length, 0.0, 1.0)
+        shape = x**3 * (10 - 15 * x + 6 * x**2)
+        size = 4 * self.step
+        if self.controller.input_limit is not None:
+            peak = float(np.max(np.abs(self.predict(shape, law=self._unlimited).command)))
+            size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
+        reference = np.asarray(size * shape, dtype=np.float64)
+        seconds = length * self.controller.dt_s
+        return Condition(
+            "slew",
+            f"smooth move in {seconds:.3g} s",
+            reference,
+            self.predict(reference),
+            self.achieve(reference),
+            size,
+        )
+
+    def push(self) -> Condition:
+        """A half-sine force at the tip, set point zero."""
+        dt, n = self.controller.dt_s, self.reference.size
+        start, length = n // 20, max(2, round(_PUSH_S / dt))
+        force = np.zeros(n)
+        force[start : start + length] = np.sin(np.pi * (np.arange(length) + 0.5) / length)[: n - start]
+        linear = [parse_effect(effect) for name, effect in self.effects.items() if name in _LINEAR]
+        free = simulate_arm(
+            self.rig, np.zeros(n), linear, rng=None, tip_force_N=force, n_modes=self.source.modes
+        )
+        answer = np.column_stack([free.hub_angle_true_rad, free.tip_true_m])[:, self.measured]
+        scale = self.step / float(np.max(np.abs(answer)))
+        nothing = np.zeros(n)
+        predicted = self.predict(nothing, output_disturbance=scale * answer)
+        return Condition(
+            "push at the tip",
+            f"{scale:.3g} N, half sine of {1e3 * length * dt:.3g} ms",
+            nothing,
+            predicted,
+            self.achieve(nothing, tip_force_N=scale * force),
+            float(np.max(np.abs(predicted.measured))),
+        )
+
+    def payloads(self) -> list[Condition]:
+        """0, 100 and 200 % of the rated payload: that of the rig and its effects, or a tenth of the link."""
+        link = self.rig.link
+        tenth = 0.1 * link.density_kg_m3 * link.width_m * link.thickness_m * link.length_m
+        extra = float(self.effects.get("tip_payload", {}).get("mass_kg", 0.0))
+        rated = self.rig.payload.mass_kg + extra or tenth
+        found = []
+        for percent in (0, 100, 200):
+            mass = rated * percent / 100
+            rig = self.rig.perturbed({"payload.mass_kg": mass})
+            without = {"tip_payload": {"name": "tip_payload", "mass_kg": 0.0}}
+            found.append(
+                self._stepped(
+                    f"payload {percent} %", f"{1e3 * mass:.3g} g at the tip", effects=without, rig=rig
+                )
+            )
+        return found
+
+    def late(self) -> Condition:
+        """One sample of delay more."""
+        own = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
+        late = {"input_delay": {"name": "input_delay", "delay_s": own + self.controller.dt_s}}
+        return self._stepped("late", f"{1e3 * self.controller.dt_s:.3g} ms more delay", effects=late)
+
+    def frictions(self) -> list[Condition]:
+        """None of the arm's joint friction effects, and twice as much of each."""
+        own = {name: effect for name, effect in self.effects.items() if name in _FRICTION}
+        if not own:
+            return []
+
+        def scaled(factor: float) -> dict[str, dict[str, Any]]:
+            return {
+                name: {key: factor * value if key in _FORCES else value for key, value in effect.items()}
+                for name, effect in own.items()
+            }
+
+        listed = " and ".join(name.replace("_", " ") for name in own)
+        return [
+            self._stepped("no friction", f"without {listed}", effects=scaled(0.0)),
+            self._stepped("double friction", f"twice the {listed}", effects=scaled(2.0)),
+        ]
+
+    def coarse(self) -> Condition:
+        """Converters of eight bits and an encoder four times as coarse."""
+        limit = self.controller.input_limit or float(np.max(np.abs(self.predict(self.reference).command)))
+        command = max(limit / 128, self.options.quantisation)
+        measurement = (
+            4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
+        )
+        words = f"command in steps of {command:.3g}, measurement of {measurement:.3g}"
+        return self._stepped("coarse", words, steps=(measurement, command))
+
+    def overdriven(self) -> list[Condition]:
+        """A step that needs twice the voltage there is, with anti-windup and without."""
+        limit = self.controller.input_limit
+        if limit is None:
+            return []
+        free = self._unlimited
+        peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
+        reference = self.reference * (_OVERDRIVEN * limit / peak)
+        words = f"a step that asks for {_OVERDRIVEN:g} times the limit"
+        aware = Condition(
+            "voltage limit",
+            f"{words}, with anti-windup",
+            reference,
+            self.predict(reference),
+            self.achieve(reference),
+            float(reference[-1]),
+        )
+        unaware = Condition(
+            "no anti-windup",
+            f"{words}, the controller does not know of it",
+            reference,
+            self.predict(reference, law=free, clip=limit),
+            self.achieve(reference, law=free, clip=limit),
+            float(reference[-1]),
+        )
+        return [aware, unaware]
+
+    @property
+    def _unlimited(self) -> Controller:
+        return replace(self.controller, input_limit=None, rate_limit=None)
+
+    def _stepped(self, name: str, words: str, **changes: Any) -> Condition:
+        return Condition(
+            name,
+            words,
+            self.reference,
+            self.predict(self.reference),
+            self.achieve(self.reference, **changes),
+            self.step,
+        )

@@ -1,0 +1,119 @@
+"""S measured in closed loop on the simulated arm, beside its prediction and its certified worst case."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.analysis.closed_loop import MeasuredSensitivity, SampledMachine, measure_sensitivity
+from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import UncertainPlant
+from ident.data.record import Record
+
+Real = npt.NDArray[np.float64]
+
+_DRAWS = 3
+_PERIODS_SMALL = 4  # sensor noise weighs ten times as much there, too
+_SMALL = 0.1  # of the large excitation: friction weighs ten times as much
+_INPUT_SHARE = 0.7  # of the input's rms in the records of the fit that the loop's command may take
+_CREST = 4.0  # peak over rms that a multisine's command stays below
+_LINES_BELOW_PEAK = 20
+_SHORTEST, _LONGEST = 500, 4000
+
+
+@dataclass(frozen=True)
+class SensitivityPlan:
+    """How S is excited: band around the predicted peak, period, lead-in, size of the large excitation; and
+    the nominal and certified peaks it is compared with."""
+
+    band_rad_s: tuple[float, float]
+    period_samples: int
+    lead_in_periods: int
+    rms: float
+    nominal_peak: float
+    nominal_omega_rad_s: float
+    certified_peak: float
+
+
+def plan_sensitivity(
+    controller: Controller,
+    plant: UncertainPlant,
+    certified_peak: float,
+    records: list[Record],
+    transient_samples: int,
+) -> SensitivityPlan:
+    """From a twentieth of the predicted peak's frequency to ten times it, lines a twentieth of it apart; as
+    large as the input of the records (SISO) and the voltage limit allow."""
+    dt = controller.dt_s
+    omega = np.geomspace(1e-3 / dt, plant.nyquist_rad_s, 8000)
+    loop = controller.response(omega) * plant.channel.nominal_response(omega)
+    size = 1 / np.abs(1 + loop)
+    at = int(np.argmax(size))
+    centre = min(float(omega[at]), plant.nyquist_rad_s / 4)
+    period = int(np.clip(round(2 * np.pi * _LINES_BELOW_PEAK / (centre * dt)), _SHORTEST, _LONGEST))
+    line = 2 * np.pi / (period * dt)
+    band = (max(centre / _LINES_BELOW_PEAK, line), min(10 * centre, 0.8 * plant.nyquist_rad_s))
+    inside = np.arange(band[0], band[1], line)
+    gain = np.abs(controller.response(inside))
+    gain = gain / np.abs(1 + controller.response(inside) * plant.channel.nominal_response(inside))
+    command = _INPUT_SHARE * float(np.sqrt(np.mean([np.var(record.input) for record in records])))
+    if controller.input_limit is not None:
+        command = min(command, controller.input_limit / _CREST)
+    return SensitivityPlan(
+        band_rad_s=(float(band[0]), float(band[1])),
+        period_samples=period,
+        lead_in_periods=int(np.clip(np.ceil(transient_samples / period), 1, 4)),
+        rms=command / float(np.sqrt(np.mean(gain**2))),
+        nominal_peak=float(size[at]),
+        nominal_omega_rad_s=float(omega[at]),
+        certified_peak=certified_peak,
+    )
+
+
+def measure_on(
+    machine: SampledMachine,
+    controller: Controller,
+    plan: SensitivityPlan,
+    rng: np.random.Generator,
+    *,
+    measured_index: int,
+    measurement_step: float,
+    command_step: float,
+    small: bool = False,
+) -> MeasuredSensitivity:
+    """S on a machine by the plan; `small` takes a tenth of the size."""
+    return measure_sensitivity(
+        controller,
+        machine,
+        rng,
+        rms=plan.rms * (_SMALL if small else 1.0),
+        band_rad_s=plan.band_rad_s,
+        period_samples=plan.period_samples,
+        periods=_PERIODS_SMALL if small else 1,
+        draws=_DRAWS,
+        lead_in_periods=plan.lead_in_periods,
+        measured_index=measured_index,
+        measurement_step=measurement_step,
+        command_step=command_step,
+    )
+
+
+def sensitivity_row(name: str, found: MeasuredSensitivity, plan: SensitivityPlan) -> dict[str, Any]:
+    """Numbers of one measurement for tables."""
+    peak, std, omega = found.peak
+    return {
+        "name": name,
+        "reference_rms": found.reference_rms,
+        "peak": peak,
+        "peak_std": std,
+        "omega_rad_s": omega,
+        "off_nominal_percent": 100 * (peak / plan.nominal_peak - 1),
+        "off_certified_percent": 100 * (peak / plan.certified_peak - 1)
+        if np.isfinite(plan.certified_peak)
+        else None,
+        "peak_command": found.peak_command,
+        "limited_fraction": found.limited_fraction,
+    }

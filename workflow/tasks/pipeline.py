@@ -1,0 +1,135 @@
+"""A whole run as one library call: stages in order, each skipped when its result is there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from workflow.config.run_config import RunConfig
+from workflow.engine import storage
+from workflow.engine.code_version import code_digest
+from workflow.engine.errors import InputError, one_line
+from workflow.engine.progress import Progress, Silence
+from workflow.engine.run_directory import LAYOUT_VERSION, RunDirectory, StageData, hash_of
+from workflow.tasks.stages import STAGES, Stage, StageInput
+from workflow.tasks.summary import RunSummary, summarise
+
+
+def run_pipeline(
+    config: RunConfig,
+    out: Path,
+    *,
+    config_text: str = "",
+    resume: bool = False,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> RunSummary:
+    """Run every stage into `out` and return the table of numbers.
+
+    `config_text` is kept as config.toml (the file as the user wrote it); `resume` takes up a run that is
+    there, `replace` starts it afresh. A result that is not certified is no error: the report is written all
+    the same and `RunSummary.certified` says so.
+
+    Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
+    then, unless identification had already been paid for. Raises StageError when a computation fails.
+    """
+    progress = progress or Silence()
+    out = Path(out)
+    RunDirectory.check_free(out, resume=resume, replace=replace)
+    inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
+    # Records are read before anything is written: a bad log leaves no directory behind.
+    first = STAGES[0]
+    started = time.monotonic()
+    ready: StageData | None = None
+    if not (resume and out.exists()):
+        ready = first.run(StageInput(config, None, progress))
+    ready_s = time.monotonic() - started
+    existed = out.exists()
+    run = RunDirectory.begin(
+        out,
+        config_text=config_text,
+        config=config.to_document(),
+        seed=config.run.seed,
+        inputs=inputs,
+        resume=resume,
+        replace=replace,
+    )
+    with run.locked():
+        run.record_status("running")
+        progress.plan([(stage.name, stage.expected_s) for stage in STAGES])
+        try:
+            for stage in STAGES:
+                _perform(stage, config, run, progress, inputs, (ready, ready_s) if stage is first else None)
+            summary = summarise(run, config)
+        except BaseException as error:
+            _fail(run, error, created=not existed)
+            raise
+        run.record_status("complete" if summary.certified else "complete, not certified")
+    return summary
+
+
+def rebuild_report(run: RunDirectory) -> RunSummary:
+    """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing."""
+    config = config_of(run)
+    with run.locked():
+        _perform(STAGES[-1], config, run, Silence(), {}, None, always=True)
+    return summarise(run, config)
+
+
+def config_of(run: RunDirectory) -> RunConfig:
+    """The configuration a run was begun with."""
+    return RunConfig.from_document(run.config_document(), source=str(run.path / "config.json"))
+
+
+def _perform(
+    stage: Stage,
+    config: RunConfig,
+    run: RunDirectory,
+    progress: Progress,
+    inputs: Mapping[str, str],
+    ready: tuple[StageData | None, float] | None,
+    *,
+    always: bool = False,
+) -> None:
+    input_hash = stage_input_hash(stage, config, run, inputs)
+    progress.start(stage.name)
+    if (
+        not always
+        and run.is_done(stage.name, input_hash)
+        and all(p.is_file() for p in stage.also_writes(run))
+    ):
+        progress.finish(stage.name, 0.0, taken_up=True)
+        return
+    started = time.monotonic()
+    data, before_s = ready if ready is not None else (None, 0.0)
+    if data is None:
+        data = stage.run(StageInput(config, run, progress))
+    run.save_stage(stage.name, data, input_hash)
+    seconds = time.monotonic() - started + before_s
+    run.record_stage(stage.name, seconds, input_hash)
+    progress.finish(stage.name, seconds, taken_up=False)
+
+
+def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs: Mapping[str, str]) -> str:
+    """SHA-256 over all that a stage's result depends on, our own code included."""
+    return hash_of(
+        {
+            "layout": LAYOUT_VERSION,
+            "code": code_digest(drawing=bool(stage.also_writes(run))),
+            "stage": stage.name,
+            "seed": config.run.seed,
+            "settings": stage.settings(config),
+            "files": dict(inputs) if not stage.after else {},
+            "after": {name: run.stage_digest(name) for name in stage.after},
+        }
+    )
+
+
+def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:
+    if isinstance(error, InputError) and created and run.stage_file("identify") is None:
+        # Nothing of value is there yet, and a half-filled directory would refuse the corrected attempt.
+        run.discard()
+        return
+    if run.manifest_path.is_file():
+        run.record_status(f"failed: {one_line(error) or type(error).__name__}")

@@ -1,0 +1,108 @@
+"""The simulated arm as a configuration describes it: rig file or preset, effects by name, experiments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ident.data.record import Record
+from plant import Rig, SampledArm, parse_effect, simulate
+from workflow.config.rig_settings import PRESETS
+from workflow.config.run_config import SimulatedRecord, SimulatedSource
+from workflow.engine.randomness import stage_rng
+
+INPUT_NAME = "voltage_V"
+OUTPUT_NAMES = SampledArm.output_names
+UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedExperiment:
+    """A record as measured, and the outputs (T, Y) before sensor effects and noise."""
+
+    record: Record
+    noise_free_output: npt.NDArray[np.float64]
+
+
+def rig_of(source: SimulatedSource) -> Rig:
+    """The nominal rig. Raises ValueError (one line) or OSError for a rig file that cannot be read."""
+    if isinstance(source.rig, str) and source.rig in PRESETS:
+        return PRESETS[source.rig]()
+    return Rig.from_toml(source.rig)
+
+
+def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> SimulatedExperiment:
+    """Run one experiment; excitation and sensor noise have streams of their own, keyed by the record's
+    name."""
+    rig = rig_of(source)
+    voltage = entry.excitation.signal(rig.sampling.dt_s, stage_rng(seed, "records", entry.name, "excitation"))
+    trajectory = simulate(
+        rig,
+        voltage,
+        [parse_effect(effect) for effect in source.effects],
+        rng=stage_rng(seed, "records", entry.name, "noise"),
+        n_modes=source.modes,
+    )
+    record = Record(
+        name=entry.name,
+        input=trajectory.voltage_V[:, None],
+        output=quantised(trajectory.output, source.encoder_step_rad),
+        dt_s=rig.sampling.dt_s,
+        input_names=(INPUT_NAME,),
+        output_names=OUTPUT_NAMES,
+        input_units=(UNITS[INPUT_NAME],),
+        output_units=tuple(UNITS[name] for name in OUTPUT_NAMES),
+    )
+    true = np.column_stack([trajectory.hub_angle_true_rad, trajectory.tip_true_m])
+    return SimulatedExperiment(record, true)
+
+
+def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.NDArray[np.float64]:
+    """(..., 2) measured outputs with the hub angle rounded to encoder steps (0 = no encoder)."""
+    if encoder_step_rad == 0:
+        return output
+    result = output.copy()
+    result[..., 0] = encoder_step_rad * np.round(output[..., 0] / encoder_step_rad)
+    return result
+
+
+class EncodedArm:
+    """The simulated arm behind its encoder: `plant.SampledArm` with the measured hub angle in encoder
+    steps."""
+
+    output_names = OUTPUT_NAMES
+
+    def __init__(
+        self,
+        source: SimulatedSource,
+        extra_effects: Sequence[Mapping[str, Any]],
+        rng: np.random.Generator,
+        *,
+        rig: Rig | None = None,
+    ) -> None:
+        replaced = {effect["name"] for effect in extra_effects}
+        kept = [effect for effect in source.effects if effect["name"] not in replaced]
+        effects = [parse_effect(effect) for effect in (*kept, *extra_effects)]
+        self._arm = SampledArm(rig or rig_of(source), effects, rng, n_modes=source.modes)
+        self._step = source.encoder_step_rad
+
+    @property
+    def dt_s(self) -> float:
+        return self._arm.dt_s
+
+    @property
+    def true_output(self) -> npt.NDArray[np.float64]:
+        return self._arm.true_output
+
+    def reset(self) -> None:
+        self._arm.reset()
+
+    def measure(self) -> npt.NDArray[np.float64]:
+        return quantised(self._arm.measure(), self._step)
+
+    def advance(self, voltage_V: float, /, *, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
+        self._arm.advance(voltage_V, hub_torque_Nm, tip_force_N)

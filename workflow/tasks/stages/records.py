@@ -1,0 +1,182 @@
+"""Records: simulated from the rig, or read from log files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident.data.record import Record
+from workflow.config.run_config import (
+    Channel,
+    FileRecord,
+    FileSource,
+    RunConfig,
+    SimulatedRecord,
+    SimulatedSource,
+    record_name,
+)
+from workflow.engine.errors import InputError, naming
+from workflow.engine.run_directory import StageData
+from workflow.engine.storage import AnyArray
+from workflow.tasks.simulated_rig import simulate_record
+from workflow.tasks.stages.base import StageInput
+
+
+def settings(config: RunConfig) -> Mapping[str, Any]:
+    """The source, and the columns the channels ask for."""
+    return {
+        "source": config.source.model_dump(mode="json"),
+        "columns": [[channel.input, channel.output] for channel in config.channels],
+    }
+
+
+def make_records(stage: StageInput) -> StageData:
+    """All records of the configuration, in its order."""
+    source = stage.config.source
+    arrays: dict[str, AnyArray] = {}
+    if isinstance(source, SimulatedSource):
+        records = []
+        for index, experiment in enumerate(source.records):
+            stage.progress.update("records", index / len(source.records), experiment.name)
+            with naming(f"source.records[{index}] ({experiment.name})"):
+                simulated = simulate_record(source, experiment, stage.config.run.seed)
+            records.append(simulated.record)
+            arrays[f"noise_free/{index}/output"] = simulated.noise_free_output
+        kinds: list[str] = [experiment.excitation.kind for experiment in source.records]
+        files: list[str | None] = [None] * len(records)
+        effects = [dict(effect) for effect in source.effects]
+    else:
+        records = [read_record(source, entry, stage.config.channels) for entry in source.records]
+        kinds, files = ["file"] * len(records), [str(entry.path) for entry in source.records]
+        effects = []
+    records = with_common_sampling_time(records)
+    about = []
+    entries: Sequence[SimulatedRecord | FileRecord] = source.records
+    for index, (record, entry) in enumerate(zip(records, entries, strict=True)):
+        if entry.role == "estimation":
+            refuse_constant_input(record)
+        arrays |= {f"record/{index}/{key}": value for key, value in record.to_arrays().items()}
+        about.append(
+            {
+                "name": record.name,
+                "role": entry.role,
+                "condition": entry.condition,
+                "remark": entry.remark,
+                "kind": kinds[index],
+                "file": files[index],
+                "samples": record.n_samples,
+                "dt_s": record.dt_s,
+                "duration_s": record.n_samples * record.dt_s,
+                "closed_loop": record.reference is not None,
+                "units": units_of(record),
+            }
+        )
+    return StageData(arrays, {"source": source.kind, "effects": effects, "records": about})
+
+
+def units_of(record: Record) -> dict[str, str]:
+    """Units of the signals a record knows the units of."""
+    known: dict[str, str] = {}
+    for names, units in (
+        (record.input_names, record.input_units),
+        (record.output_names, record.output_units),
+    ):
+        known |= dict(zip(names, units, strict=False))
+    return known
+
+
+def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel]) -> Record:
+    """One log file as the configuration describes it. Raises InputError: one line naming file and place."""
+    inputs = list(dict.fromkeys(channel.input for channel in channels))
+    outputs = list(dict.fromkeys(channel.output for channel in channels))
+    references = entry.references if entry.references is not None else source.references
+    # A record's own time base replaces the common one altogether: dt_s here must not meet a time column
+    # there.
+    own = entry.time is not None or entry.dt_s is not None
+    record = read_log(
+        entry.path,
+        inputs,
+        outputs,
+        time=entry.time if own else source.time,
+        dt_s=entry.dt_s if own else source.dt_s,
+        references=list(references),
+        name=record_name(entry),
+    )
+    if entry.start_sample or entry.stop_sample is not None:
+        with naming(f"{entry.path}"):
+            record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
+    unit = source.units
+    return Record(
+        name=record.name,
+        input=-record.input if entry.mirrored else record.input,
+        output=-record.output if entry.mirrored else record.output,
+        dt_s=record.dt_s,
+        input_names=record.input_names,
+        output_names=record.output_names,
+        reference=None
+        if record.reference is None
+        else (-record.reference if entry.mirrored else record.reference),
+        reference_names=record.reference_names,
+        input_units=tuple(unit.get(name, "") for name in record.input_names),
+        output_units=tuple(unit.get(name, "") for name in record.output_names),
+        source=record.source,
+    )
+
+
+def read_log(
+    path: Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    time: str | None,
+    dt_s: float | None,
+    references: Sequence[str] = (),
+    name: str | None = None,
+) -> Record:
+    """A csv, npz or mat file by its ending; constant inputs are refused. Raises InputError, one line."""
+    readers = {
+        ".csv": Record.from_csv,
+        ".txt": Record.from_csv,
+        ".npz": Record.from_npz,
+        ".mat": Record.from_mat,
+    }
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: unknown kind of file {path.suffix!r}; expected .csv, .npz or .mat")
+    try:
+        record = reader(path, inputs, outputs, time=time, dt_s=dt_s, references=references, name=name)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(error) from error
+    return record
+
+
+def refuse_constant_input(record: Record) -> None:
+    """A record to identify from must have an input that moves. Raises InputError."""
+    for index, column in enumerate(record.input_names):
+        if not np.ptp(record.input[:, index]) > 0:
+            raise InputError(
+                f"{record.label}: input column '{column}' is constant ({record.input[0, index]:.6g}); "
+                "expected a signal that moves"
+            )
+
+
+def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
+    """The records with the first one's sampling time. Raises InputError where they really differ.
+
+    Time stamps are written with a few digits, so that the mean interval of equal clocks differs in its last
+    digits.
+    """
+    first = records[0]
+    for other in records[1:]:
+        if not abs(other.dt_s - first.dt_s) <= 1e-6 * first.dt_s:
+            raise InputError(
+                f"records {first.name!r} and {other.name!r} differ in sampling time "
+                f"({first.dt_s:.6g} and {other.dt_s:.6g} s); identify them in separate runs"
+            )
+    return [replace(record, dt_s=first.dt_s) for record in records]

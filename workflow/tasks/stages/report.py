@@ -1,0 +1,39 @@
+"""Report: one self-contained page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from workflow.config.run_config import RunConfig
+from workflow.engine import storage
+from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.tasks.stages.base import StageInput
+
+
+def settings(config: RunConfig) -> Mapping[str, Any]:
+    """Words that appear on the page and nowhere before."""
+    return {
+        "run": config.run.model_dump(mode="json"),
+        "notes": config.notes.model_dump(mode="json"),
+        "specification": config.specification.model_dump(mode="json"),
+    }
+
+
+def write_page(stage: StageInput) -> StageData:
+    """report.html and the hash of its content."""
+    # Imported here: matplotlib takes a second to load, and only this stage draws.
+    from workflow.report import write_report
+
+    path = write_report(
+        stage.results,
+        stage.config,
+        lambda fraction, name: stage.progress.update("report", fraction, name),
+    )
+    return StageData(document={"report_sha256": storage.sha256_of_file(path)})
+
+
+def page(run: RunDirectory) -> tuple[Path, ...]:
+    """The file outside stages/ that belongs to this stage."""
+    return (run.report_path,)

@@ -1,0 +1,297 @@
+"""Uncertainty: ellipses around every identified response, and what the residuals say about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.plant_set import Mode
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.checks.validation import (
+    ResidualTest,
+    fit_on_fresh_data,
+    independence_test,
+    repeat_scatter,
+    whiteness_test,
+)
+from ident.data.nonparametric import empirical_frf
+from ident.data.record import Record
+from ident.data.signal_filter import increments
+from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from ident.uncertainty.conditions import combine_posteriors, group_posteriors, record_posteriors
+from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.nominal import nominal_near
+from ident.uncertainty.pole_intervals import pole_intervals
+from workflow.config.run_config import Channel, RunConfig, UncertaintyOptions
+from workflow.engine.errors import naming
+from workflow.engine.run_directory import StageData
+from workflow.engine.storage import AnyArray
+from workflow.tasks.conditioning import as_bounded
+from workflow.tasks.stages.base import StageInput
+from workflow.tasks.stages.results import ChannelResult, RunRecord, channel_result, load_records
+
+_FEWEST_FREQUENCIES = 100
+_SHARE_INSIDE = 0.9
+
+N_BANDS = 6
+"""Bands of equal width on the log axis in which radii and scatter are summarised."""
+
+
+def settings(config: RunConfig) -> Mapping[str, Any]:
+    """Uncertainty options of the channels."""
+    return {"channels": [channel.uncertainty.model_dump(mode="json") for channel in config.channels]}
+
+
+def find_uncertainty(stage: StageInput) -> StageData:
+    """Posterior, ellipses on a display grid, residual tests and repeat scatter of every channel."""
+    records = load_records(stage.results)
+    identified = stage.results.load_stage("identify")
+    arrays: dict[str, AnyArray] = {}
+    about = []
+    for k, channel in enumerate(stage.config.channels):
+        stage.progress.update("uncertainty", k / len(stage.config.channels), channel.label)
+        result = channel_result(identified, k)
+        model = result.identification.model
+        with naming(f"channel {channel.label!r}"):
+            posterior = posterior_of(result, channel.uncertainty, records)
+            omega = display_grid(model, result.bounded)
+            frequency = posterior.at(omega, channel.uncertainty.level)
+            nominal = nominal_of(posterior, model.poles, nominal_grid(omega, channel))
+            empirical = empirical_response(
+                result.bounded,
+                integrators=0 if channel.increments else model.integrators,
+                level=channel.uncertainty.level,
+                band_rad_s=channel.bounds_band_rad_s or channel.band_rad_s,
+            )
+            scatter = scatter_of(channel, result, records, bands_of(omega))
+        at = f"channel/{k}/"
+        arrays |= {f"{at}posterior/{key}": value for key, value in posterior.to_arrays().items()}
+        arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
+        arrays |= {f"{at}nominal/{key}": value for key, value in nominal.to_arrays().items()}
+        if empirical is not None:
+            arrays |= {f"{at}empirical/{key}": value for key, value in empirical.to_arrays().items()}
+        about.append(
+            {
+                "name": channel.label,
+                "method": channel.uncertainty.method,
+                "level": channel.uncertainty.level,
+                "report": posterior.report.to_dict() if posterior.report is not None else None,
+                "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
+                "tests": residual_tests(posterior, result.bounded),
+                "repeat_scatter": scatter,
+                "intervals": intervals_of(posterior, model.poles, channel.uncertainty.level),
+                "nominal": nominal_row(posterior.at(nominal_grid(omega, channel)), nominal),
+            }
+        )
+    return StageData(arrays, {"channels": about})
+
+
+def posterior_of(
+    result: ChannelResult, options: UncertaintyOptions, records: Sequence[RunRecord]
+) -> ResponsePosterior:
+    """One library call, by method."""
+    model = result.identification.model
+    if options.method == "classical":
+        return classical(result.bounded, model, options)
+    if options.method == "tangent":
+        return tangent(result.bounded, model, options)
+    condition = {item.record.name: item.condition for item in records}
+    groups: dict[str, list[Record]] = {}
+    for record in result.bounded:
+        known = condition.get(record.name) if options.method == "conditions" else None
+        groups.setdefault(known or record.name, []).append(record)
+    if len(groups) < 4:
+        what = "estimation records" if options.method == "records" else "conditions of estimation records"
+        raise ValueError(
+            f"uncertainty.method = {options.method!r} needs at least four {what}; found {len(groups)}"
+        )
+    each = group_posteriors(list(groups.values()), model, options)
+    return combine_posteriors(each, small_sample_level=options.level)
+
+
+def nominal_grid(omega: npt.NDArray[np.float64], channel: Channel) -> npt.NDArray[np.float64]:
+    """Where the nominal model has to be right: the band of the data, everywhere without one."""
+    band = channel.bounds_band_rad_s or channel.band_rad_s
+    if band is None:
+        return omega
+    inside = omega[(omega >= band[0]) & (omega <= band[1])]
+    return inside if inside.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
+
+
+def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: npt.NDArray[np.float64]) -> GobfModel:
+    """Nearest model on the identified poles; on every pole taken twice where only that one stays in its
+    ellipses.
+
+    The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
+    but a pole taken twice is a mode listed twice, so it has to earn that.
+    """
+    single = nominal_near(posterior, poles, omega)
+    double = nominal_near(posterior, poles.doubled(), omega)
+    ellipses = posterior.at(omega)
+    inside = [
+        float(np.mean(ellipses.contains(model.frequency_response(omega)))) for model in (single, double)
+    ]
+    return double if inside[0] < _SHARE_INSIDE <= inside[1] else single
+
+
+def display_grid(model: GobfModel, records: Sequence[Record]) -> npt.NDArray[np.float64]:
+    """Frequencies (F,) for pictures: from one period per longest record to Nyquist, denser around the
+    modes."""
+    longest_s = max(record.n_samples for record in records) * model.dt_s
+    poles = model.poles
+    modes = [
+        Mode(float(omega), float(zeta))
+        for omega, zeta in zip(poles.omega_rad_s(model.dt_s), poles.zeta(), strict=True)
+        if zeta < 0.4
+    ]
+    low, high = 2 * np.pi / longest_s, np.pi / model.dt_s
+    return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
+
+
+def bands_of(omega: npt.NDArray[np.float64]) -> list[tuple[float, float]]:
+    """`N_BANDS` bands of equal ratio over the grid."""
+    edges = np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist()
+    return list(pairwise(edges))
+
+
+def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> dict[str, float]:
+    """Size of the ellipses in a band: major semi-axis over |G|, in percent."""
+    inside = (frequency.omega_rad_s >= low) & (frequency.omega_rad_s < high)
+    relative = 100 * frequency.ellipse().semi_major[inside] / np.abs(frequency.centre[inside])
+    return {
+        "from_rad_s": low,
+        "to_rad_s": high,
+        "median_radius_percent": float(np.median(relative)),
+        "largest_radius_percent": float(np.max(relative)),
+    }
+
+
+def nominal_row(frequency: FrequencyUncertainty, nominal: GobfModel) -> dict[str, float]:
+    """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
+    distance = frequency.normalised_distance(nominal.frequency_response(frequency.omega_rad_s))
+    worst = int(np.argmax(distance))
+    return {
+        "share_inside_percent": 100 * float(np.mean(distance <= 1)),
+        "largest_distance": float(distance[worst]),
+        "at_rad_s": float(frequency.omega_rad_s[worst]),
+    }
+
+
+def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
+
+    Where the bounds have a noise model, whiteness is that of the residuals behind it: they rest on those.
+    """
+    colour = () if posterior.report is None else posterior.report.ar_coefficients
+    filter_of_noise = np.array([1.0, *colour])
+    fits = [fit_on_fresh_data(posterior, record) for record in records]
+    whitened = [lfilter(filter_of_noise, np.ones(1), fit.residual)[len(colour) :] for fit in fits]
+    delay = posterior.input_delay_samples
+    inputs = [record.input[: record.n_samples - delay, 0] for record in records]
+    driven = [fit.residual[delay:] for fit in fits]
+    return [
+        {"data": "estimation", **whiteness_test(whitened).to_dict()},
+        {"data": "estimation", **independence_test(inputs, driven).to_dict()},
+    ]
+
+
+def tests_by_name(documents: Sequence[Mapping[str, Any]]) -> dict[str, ResidualTest]:
+    """The tests on the estimation records by name, from the documents of `residual_tests`."""
+    found = {}
+    for document in documents:
+        if document["data"] == "estimation":
+            test = ResidualTest.from_dict({key: value for key, value in document.items() if key != "data"})
+            found[test.name] = test
+    return found
+
+
+def noise_order(spread: Mapping[str, Any]) -> int:
+    """Order of the noise model behind which the residuals were tested."""
+    report = spread["report"]
+    return len(report["ar_coefficients"]) if report else 0
+
+
+def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> dict[str, Any] | None:
+    """Intervals of modes (by frequency) and decay rates (slowest first), or None: only the tangent posterior
+    has them."""
+    try:
+        found = pole_intervals(posterior, poles, level)
+    except ValueError:
+        return None
+    by_frequency = np.argsort(poles.omega_rad_s(posterior.dt_s), kind="stable")
+    slowest_first = [i for i in np.argsort(-poles.real, kind="stable") if poles.real[i] > 0]
+    return {
+        "level": level,
+        "modes": [
+            {
+                "frequency_Hz": (found.omega_rad_s[i] / (2 * np.pi)).tolist(),
+                "omega_rad_s": found.omega_rad_s[i].tolist(),
+                "damping": found.zeta[i].tolist(),
+            }
+            for i in by_frequency
+        ],
+        "real_poles_per_s": [found.decay_per_s[i].tolist() for i in slowest_first],
+    }
+
+
+def empirical_response(
+    records: Sequence[Record],
+    *,
+    integrators: int = 0,
+    level: float = 0.95,
+    band_rad_s: tuple[float, float] | None = None,
+) -> FrequencyUncertainty | None:
+    """Response without a model from the largest set of equally long records, or None if they are too
+    short.
+
+    integrators: as often the differences from sample to sample are taken first, of input and output, unless
+    the records are confined to a band.
+    """
+    by_length: dict[int, list[Record]] = {}
+    for record in records:
+        by_length.setdefault(record.n_samples, []).append(record)
+    alike = max(by_length.values(), key=len)
+    if band_rad_s is None:
+        for _ in range(integrators):  # an integrated output ends elsewhere than it began and leaks everywhere
+            alike = [increments(record) for record in alike]
+    low, high = band_rad_s or (None, None)
+    try:
+        return empirical_frf(alike, level=level, omega_min_rad_s=low, omega_max_rad_s=high)
+    except ValueError:
+        return None  # a picture the records are too short for; the identification stands without it
+
+
+def scatter_of(
+    channel: Channel,
+    result: ChannelResult,
+    records: Sequence[RunRecord],
+    bands: Sequence[tuple[float, float]],
+) -> list[dict[str, Any]] | None:
+    """Predicted ellipses of single records against the scatter of repeats, or None without repeats."""
+    bounded = {record.name: record for record in result.bounded}
+    groups: dict[str, list[Record]] = {}
+    for item in records:
+        if item.condition is not None and item.role != "validation":
+            record = bounded.get(item.record.name) or as_bounded(item.record, channel)
+            groups.setdefault(item.condition, []).append(record)
+    repeated = [group for group in groups.values() if len(group) >= 2]
+    if not repeated:
+        return None
+    flat = record_posteriors(
+        [record for group in repeated for record in group],
+        result.identification.model,
+        channel.uncertainty,
+    )
+    omega = np.geomspace(bands[0][0], bands[-1][1] * (1 - 1e-6), 20 * len(bands))
+    estimates = iter([posterior.at(omega, channel.uncertainty.level) for posterior in flat])
+    return [
+        row.to_dict()
+        for row in repeat_scatter([[next(estimates) for _ in group] for group in repeated], bands)
+    ]
