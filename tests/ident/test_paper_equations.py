@@ -8,7 +8,7 @@ Reading the printed text: (8) and (9) are about squared moduli, the first entry 
 from __future__ import annotations
 
 import ast
-import importlib
+import pkgutil
 import typing
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +58,7 @@ ALGORITHMS = typing.get_args(Algorithm)
 
 @dataclass(frozen=True)
 class Equation:
-    """`functions` are dotted names below ident, `tests` "file::test" below tests/ident ("" is this file)."""
+    """`functions` are dotted names, `tests` "file::test" below tests/ident ("" is this file)."""
 
     numbers: tuple[int, ...]
     says: str
@@ -70,19 +70,19 @@ EQUATIONS = (
     Equation(
         (1,),
         "y = G(q) u + v, G a sum of delays",
-        ("model.GobfModel.simulate",),
+        ("ident.basis.model.GobfModel.simulate",),
         ("::test_1_output_is_the_convolution_with_the_impulse_response",),
     ),
     Equation(
         (2,),
         "FIR: the sum cut off",
-        ("comparators.fir", "basis.regressor"),
+        ("validation.comparators.comparators.fir", "ident.basis.functions.regressor"),
         ("::test_2_zero_poles_are_the_fir_model", "test_basis.py::test_fir_is_delay"),
     ),
     Equation(
         (3,),
         "y = sum theta_i L_i(q) u",
-        ("model.GobfModel.frequency_response", "model.GobfModel.simulate"),
+        ("ident.basis.model.GobfModel.frequency_response", "ident.basis.model.GobfModel.simulate"),
         (
             "::test_3_model_is_the_weighted_sum_of_its_functions",
             "test_model.py::test_simulation_agrees_with_control",
@@ -91,13 +91,17 @@ EQUATIONS = (
     Equation(
         (4,),
         "orthonormal on the unit circle",
-        ("basis.basis_response",),
+        ("ident.basis.functions.basis_response",),
         ("test_basis.py::test_basis_is_orthonormal_on_the_circle", "test_basis.py::test_kernel_identity"),
     ),
     Equation(
         (5,),
         "the generalised basis",
-        ("basis.basis_response", "basis.all_pass_response", "paper_realisation.complex_realisation"),
+        (
+            "ident.basis.functions.basis_response",
+            "ident.basis.functions.all_pass_response",
+            "ident.basis.paper_realisation.complex_realisation",
+        ),
         (
             "test_basis.py::test_real_poles_give_the_printed_formula",
             "test_basis.py::test_paper_complex_states_are_the_printed_functions",
@@ -107,7 +111,7 @@ EQUATIONS = (
     Equation(
         (6,),
         "Laguerre: one real pole repeated",
-        ("basis.basis_response", "basis.regressor"),
+        ("ident.basis.functions.basis_response", "ident.basis.functions.regressor"),
         (
             "::test_5_6_fir_laguerre_and_kautz_are_one_code_path",
             "test_basis.py::test_laguerre_by_transfer_functions",
@@ -116,25 +120,25 @@ EQUATIONS = (
     Equation(
         (7,),
         "real pair as combinations of the complex functions",
-        ("real_pair.combination",),
+        ("ident.basis.real_pair.combination",),
         ("::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",),
     ),
     Equation(
         (8, 9, 10),
         "the combination is unitary",
-        ("real_pair.combination",),
+        ("ident.basis.real_pair.combination",),
         ("::test_8_to_10_combination_is_unitary_for_every_solution",),
     ),
     Equation(
         (11, 12),
         "each function from the one before",
-        ("basis.basis_response", "paper_realisation.complex_realisation"),
+        ("ident.basis.functions.basis_response", "ident.basis.paper_realisation.complex_realisation"),
         ("::test_11_12_functions_follow_from_the_one_before",),
     ),
     Equation(
         (13,),
         "real numerator m1 q + m2 behind the all-pass of the poles before",
-        ("real_pair.pair_response", "real_pair.combination"),
+        ("ident.basis.real_pair.pair_response", "ident.basis.real_pair.combination"),
         (
             "::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",
             "::test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles",
@@ -143,7 +147,7 @@ EQUATIONS = (
     Equation(
         (14, 15, 16),
         "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M",
-        ("real_pair.pair_metric", "real_pair.pair_response"),
+        ("ident.basis.real_pair.pair_metric", "ident.basis.real_pair.pair_response"),
         (
             "test_real_pair.py::test_solutions_satisfy_the_constraints",
             "test_real_pair.py::test_constraints_make_the_pair_orthonormal",
@@ -153,13 +157,13 @@ EQUATIONS = (
     Equation(
         (17,),
         "x_2 from x_1 by a quarter turn in the space of M",
-        ("real_pair.rotated_numerators",),
+        ("ident.basis.real_pair.rotated_numerators",),
         ("::test_17_second_numerator_is_the_quarter_turn",),
     ),
     Equation(
         (18, 19),
         "the solution with m2 = 0",
-        ("real_pair.paper_numerators",),
+        ("ident.basis.real_pair.paper_numerators",),
         (
             "::test_18_19_solution_with_m2_zero",
             "test_real_pair.py::test_every_solution_gives_the_same_fit",
@@ -169,7 +173,7 @@ EQUATIONS = (
     Equation(
         (20,),
         "J, the mean square of the residual",
-        ("least_squares.fit", "error_surface.error_surface"),
+        ("ident.fit.least_squares.fit", "ident.search.error_surface.error_surface"),
         (
             "::test_20_cost_is_the_mean_square_residual",
             "test_error_surface.py::test_surface_is_the_fit_at_every_point",
@@ -178,25 +182,25 @@ EQUATIONS = (
     Equation(
         (21,),
         "linear regression phi' theta",
-        ("basis.regressor", "model.GobfModel.simulate"),
+        ("ident.basis.functions.regressor", "ident.basis.model.GobfModel.simulate"),
         ("::test_21_output_is_linear_in_the_coefficients",),
     ),
     Equation(
         (22,),
         "difference equations of the states",
-        ("paper_realisation.complex_realisation", "basis.regressor"),
+        ("ident.basis.paper_realisation.complex_realisation", "ident.basis.functions.regressor"),
         ("::test_22_difference_equations_give_the_printed_functions",),
     ),
     Equation(
         (23, 24),
         "E x(k+1) = A x + B u, solved for x(k+1)",
-        ("paper_realisation.complex_realisation",),
+        ("ident.basis.paper_realisation.complex_realisation",),
         ("::test_23_24_matrices_are_the_printed_ones",),
     ),
     Equation(
         (25, 26),
         "real states by the block diagonal T",
-        ("paper_realisation.real_realisation", "basis.basis_state_space"),
+        ("ident.basis.paper_realisation.real_realisation", "ident.basis.functions.basis_state_space"),
         (
             "test_basis.py::test_paper_state_space_gives_the_same_basis",
             "::test_25_26_transformation_keeps_the_space",
@@ -207,7 +211,7 @@ EQUATIONS = (
     Equation(
         (27,),
         "least-squares coefficients",
-        ("least_squares.fit",),
+        ("ident.fit.least_squares.fit",),
         (
             "::test_27_least_squares_solves_the_normal_equations",
             "test_least_squares.py::test_fit_is_the_dense_least_squares_fit",
@@ -216,7 +220,7 @@ EQUATIONS = (
     Equation(
         (28, 29),
         "filter parameters eta, beta and gamma",
-        ("coordinates.search_space", "basis.block_parameters"),
+        ("ident.basis.coordinates.search_space", "ident.basis.functions.block_parameters"),
         (
             "::test_28_29_filter_parameters_and_poles_correspond",
             "test_pole_search.py::test_points_of_the_cube_are_ordered_poles_inside_the_circle",
@@ -225,7 +229,11 @@ EQUATIONS = (
     Equation(
         (30,),
         "cost over eta with the coefficients fitted every time",
-        ("candidate_cost.CandidateCost.rss", "pole_search.PoleSearch.joint", "identify.identify"),
+        (
+            "ident.search.candidate_cost.CandidateCost.rss",
+            "ident.search.pole_search.PoleSearch.joint",
+            "identify.identify",
+        ),
         (
             "::test_30_cost_of_eta_is_that_of_the_fitted_coefficients",
             "test_pole_search.py::test_paper_coordinates_can_be_chosen",
@@ -234,7 +242,7 @@ EQUATIONS = (
     Equation(
         (31,),
         "bounded global minimisation: DIRECT in all variants",
-        ("direct.minimise",),
+        ("ident.search.direct.minimise",),
         (
             "::test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum",
             "::test_31_all_variants_of_nlopt_are_there",
@@ -252,10 +260,7 @@ def test_table_covers_the_equations_in_order():
 @pytest.mark.parametrize("entry", EQUATIONS, ids=lambda entry: f"({entry.numbers[0]})")
 def test_functions_and_tests_of_the_table_exist(entry):
     for name in entry.functions:
-        module, *path = name.split(".")
-        found = importlib.import_module(f"ident.{module}")
-        for part in path:
-            found = getattr(found, part)
+        found = pkgutil.resolve_name(name)
         assert callable(found), name
         assert found.__doc__, f"{name} has no contract"
     for name in entry.tests:
