@@ -232,7 +232,7 @@ EQUATIONS = (
         (
             "ident.search.candidate_cost.CandidateCost.rss",
             "ident.search.pole_search.PoleSearch.joint",
-            "identify.identify",
+            "ident.identify.identify",
         ),
         (
             "::test_30_cost_of_eta_is_that_of_the_fitted_coefficients",
