@@ -19,6 +19,7 @@ import numpy as np
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.synthesis.interrupts import interrupts_kept
 
 Symbol = Any  # casadi.SX; its stubs disagree with its own arithmetic on numpy arrays
 
@@ -149,7 +150,8 @@ class AngleProgram:
             "print_time": False,
             "error_on_fail": False,
         }
-        self._solver = ca.nlpsol("angle_program", "ipopt", nlp, options)
+        with interrupts_kept():
+            self._solver = ca.nlpsol("angle_program", "ipopt", nlp, options)
 
     def _response(self, x: Symbol, omega: Real) -> tuple[Symbol, Symbol]:
         """Real and imaginary part of K on the grid; sections in p or, above |p| = 1, in 1/p."""
@@ -191,16 +193,17 @@ class AngleProgram:
         return re, im
 
     def solve(self, start: NlpPoint) -> NlpPoint:
-        """Maximise log g from a start."""
+        """Maximise log g from a start; KeyboardInterrupt if one came meanwhile (IPOPT would end early)."""
         initial = np.concatenate([start.parameters, [start.g], *start.angles])
         initial = np.clip(initial, self._bounds[0], self._bounds[1])
-        answer = self._solver(
-            x0=initial,
-            lbx=self._bounds[0],
-            ubx=self._bounds[1],
-            lbg=self._row_bounds[0],
-            ubg=self._row_bounds[1],
-        )
+        with interrupts_kept():
+            answer = self._solver(
+                x0=initial,
+                lbx=self._bounds[0],
+                ubx=self._bounds[1],
+                lbg=self._row_bounds[0],
+                ubg=self._row_bounds[1],
+            )
         values = np.asarray(answer["x"]).ravel()
         stats = self._solver.stats()
         n = self.cascade.parameters

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -22,6 +21,7 @@ import numpy as np
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
+from control_design.synthesis.interrupts import interrupts_wait, leave_to_parent
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.search_tasks import StartEnd, StartTask, Workshop
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -65,7 +65,8 @@ class WorkPool:
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
         os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
         try:
-            pool.submit(_ready)  # the first task starts all processes, with these variables
+            with interrupts_wait():
+                pool.submit(_ready)  # the first task starts all processes, with these variables
         finally:
             for name, value in before.items():
                 if value is None:
@@ -94,9 +95,14 @@ class WorkPool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the processes; a task that is running takes a second at most."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        """Ends the processes: at an error or an interrupt at once, else after the task they are at (which
+        takes a second at most)."""
+        if self._pool is None:
+            return
+        if error is not None:
+            for process in list(self._pool._processes.values()):
+                process.terminate()
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 _own: Workshop | None = None  # of a worker process
@@ -110,7 +116,7 @@ def _begin(
 ) -> None:
     """First thing in a worker process."""
     global _own
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_to_parent()
     parent = multiprocessing.parent_process()
     assert parent is not None
 

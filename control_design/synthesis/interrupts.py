@@ -1,0 +1,56 @@
+"""Interrupts from the keyboard (SIGINT) that compiled code swallows, and processes that must not see them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from types import FrameType
+from typing import Any
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Raise KeyboardInterrupt at the end if an interrupt came while the code inside ran.
+
+    CasADi asks Python for signals while it iterates and turns the exception of the handler into an ordinary
+    end of the solver ("User_Requested_Stop", or a failed evaluation). The handler is therefore watched, not
+    the status. Python runs handlers in the main thread only: elsewhere there is nothing to do.
+    """
+    before: Any = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    seen = False
+
+    def watch(number: int, frame: FrameType | None) -> None:
+        nonlocal seen
+        seen = True
+        before(number, frame)
+
+    try:
+        signal.signal(signal.SIGINT, watch)
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if seen:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def interrupts_wait() -> Iterator[None]:
+    """Interrupts come through only at the end; processes begun inside do not see them."""
+    resource_tracker.ensure_running()  # its own start would let them through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def leave_to_parent() -> None:
+    """In a worker process: the parent alone answers to the keyboard."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
