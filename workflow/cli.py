@@ -6,12 +6,13 @@ result is not certified or misses its specification (the report is written all t
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import sys
 import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -89,7 +90,7 @@ def run(
     with TerminalProgress() as progress:
         summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
     if as_json:
-        _print_json(summary.to_document())
+        print_json(summary.to_document())
     else:
         print_summary(summary)
     _leave(summary.certified, summary.verdict)
@@ -109,7 +110,7 @@ def simulate(
 
     files = simulate_to_csv(config, out)
     if as_json:
-        _print_json({"files": [str(path) for path in files]})
+        print_json({"files": [str(path) for path in files]})
     else:
         for path in files:
             typer.echo(str(path))
@@ -219,7 +220,7 @@ def identify(
         )
     if as_json:
         document = summary.to_document()
-        _print_json({key: document[key] for key in ("title", "verdict", "report", "numbers", "table")})
+        print_json({key: document[key] for key in ("title", "verdict", "report", "numbers", "table")})
     else:
         print_summary(summary)
         for name, path in (("model", export), ("model for flexlink design", out)):
@@ -264,7 +265,7 @@ def design(
 
     summary = design_controller(source, specification, out=out, seed=seed)
     if as_json:
-        _print_json(summary.to_document())
+        print_json(summary.to_document())
     else:
         print_summary(summary)
     _leave(summary.certified, summary.verdict)
@@ -282,27 +283,7 @@ def report(
 
     summary = rebuild_report(RunDirectory.open(directory))
     if as_json:
-        _print_json(summary.to_document())
-    else:
-        print_summary(summary)
-
-
-@app.command(short_help="Redraw Figs. 1-7 of Ziaei & Wang 2006.")
-def paper(
-    out: Annotated[Path, typer.Option(help="Directory for page, figures and table; new or empty.")],
-    seed: Annotated[int, typer.Option(min=0, help="Root of all inputs and noise.")] = 2006,
-    replace: Annotated[bool, typer.Option("--replace", help="Exchange an earlier page in --out.")] = False,
-    as_json: Json = False,
-) -> None:
-    """Redraw the figures of Ziaei & Wang 2006 with what the paper reports beside what we find."""
-    from validation.paper.command import redraw_paper
-    from validation.paper.settings import PaperSettings
-    from workflow.console import TerminalProgress, print_summary
-
-    with TerminalProgress() as progress:
-        summary = redraw_paper(out, PaperSettings(seed=seed), replace=replace, progress=progress)
-    if as_json:
-        _print_json(summary.to_document())
+        print_json(summary.to_document())
     else:
         print_summary(summary)
 
@@ -339,7 +320,7 @@ def study(
             config, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
         )
     if as_json:
-        _print_json(summary.to_document())
+        print_json(summary.to_document())
     else:
         print_summary(summary)
     _leave(summary.certified, summary.verdict)
@@ -395,7 +376,7 @@ def diagnose(
             progress=progress,
         )
     if as_json:
-        _print_json(found.to_document())
+        print_json(found.to_document())
     else:
         print_summary(found.summary)
     for line in found.complaints():
@@ -404,48 +385,13 @@ def diagnose(
         raise typer.Exit(found.exit_code)
 
 
-@app.command(short_help="Test the diagnosis on sealed cases of its own.")
-def blind(
-    cases: Annotated[int, typer.Option(help="Number of cases.")],
-    seed: Annotated[int, typer.Option(help="Root of all rigs, causes, inputs and noise.")],
-    out: Annotated[Path, typer.Option(help="Directory of the run, new or empty.")],
-    jobs: Annotated[
-        int | None,
-        typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
-    ] = None,
-    simulator: Annotated[
-        str,
-        typer.Option(help="What makes the records: ritz (built in) or exudyn (extra 'blind')."),
-    ] = "ritz",
-    only: Annotated[
-        str | None,
-        typer.Option(help="One sort of cases: none, faint, clear, pair or unlisted [default: a mix]."),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in --out; finished cases are taken up.")
-    ] = False,
-    as_json: Json = False,
-) -> None:
-    """Cases from an independent simulator, labels sealed by a salted hash, diagnosis, opening, scores."""
-    from validation.blind.protocol import run_blind
-    from workflow.console import TerminalProgress, print_summary
-
-    with TerminalProgress() as progress:
-        summary = run_blind(
-            cases, seed, out, jobs=jobs, simulator=simulator, only=only, resume=resume, progress=progress
-        )
-    if as_json:
-        _print_json(summary.numbers)
-    else:
-        print_summary(summary)
-
-
 def _degree(text: str | None) -> int | str | None:
     """A number where one was given, so that the settings' own complaint names what is allowed."""
     return int(text) if text is not None and text.isdigit() else text
 
 
-def _print_json(document: Mapping[str, Any]) -> None:
+def print_json(document: Mapping[str, Any]) -> None:
+    """A document, and nothing else, on standard output."""
     from workflow.engine.storage import strict_json
 
     sys.stdout.write(json.dumps(strict_json(document), allow_nan=False, ensure_ascii=False, indent=1) + "\n")
@@ -473,6 +419,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not arguments:
         arguments = ["--help"]
     try:
+        _plug_in(arguments)
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         # typer turns Ctrl-C into a silent exit of this code.
         return _interrupted(arguments) if code == _EXIT_INTERRUPTED else code
@@ -488,13 +435,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(*_explain(error))
 
 
+def _commands() -> dict[str, Callable[..., Any]]:
+    """Every registered command by its name."""
+    return {
+        info.name or info.callback.__name__: info.callback
+        for info in app.registered_commands
+        if info.callback is not None
+    }
+
+
+def _plug_in(arguments: Sequence[str]) -> None:
+    """Register the commands that other packages bring: entry points of the group `flexlink.commands`, each a
+    function with Typer's annotations. Looked for only where none of our own commands is called."""
+    known = _commands()
+    if next((name for name in arguments if not name.startswith("-")), None) in known:
+        return
+    for point in metadata.entry_points(group="flexlink.commands"):
+        if point.name not in known:
+            app.command(point.name)(point.load())
+
+
 def _interrupted(arguments: Sequence[str]) -> int:
     command = arguments[0]
-    hint = (
-        f"; `flexlink {command} --out DIR --resume` continues"
-        if command in ("run", "study", "diagnose", "blind")
-        else ""
-    )
+    called = _commands().get(command)
+    resumable = called is not None and "resume" in inspect.signature(called).parameters
+    hint = f"; `flexlink {command} --out DIR --resume` continues" if resumable else ""
     return _complain(f"interrupted{hint}", _EXIT_INTERRUPTED)
 
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import validation.blind
 from plant.effects import EFFECTS, GroundSpring, parse_effects
 from plant.rig import Rig
 from plant.simulate import simulate
@@ -82,16 +79,6 @@ def _noise_deviations(ours: Truth, effects: list[dict[str, object]], voltage: np
 def test_effects_of_the_list_are_all_there():
     assert set(LISTED) == set(EFFECTS) == set(EFFECTS_HERE)
     assert not set(LISTED) & set(UNLISTED)
-
-
-def test_the_truth_shares_no_code_with_plant():
-    folder = Path(validation.blind.__file__).parent
-    for name in ("truth.py", "kernel.py", "beam.py", "inputs.py", "rigs.py", "sizes.py", "cases.py"):
-        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
-            module = getattr(node, "module", "") or ""
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [module]
-            if isinstance(node, (ast.Import, ast.ImportFrom)):
-                assert not any(entry.split(".")[0] in ("plant", "diagnosis") for entry in names), name
 
 
 def test_clamped_frequencies_are_those_of_the_uniform_beam():

@@ -7,7 +7,7 @@ import html
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from validation.paper.findings import Finding
@@ -26,7 +26,7 @@ def page_html(
 ) -> str:
     """The self-contained page; everything drawn stands inside it."""
     environment = Environment(
-        loader=PackageLoader("workflow", "templates"),
+        loader=ChoiceLoader([PackageLoader("validation"), PackageLoader("workflow")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
