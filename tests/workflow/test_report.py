@@ -16,7 +16,6 @@ from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, StageData
 from workflow.figures.style import Picture
 from workflow.report import write_report
-from workflow.report.words import count, decibels, frequency, listing, number, sentence
 from workflow.tasks.stages.results import load_records
 
 ATTACK = "<script>alert(1)</script>"
@@ -299,38 +298,6 @@ def test_missing_stage_is_one_line(tmp_path):
     with pytest.raises(InputError, match="stage records is not there"):
         write_report(run, settings)
     assert not run.report_path.exists()
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "–"),
-        (float("nan"), "not known"),
-        (float("inf"), "unlimited"),
-        (0.0, "0"),
-        (1234.6, "1235"),
-        (123456.7, "123457"),
-        (0.001234, "0.00123"),
-        (1.5e-7, "1.5e-07"),
-        (-2.0, "-2"),
-    ],
-)
-def test_numbers_in_words(value, text):
-    assert number(value) == text
-
-
-def test_small_phrases():
-    assert listing([]) == ""
-    assert listing(["a"]) == "a"
-    assert listing(["a", "b", "c"]) == "a, b and c"
-    assert count(0, "run") == "no runs"
-    assert count(1, "run") == "1 run"
-    assert count(2, "entry", "entries") == "2 entries"
-    assert decibels(2.0) == "2 (+6.0 dB)"
-    assert decibels(0.0) == "no lower limit"
-    assert frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
-    assert sentence("hub: it is") == "hub: it is."
-    assert sentence("stop!") == "Stop!"
 
 
 def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn):

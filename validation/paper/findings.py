@@ -11,7 +11,7 @@ from validation.paper.bounds import TWO_SIGMA_LEVEL, Coverage
 from validation.paper.experiments import RECIPE_BUDGET, Comparison, PaperResults
 from validation.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
 from validation.paper.surface import minima_along, slices
-from workflow.report.words import listing, number
+from workflow.report.formats import listing, number
 
 # A response is matched where its RMS error stays below this; a fit is good within these points of the best.
 _MATCHED = 0.1

@@ -27,7 +27,7 @@ from workflow.engine.errors import (
     one_line,
 )
 from workflow.engine.progress import Progress, Silence
-from workflow.report.words import listing
+from workflow.report.formats import listing
 from workflow.tasks.summary import Row, RunSummary, Section
 
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only

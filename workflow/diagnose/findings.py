@@ -17,7 +17,7 @@ from workflow.diagnose.words import (
     sureness,
     times_noise,
 )
-from workflow.report.words import listing, number
+from workflow.report.formats import listing, number
 
 # A stated value that had to move further than this is worth a sentence.
 NOTABLE_TOLERANCES = 2.0

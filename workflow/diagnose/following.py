@@ -15,7 +15,7 @@ from diagnosis.next_experiment.next_experiment import NextExperiment, next_exper
 from plant.simulate import simulate
 from workflow.diagnose.findings import unlisted_words
 from workflow.diagnose.words import effect_words, probability_words
-from workflow.report.words import listing
+from workflow.report.formats import listing
 
 # Below this probability not even a runner-up is a rival.
 _THINKABLE = 1e-4

@@ -8,9 +8,9 @@ from typing import Any
 from workflow.diagnose.words import effect_words, probability_words, times_noise
 from workflow.figures.gap_overview import CaseGap, draw_case_gaps
 from workflow.figures.style import render
+from workflow.report.formats import count, listing, number
 from workflow.report.page import Block, Plot, Section, Table, maybe
 from workflow.report.rendering import page
-from workflow.report.words import count, listing, number
 
 
 def overview_page(documents: Sequence[Mapping[str, Any]], failed: Mapping[str, str]) -> str:

@@ -21,9 +21,9 @@ from workflow.diagnose.words import (
 )
 from workflow.figures.gap_style import WORDS
 from workflow.figures.style import Picture, render
+from workflow.report.formats import count, number
 from workflow.report.page import Block, Code, Plot, Section, Table, Text, maybe
 from workflow.report.rendering import page
-from workflow.report.words import count, number
 
 _LEAST_PRESENCE = 0.01  # of an effect in the table
 

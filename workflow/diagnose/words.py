@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from workflow.report.words import number
+from workflow.report.formats import number
 
 _EFFECTS: Mapping[str, str] = {
     "coulomb_friction": "dry (Coulomb) friction",

@@ -6,8 +6,8 @@ import math
 
 from control_design.convex.reference_filter import Prefilter
 from workflow.report.data import RunData
+from workflow.report.formats import frequency, number, percent, sentence
 from workflow.report.page import Block, Code, Remarks, Table, Text, heading, maybe
-from workflow.report.words import frequency, number, percent, sentence
 from workflow.tasks.achievable_performance import bracket_of, order_advice, yardstick_words
 from workflow.tasks.joint_coverage import joint_numbers, joint_of, joint_words
 from workflow.tasks.reference_filter import prefilter_of, prefilter_words

@@ -18,6 +18,7 @@ from workflow.figures.records import ShownRecord, draw_records
 from workflow.figures.residuals import draw_residual_tests
 from workflow.figures.style import Picture, render
 from workflow.figures.validation import draw_validation
+from workflow.report.formats import count, frequency, listing, number, percent, sentence
 from workflow.report.model_blocks import (
     STABILISATION_CAPTION,
     band_table,
@@ -33,7 +34,6 @@ from workflow.report.model_blocks import (
 )
 from workflow.report.page import Block, Plot, Section, Table, Text, maybe
 from workflow.report.rendering import page
-from workflow.report.words import count, frequency, listing, number, percent, sentence
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.stages.uncertainty import tests_by_name
 

@@ -11,8 +11,8 @@ import numpy as np
 from control_design.synthesis.synthesis_result import Outcome
 from workflow.report.beyond_margins import order_blocks, prefilter_blocks, whole_blocks
 from workflow.report.data import RunData
+from workflow.report.formats import count, decibels, frequency, listing, number, percent, sentence, si
 from workflow.report.page import Block, Code, Plot, Remarks, Section, Table, Text, maybe
-from workflow.report.words import count, decibels, frequency, listing, number, percent, quantity, sentence
 from workflow.tasks.joint_coverage import open_words
 
 _NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
@@ -238,14 +238,14 @@ def closed_loop_section(data: RunData) -> Section:
         else f"{count(draws, 'plant')} drawn from the identified uncertainty"
     )
     lead = (
-        f"A reference step of {quantity(document['reference_step'], data.unit(channel.output))} and a step "
+        f"A reference step of {si(document['reference_step'], data.unit(channel.output))} and a step "
         "disturbance of "
-        f"{quantity(document['disturbance'], data.unit(channel.input))} at the plant's input, on the "
+        f"{si(document['disturbance'], data.unit(channel.input))} at the plant's input, on the "
         "identified model and in "
         f"{where}"
     )
     if document["quantisation"]:
-        lead += f", commands rounded to {quantity(document['quantisation'], data.unit(channel.input))}"
+        lead += f", commands rounded to {si(document['quantisation'], data.unit(channel.input))}"
     lead += f": {settled} of {draws} settled."
     blocks: list[Block] = [Text(lead)]
     if document.get("prefiltered"):
@@ -345,7 +345,7 @@ def _sensitivity_blocks(data: RunData) -> list[Block]:
         tuple(
             (
                 row["name"],
-                quantity(row["reference_rms"], unit),
+                si(row["reference_rms"], unit),
                 f"{number(row['peak'], 4)} ± {number(row['peak_std'], 2)}",
                 frequency(row["omega_rad_s"]),
                 f"{row['off_nominal_percent']:+.2f} %",
@@ -424,8 +424,8 @@ def _beyond_records(data: RunData) -> tuple[str, ...]:
         return ()
     unit = data.unit(channel.input)
     return (
-        f"The command reaches {quantity(peak, unit)}, {number(peak / seen, 2)} times the largest input in "
-        f"the records of the fit ({quantity(seen, unit)}): how the arm answers there is not known. "
+        f"The command reaches {si(peak, unit)}, {number(peak / seen, 2)} times the largest input in "
+        f"the records of the fit ({si(seen, unit)}): how the arm answers there is not known. "
         "Advice: set effort_limit or input_limit in [specification], or take a smaller "
         "closed_loop.reference_step.",
     )
@@ -445,8 +445,8 @@ def _lasting_error(data: RunData) -> tuple[str, ...]:
         until, advice = "for good", "integrator = true in [specification]"
     channel = data.config.control_channel
     return (
-        f"A constant disturbance of {quantity(document['disturbance'], data.unit(channel.input))} "
-        f"leaves {quantity(left, data.unit(channel.output))} of error {until}, "
+        f"A constant disturbance of {si(document['disturbance'], data.unit(channel.input))} "
+        f"leaves {si(left, data.unit(channel.output))} of error {until}, "
         f"{percent(100 * left / step, 2)} of the reference step. The specification asks for nothing better; "
         f"where that matters: {advice}.",
     )

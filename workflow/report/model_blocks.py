@@ -11,8 +11,8 @@ from typing import Any
 
 from ident.basis.options import IdentOptions
 from ident.stabilisation import Stabilisation
+from workflow.report.formats import count, frequency, listing, number, percent
 from workflow.report.page import Block, Remarks, Table, maybe
-from workflow.report.words import count, frequency, listing, number, percent
 from workflow.tasks.stages.uncertainty import noise_order
 from workflow.tasks.summary import between
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from workflow.config.run_config import SimulatedSource
 from workflow.report.data import ChannelData, RunData
+from workflow.report.formats import count, frequency, listing, number, percent, sentence
 from workflow.report.model_blocks import (
     STABILISATION_CAPTION,
     band_table,
@@ -22,7 +23,6 @@ from workflow.report.model_blocks import (
 )
 from workflow.report.page import Block, Plot, Remarks, Section, Table, Text, heading, maybe
 from workflow.report.pictures import channel_picture, fresh_index, shown_pair
-from workflow.report.words import count, frequency, listing, number, percent, sentence
 from workflow.tasks.stages.uncertainty import tests_by_name
 
 _ROLE = {"estimation": "estimation", "validation": "validation", "repeat": "repeat"}

@@ -8,8 +8,8 @@ from typing import Any
 
 from workflow.report.beyond_margins import beyond_words
 from workflow.report.data import ChannelData, RunData
+from workflow.report.formats import count, frequency, listing, number, percent, sentence
 from workflow.report.page import Block, Code, Section, Table, Text
-from workflow.report.words import count, frequency, listing, number, percent, sentence
 from workflow.tasks.joint_coverage import open_words
 
 

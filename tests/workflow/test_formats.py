@@ -1,0 +1,143 @@
+"""Formats: every filter on its limiting cases. Templates: escaping, pictures by name, contents."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from jinja2 import ChoiceLoader, DictLoader
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from workflow.figures.registry import drawings
+from workflow.report import rendering
+from workflow.report.formats import (
+    count,
+    decibels,
+    extent,
+    frequency,
+    interval,
+    listing,
+    number,
+    percent,
+    sentence,
+    setting,
+    share,
+    si,
+    signed,
+    yes_no,
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"),
+        (float("nan"), "not known"),
+        (float("inf"), "unlimited"),
+        (0.0, "0"),
+        (1234.6, "1235"),
+        (123456.7, "123457"),
+        (0.001234, "0.00123"),
+        (1.5e-7, "1.5e-07"),
+        (-2.0, "-2"),
+    ],
+)
+def test_numbers_in_words(value, text):
+    assert number(value) == text
+
+
+def test_small_phrases():
+    assert listing([]) == ""
+    assert listing(["a"]) == "a"
+    assert listing(["a", "b", "c"]) == "a, b and c"
+    assert count(0, "run") == "no runs"
+    assert count(1, "run") == "1 run"
+    assert count(2, "entry", "entries") == "2 entries"
+    assert decibels(2.0) == "2 (+6.0 dB)"
+    assert decibels(0.0) == "no lower limit"
+    assert frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
+    assert sentence("hub: it is") == "hub: it is."
+    assert sentence("stop!") == "Stop!"
+    assert sentence(" two \n lines ") == "Two lines."
+    assert sentence(Markup("<b>x</b> ")) == Markup("<b>x</b>.")
+    assert isinstance(sentence(Markup("a")), Markup)
+
+
+def test_numbers_with_units_and_ranges():
+    assert si(1.2345, "N m") == "1.23 N m"
+    assert si(2.0, "") == "2"
+    assert si(None, "V") == "–"
+    assert percent(4.5678, 2) == "4.6 %"
+    assert share(0.95) == "95 %"
+    assert share(None) == "–"
+    assert signed(-0.125, "%") == "-0.12 %"
+    assert extent([2.0, 1.0, 3.0]) == "1 to 3"
+    assert extent([1.00001, 1.0]) == "1"
+    assert interval((7.6123, 7.6191)) == "7.6123 to 7.6191"
+    assert interval((0.0, float("inf"))) == "not known"
+    assert interval((1.0, 1.0)) == "1 to 1"
+    assert interval((1.23456, 2.0), 3) == "1.23 to 2"
+    assert [yes_no(state) for state in (True, False, None)] == ["yes", "NO", "–"]
+    assert setting({"name": "coulomb", "level_Nm": 0.1, "on": True}) == "level_Nm = 0.1, on = True"
+    assert setting((1.0, 2.5)) == "1 to 2.5"
+
+
+PAGE = """
+{% extends "base.html.j2" %}
+{% from "macros.html.j2" import section, figure, table, row, remarks with context %}
+{% block body %}
+{% call section("one", "One", "1") %}
+{% call figure("line", values) %}A "caption" of {{ title }}.{% endcall %}
+{% call figure("line", values, file="again") %}Again.{% endcall %}
+{% call figure("line", []) %}Never drawn.{% endcall %}
+{% call table(["a", "b"]) %}{{ row([name, 1.5|number], false) }}{% endcall %}
+{{ remarks([name, "  "], "warning") }}{{ remarks([], "good", "No title without items") }}
+{% endcall %}
+{% endblock %}
+"""
+
+
+@pytest.fixture
+def line(monkeypatch):
+    """A page and a drawing of this test's own."""
+
+    def draw(values: list[float]) -> Figure | None:
+        figure = Figure()
+        figure.subplots().plot(values)
+        return figure if values else None
+
+    environment = rendering.environment()
+    loader = ChoiceLoader(
+        [DictLoader({"test.html.j2": PAGE, "test.txt.j2": "{{ name }}"}), environment.loader]
+    )
+    monkeypatch.setattr(environment, "loader", loader)
+    monkeypatch.setattr(rendering, "drawings", lambda: {"line": draw})
+
+
+def test_a_template_draws_its_figures_and_escapes_what_it_is_given(line):
+    page = rendering.render_page("test.html.j2", title="A<B", name="<script>", values=[1.0, 2.0])
+    assert list(page.pictures) == ["line", "line-again"]
+    assert page.html.count("<svg") == 2
+    assert "Never drawn" not in page.html
+    assert "No title" not in page.html
+    assert 'aria-label="A &quot;caption&quot; of A&lt;B."' in page.html
+    assert '<tr class="no"><td>&lt;script&gt;</td><td>1.5</td></tr>' in page.html
+    assert '<a href="#one">1</a>' in page.html
+    assert page.html.count("<li>") == 1
+    assert "<script>" not in page.html
+
+
+def test_texts_are_not_escaped(line):
+    assert rendering.render_text("test.txt.j2", name="a < b & c") == "a < b & c"
+
+
+def test_every_figure_that_a_template_names_can_be_drawn():
+    environment = rendering.environment()
+    for template in environment.list_templates(extensions=["j2"]):
+        assert environment.loader is not None
+        source = environment.loader.get_source(environment, template)[0]
+        source = re.sub(r"{#.*?#}", "", source, flags=re.DOTALL)
+        for name in re.findall(r'call figure\("([^"]+)"', source):
+            assert name in drawings(), f"{template}: {name}"

@@ -1,0 +1,161 @@
+"""Numbers as words: the filters and functions that templates have, and the one place that formats a number.
+
+Each takes plain values (None and non-finite ones too) and returns text. What the text means in a sentence,
+and every sentence, stands in the templates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+MISSING = "–"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Significant digits without a pointless exponent; None is a dash, infinities and nan are words."""
+    if value is None:
+        return MISSING
+    if math.isnan(value):
+        return "not known"
+    if math.isinf(value):
+        return "unlimited" if value > 0 else "-unlimited"
+    text = f"{value:.{digits}g}"
+    if "e" in text and 1e-3 <= abs(value) < 1e6:
+        text = f"{value:.0f}"
+    return text
+
+
+def si(value: float | None, unit: str, digits: int = 3) -> str:
+    """A number with its unit, if anybody stated one: 1.25 | si("N m") is "1.25 N m"."""
+    text = number(value, digits)
+    return text if text == MISSING or not unit else f"{text} {unit}"
+
+
+def percent(value: float | None, digits: int = 3) -> str:
+    """A value that is in percent already."""
+    return si(value, "%", digits)
+
+
+def share(value: float | None, digits: int = 4) -> str:
+    """A share of one in percent: 0.95 | share is "95 %"."""
+    return percent(None if value is None else 100 * value, digits)
+
+
+def signed(value: float | None, unit: str = "", decimals: int = 2) -> str:
+    """With its sign and a fixed number of decimals."""
+    return MISSING if value is None else f"{value:+.{decimals}f} {unit}".rstrip()
+
+
+def fixed(value: float | None, decimals: int = 1) -> str:
+    """A fixed number of decimals."""
+    return MISSING if value is None else f"{value:.{decimals}f}"
+
+
+def interval(ends: Sequence[float], digits: int | None = None) -> str:
+    """low to high; without `digits`, as many as show two digits of what lies between."""
+    low, high = ends
+    if digits is not None:
+        return f"{number(low, digits)} to {number(high, digits)}"
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return "not known"
+    if not 1e-7 < high - low < 1e5:
+        return f"{low:.6g} to {high:.6g}"
+    decimals = max(0, 1 - math.floor(math.log10(high - low)))
+    return f"{low:.{decimals}f} to {high:.{decimals}f}"
+
+
+def extent(values: Iterable[float], digits: int = 4) -> str:
+    """Smallest to largest; one number where both read the same."""
+    known = sorted(values)
+    low, high = number(known[0], digits), number(known[-1], digits)
+    return low if low == high else f"{low} to {high}"
+
+
+def frequency(omega_rad_s: float | None, digits: int = 3) -> str:
+    """rad/s with Hz beside it."""
+    if omega_rad_s is None:
+        return MISSING
+    return f"{number(omega_rad_s, digits)} rad/s ({number(hertz(omega_rad_s), digits)} Hz)"
+
+
+def hertz(omega_rad_s: float) -> float:
+    """rad/s as Hz."""
+    return omega_rad_s / (2 * math.pi)
+
+
+def degrees(radians: float) -> float:
+    """rad as degrees; infinite ones stay infinite."""
+    return math.degrees(radians)
+
+
+def decibels(factor: float) -> str:
+    """A gain factor with its dB."""
+    if math.isinf(factor):
+        return "unlimited"
+    return f"{number(factor)} ({20 * math.log10(factor):+.1f} dB)" if factor > 0 else "no lower limit"
+
+
+def listing(items: Iterable[object]) -> str:
+    """a, b and c."""
+    words = [str(item) for item in items]
+    return " and ".join([part for part in (", ".join(words[:-1]), words[-1]) if part]) if words else ""
+
+
+def count(n: int, one: str, many: str | None = None) -> str:
+    """1 record, 3 records, no records."""
+    words = one if n == 1 else (many or one + "s")
+    return f"{'no' if n == 0 else n} {words}"
+
+
+def sentence(text: str) -> str:
+    """With a capital at the start and a full stop at the end, on one line; markup stays markup."""
+    words = " ".join(text.split())
+    if words:
+        first = words.split(maxsplit=1)[0]
+        # "hub: ..." and "n_real = 1 ..." start with a name, and names keep their spelling.
+        start = words[0] if first.endswith(":") or "_" in first else words[0].upper()
+        words = start + words[1:] + ("" if words[-1] in ".!?" else ".")
+    return Markup(words) if isinstance(text, Markup) else words
+
+
+def yes_no(state: bool | None) -> str:
+    """A requirement's state in a table."""
+    return MISSING if state is None else "yes" if state else "NO"
+
+
+def setting(value: Any) -> str:
+    """The value of an option, as a person would write it down."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float | int):
+        return number(float(value), 6)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} = {part}" for key, part in value.items() if key != "name")
+    if isinstance(value, tuple | list):
+        return " to ".join(setting(part) for part in value)
+    return str(value)
+
+
+FILTERS: Mapping[str, Callable[..., Any]] = {
+    "number": number,
+    "si": si,
+    "percent": percent,
+    "share": share,
+    "signed": signed,
+    "fixed": fixed,
+    "interval": interval,
+    "extent": extent,
+    "frequency": frequency,
+    "hertz": hertz,
+    "degrees": degrees,
+    "decibels": decibels,
+    "listing": listing,
+    "count": count,
+    "sentence": sentence,
+    "yes_no": yes_no,
+    "setting": setting,
+}
