@@ -1,12 +1,16 @@
-"""Paths to data that never enters the repository: measured arms and recorded gap cases."""
+"""Paths to data that never enters the repository, and the command line called in this process."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from tests.workflow.command import Answer
+from workflow.cli import main
 
 # The same examples on every machine, and no time limit for an example that happens to compile something.
 settings.register_profile("flexlink", deadline=None, derandomize=True)
@@ -38,3 +42,31 @@ def gap_cases() -> Path:
     if folder is None:
         pytest.skip("gap cases not found: set FLEXLINK_GAP to the folder that holds labelled/")
     return folder
+
+
+@pytest.fixture
+def flexlink(capfd: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
+    """Call `flexlink` in this process."""
+
+    def call(*arguments: object) -> Answer:
+        capfd.readouterr()
+        code = main([str(argument) for argument in arguments])
+        captured = capfd.readouterr()
+        return Answer(code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def refused(flexlink: Callable[..., Answer]) -> Callable[..., str]:
+    """Call `flexlink`, insist on exit code 2 with one line on standard error only, return the line."""
+
+    def call(*arguments: object) -> str:
+        answer = flexlink(*arguments)
+        assert answer.code == 2, answer
+        assert answer.out == ""
+        assert answer.err.count("\n") == 1, answer.err
+        assert "Traceback" not in answer.err
+        return answer.err
+
+    return call

@@ -203,7 +203,7 @@ def test_effort_is_bounded(monkeypatch):
         return simulate(*args, **kwargs)
 
     for module in ("next_experiment", "discrimination"):
-        monkeypatch.setattr(f"diagnosis.{module}.simulate", counted)
+        monkeypatch.setattr(f"diagnosis.next_experiment.{module}.simulate", counted)
     rivals = _rivals(
         CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), None, rig=TOLERANT
     )
