@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
@@ -120,18 +120,14 @@ class Record:
         """The record with one input and one output; a name may be left out where there is only one column."""
         i = self._column("input", self.input_names, input_name)
         o = self._column("output", self.output_names, output_name)
-        return Record(
-            name=self.name,
+        return replace(
+            self,
             input=self.input[:, [i]],
             output=self.output[:, [o]],
-            dt_s=self.dt_s,
             input_names=(self.input_names[i],),
             output_names=(self.output_names[o],),
-            reference=self.reference,
-            reference_names=self.reference_names,
             input_units=self.input_units[i : i + 1],
             output_units=self.output_units[o : o + 1],
-            source=self.source,
         )
 
     def _column(self, key: str, names: tuple[str, ...], name: str | None) -> int:
@@ -149,18 +145,11 @@ class Record:
                 f"{self.n_samples}, the number there are"
             )
         part = slice(start, stop)
-        return Record(
-            name=self.name,
+        return replace(
+            self,
             input=self.input[part],
             output=self.output[part],
-            dt_s=self.dt_s,
-            input_names=self.input_names,
-            output_names=self.output_names,
             reference=None if self.reference is None else self.reference[part],
-            reference_names=self.reference_names,
-            input_units=self.input_units,
-            output_units=self.output_units,
-            source=self.source,
         )
 
     def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:

@@ -1,0 +1,37 @@
+"""Why simulation and machine disagree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import diagnosis
+from diagnosis import Case, Experiment
+from flexlink.shown import Shown, dressed
+
+__all__ = ["Case", "Diagnosis", "Experiment", "diagnose"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown, diagnosis.Diagnosis):
+    """What `diagnose` found, see there: `flexlink.Diagnosis` is `diagnosis.Diagnosis` that shows itself."""
+
+
+def diagnose(case: Any, **more: Any) -> Diagnosis:
+    """Which effect explains the gap between a rig and its records; arguments as `diagnosis.diagnose`.
+
+    Takes some ten seconds for records of a few thousand samples.
+
+    Examples
+    --------
+    >>> rig, rubbing = flexlink.paper_link(), flexlink.effect("coulomb_friction", torque_Nm=0.05)
+    >>> def measured(name, role, amplitude_V):
+    ...     voltage = flexlink.prbs(8, 4, amplitude_V, 600)
+    ...     run = flexlink.simulate(rig, voltage, [rubbing], rng=default_rng(int(amplitude_V)))
+    ...     return flexlink.Experiment(name, role, run.voltage_V, run.output)
+    >>> case = flexlink.Case("arm", rig, (measured("a", "estimation", 6.0), measured("b", "held_out", 4.0)))
+    >>> found = flexlink.diagnose(case)
+    >>> found.verdict, found.effects[0].name
+    ('effect', 'coulomb_friction')
+    """
+    return dressed(Diagnosis, diagnosis.diagnose(case, **more))

@@ -1,0 +1,187 @@
+"""Controllers: uncertain plants and a specification in, a controller and its certificate out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import control
+import numpy as np
+import numpy.typing as npt
+
+import control_design
+from control_design import (
+    Controller,
+    LinearMachine,
+    RationalWeight,
+    SampledMachine,
+    Specification,
+    SynthesisOptions,
+    c_source,
+    step_metrics,
+)
+from flexlink.models import Uncertainty
+from flexlink.shown import Shown, dressed
+
+__all__ = [
+    "Certificate",
+    "Controller",
+    "LoopRun",
+    "RationalWeight",
+    "Specification",
+    "SynthesisOptions",
+    "SynthesisResult",
+    "UncertainPlant",
+    "c_source",
+    "certify",
+    "simulate_loop",
+    "step_metrics",
+    "synthesise",
+]
+
+
+class UncertainPlant(Shown, control_design.UncertainPlant):
+    """What a controller is designed for: a nominal state space and the ellipses around its response.
+
+    Parameters
+    ----------
+    plant : Uncertainty, or control.StateSpace, or a model with `to_control()`
+        An `Uncertainty` brings its own ellipses; anything else is exact unless `uncertainty` is given.
+
+    Other arguments as `control_design.UncertainPlant`.
+
+    Examples
+    --------
+    >>> import control
+    >>> flexlink.UncertainPlant(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01), name="motor")
+    UncertainPlant 'motor': 1 state, dt = 0.01 s, no integrator, response taken as exact
+    """
+
+    def __init__(
+        self,
+        plant: Any = None,
+        *,
+        name: str = "plant",
+        uncertainty: Any = None,
+        integrators: int | None = None,
+        performance: control_design.Channel | None = None,
+        level: float = 0.95,
+        nominal: control.StateSpace | None = None,
+    ) -> None:
+        given = plant if nominal is None else nominal
+        if uncertainty is None and isinstance(given, Uncertainty):
+            uncertainty = given
+        super().__init__(
+            name=name,
+            nominal=given if isinstance(given, control.StateSpace) else given.to_control(),
+            uncertainty=uncertainty,
+            integrators=integrators,
+            performance=performance,
+            level=level,
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SynthesisResult(Shown, control_design.SynthesisResult):
+    """What `synthesise` found, and what was asked of it."""
+
+    plants: tuple[control_design.UncertainPlant, ...] = ()
+    specification: Specification = field(default_factory=Specification)
+
+    def to_control(self) -> control.StateSpace:
+        """The controller as `control.StateSpace`, without its computational delay and limits."""
+        return self.controller.to_control()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Shown, control_design.Certificate):
+    """What `certify` checked, and on what."""
+
+    controller: Controller | None = None
+    uncertain_plants: tuple[control_design.UncertainPlant, ...] = ()
+    specification: Specification = field(default_factory=Specification)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopRun(Shown, control_design.ClosedLoopTrajectory):
+    """A closed loop in time, from `simulate_loop`."""
+
+
+def synthesise(
+    plants: control_design.UncertainPlant | Sequence[control_design.UncertainPlant],
+    specification: Specification,
+    options: SynthesisOptions | None = None,
+    *,
+    rng: np.random.Generator | int = 0,
+    **more: Any,
+) -> SynthesisResult:
+    """One controller for one or several uncertain plants; arguments as `control_design.synthesise`.
+
+    rng: a generator, or the seed of one.
+
+    Examples
+    --------
+    >>> quick = flexlink.SynthesisOptions(starts=1, sufficient_gamma=0.99, dense_points=1000)
+    >>> designed = flexlink.synthesise(example_plant(), example_specification(), quick)
+    >>> designed.outcome.name, designed.controller.order
+    ('MET_ON_GRID', 2)
+    """
+    chosen = _several(plants)
+    generator = np.random.default_rng(rng)
+    result = control_design.synthesise(chosen, specification, options, rng=generator, **more)
+    return dressed(SynthesisResult, result, plants=chosen, specification=specification)
+
+
+def certify(
+    controller: Controller | SynthesisResult,
+    plants: control_design.UncertainPlant | Sequence[control_design.UncertainPlant] | None = None,
+    specification: Specification | None = None,
+    **more: Any,
+) -> Certificate:
+    """Check a controller from any source, independently of the optimiser; `control_design.certify`.
+
+    plants, specification: taken from the result of `synthesise` where that is given.
+
+    Examples
+    --------
+    >>> given = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    >>> flexlink.certify(given, example_plant(), example_specification()).certified
+    True
+    """
+    if isinstance(controller, SynthesisResult):
+        plants = controller.plants if plants is None else plants
+        specification = specification or controller.specification
+        controller = controller.controller
+    if plants is None or specification is None:
+        raise ValueError("certify needs plants and a specification beside a controller")
+    chosen = _several(plants)
+    found = control_design.certify(controller, chosen, specification, **more)
+    return dressed(
+        Certificate, found, controller=controller, uncertain_plants=chosen, specification=specification
+    )
+
+
+def simulate_loop(controller: Controller, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
+    """Run the loop in time, limits and delay included; arguments as `control_design.simulate`.
+
+    machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system or an
+    `UncertainPlant` (its nominal) as well.
+
+    Examples
+    --------
+    >>> given = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    >>> run = flexlink.simulate_loop(given, example_plant(), [1.0] * 400)
+    >>> abs(flexlink.step_metrics(run).steady_error) < 1e-3
+    True
+    """
+    if isinstance(machine, control_design.UncertainPlant):
+        machine = machine.nominal
+    chosen: SampledMachine = LinearMachine(machine) if isinstance(machine, control.StateSpace) else machine
+    return dressed(LoopRun, control_design.simulate(controller, chosen, reference, **more))
+
+
+def _several(
+    plants: control_design.UncertainPlant | Sequence[control_design.UncertainPlant],
+) -> tuple[control_design.UncertainPlant, ...]:
+    return (plants,) if isinstance(plants, control_design.UncertainPlant) else tuple(plants)

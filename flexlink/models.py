@@ -1,0 +1,254 @@
+"""Records in, models with their uncertainty out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ValidationError
+
+import ident
+from flexlink.shown import Shown, dressed
+from ident import GobfModel, IdentOptions, Poles, band_limited, identify_frf, identify_miso
+from ident.basis import posterior
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.frf_records import FrfRepeats
+from ident.data.nonparametric import empirical_frf
+from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.nominal import nominal_near
+from ident.uncertainty.pole_intervals import pole_intervals
+from plant.rig import one_line
+
+__all__ = [
+    "EmbeddingOptions",
+    "FrequencyUncertainty",
+    "FrfRepeats",
+    "GobfModel",
+    "IdentOptions",
+    "Identification",
+    "Poles",
+    "Record",
+    "Uncertainty",
+    "band_limited",
+    "empirical_frf",
+    "identify",
+    "identify_frf",
+    "identify_miso",
+    "pole_intervals",
+    "uncertainty",
+]
+
+Options = TypeVar("Options", bound=BaseModel)
+# Frequencies over which a low-order nominal model is fitted to a posterior.
+_NOMINAL_POINTS = 400
+
+
+class Record(Shown, ident.Record):
+    """One uniformly sampled experiment, from arrays, pandas columns or (with `from_csv` and so on) a file.
+
+    Parameters
+    ----------
+    u, y : (T,) or (T, n), or a pandas column or table
+        Input and output, one row per sample; also under the names of the attributes, `input` and `output`.
+        Pandas names become the names of the signals; without, they are u and y (u1, u2, ... if several).
+    dt_s : float
+        Sampling time in seconds.
+    reference : as y, optional
+        Closed-loop reference.
+
+    The other arguments are the attributes of `ident.Record`. Raises ValueError where shapes do not fit;
+    nothing is transposed to make them.
+
+    Examples
+    --------
+    >>> import numpy as np, pandas as pd, flexlink
+    >>> flexlink.Record(u=np.ones(4), y=np.arange(4.0), dt_s=0.01)
+    Record 'record': 4 samples, every 0.01 s, 0.04 s in all
+      u -> y
+    >>> log = pd.DataFrame({"voltage_V": [1.0, 1.0, 1.0], "angle_rad": [0.0, 0.1, 0.3]})
+    >>> flexlink.Record(u=log["voltage_V"], y=log["angle_rad"], dt_s=0.01, name="first try")
+    Record 'first try': 3 samples, every 0.01 s, 0.03 s in all
+      voltage_V -> angle_rad
+    >>> flexlink.Record(u=np.ones((1, 4)), y=np.arange(4.0), dt_s=0.01)
+    Traceback (most recent call last):
+    ValueError: u has 1 samples of 4 signals; expected one row per sample
+    """
+
+    def __init__(
+        self,
+        u: Any = None,
+        y: Any = None,
+        dt_s: float | None = None,
+        *,
+        reference: Any = None,
+        name: str = "record",
+        input: Any = None,  # noqa: A002 (the attribute's name)
+        output: Any = None,
+        input_names: Sequence[str] = (),
+        output_names: Sequence[str] = (),
+        reference_names: Sequence[str] = (),
+        input_units: Sequence[str] = (),
+        output_units: Sequence[str] = (),
+        source: str = "",
+    ) -> None:
+        if dt_s is None:
+            raise ValueError("a record needs dt_s, the sampling time in seconds")
+        u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
+        inputs, input_names = _signals("u", u, input_names)
+        outputs, output_names = _signals("y", y, output_names)
+        if reference is not None:
+            reference, reference_names = _signals("r", reference, reference_names)
+        super().__init__(
+            name=name,
+            input=inputs,
+            output=outputs,
+            dt_s=dt_s,
+            input_names=tuple(input_names),
+            output_names=tuple(output_names),
+            reference=reference,
+            reference_names=tuple(reference_names),
+            input_units=tuple(input_units),
+            output_units=tuple(output_units),
+            source=source,
+        )
+
+
+def _either(short: str, first: Any, long: str, second: Any) -> Any:
+    if (first is None) == (second is None):
+        raise ValueError(f"give {short} (or, under its long name, {long}), once")
+    return second if first is None else first
+
+
+def _signals(
+    default: str, values: Any, names: Sequence[str]
+) -> tuple[npt.NDArray[np.float64], Sequence[str]]:
+    """(T, n) and n names, from a vector, a table or their pandas forms."""
+    if not names:  # pandas: a column has a name, a table has columns
+        named = getattr(values, "columns", None)
+        names = [str(c) for c in named] if named is not None else [str(getattr(values, "name", None) or "")]
+    signals = np.asarray(values, dtype=np.float64)
+    if signals.ndim == 1:
+        signals = signals[:, None]
+    if signals.ndim != 2:
+        raise ValueError(f"{default} must be (T,) or (T, n); got shape {signals.shape}")
+    if signals.shape[1] > max(signals.shape[0], 1):
+        raise ValueError(
+            f"{default} has {signals.shape[0]} samples of {signals.shape[1]} signals; "
+            "expected one row per sample"
+        )
+    if not any(names):
+        count = signals.shape[1]
+        names = [default] if count == 1 else [f"{default}{i + 1}" for i in range(count)]
+    return signals, names
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Shown, ident.Identification):
+    """What `identify` found: `ident.Identification` and the records it came from.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> found.model.poles.omega_rad_s(found.model.dt_s).round(1)
+    array([20.])
+    """
+
+    records: tuple[ident.Record, ...] = ()
+
+    def to_control(self) -> Any:
+        """The model as `control.StateSpace`."""
+        return self.model.to_control()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Uncertainty(Shown, posterior.ResponsePosterior):
+    """What `uncertainty` found: the response at any frequency with its ellipses (`at`, `simultaneous`).
+
+    Examples
+    --------
+    >>> spread = flexlink.uncertainty(flexlink.identify(example_record(), n_pairs=1, n_real=0))
+    >>> spread.at([5.0, 20.0]).ellipse(0.95).semi_major.shape
+    (2,)
+    """
+
+    nominal_poles: Poles = Poles()  # noqa: RUF009 (frozen)
+
+    def nominal(self) -> GobfModel:
+        """The model on the identified poles that is nearest to the centre in units of the ellipses."""
+        nyquist = np.pi / self.dt_s
+        omega = np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
+        return nominal_near(self, self.nominal_poles, omega)
+
+    def at_modes(self) -> list[tuple[float, float]]:
+        """(frequency [rad/s], major semi-axis of the 95 % ellipse / gain) at every mode of the model."""
+        omega = np.unique(self.nominal_poles.omega_rad_s(self.dt_s))
+        here = self.at(omega[omega < np.pi / self.dt_s]) if omega.size else None
+        if here is None:
+            return []
+        share = here.ellipse(0.95).semi_major / np.abs(here.centre)
+        return list(zip(here.omega_rad_s.tolist(), share.tolist(), strict=True))
+
+    def to_control(self) -> Any:
+        """`nominal` as `control.StateSpace`; the ellipses have no place there."""
+        return self.nominal().to_control()
+
+
+def identify(
+    records: ident.Record | Sequence[ident.Record], options: IdentOptions | None = None, **settings: Any
+) -> Identification:
+    """Model of one input and one output, poles searched globally, order chosen from the data unless given.
+
+    `settings` are fields of `IdentOptions`, in place of `options`. Raises ValueError if a setting or a record
+    cannot be used.
+
+    Examples
+    --------
+    >>> flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    GobfModel of order 2, u -> y, dt = 0.01 s: fits 99.0 % of record
+      mode at 20 rad/s (3.18 Hz), damping ratio 0.0499
+    """
+    chosen = _options(IdentOptions, options, settings)
+    used = (records,) if isinstance(records, ident.Record) else tuple(records)
+    return dressed(Identification, ident.identify(used, chosen), records=used)
+
+
+def uncertainty(
+    identification: ident.Identification,
+    records: Sequence[ident.Record] | None = None,
+    options: EmbeddingOptions | None = None,
+    **settings: Any,
+) -> Uncertainty:
+    """Posterior of the response around an identified model: noise, pole error and what the model lacks.
+
+    records: those of the identification, taken from it if it came from `flexlink.identify`. `settings` are
+    fields of `EmbeddingOptions`, in place of `options`.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> spread = flexlink.uncertainty(found)
+    >>> spread
+    Response u -> y, 95 % ellipses frequency by frequency: noise 0.01, from 1995 samples
+      mode at 20 rad/s: semi-axis 0.084 % of the response
+    >>> bool(spread.at([20.0]).contains(found.model.frequency_response([20.0]))[0])
+    True
+    """
+    chosen = _options(EmbeddingOptions, options, settings)
+    used = records if records is not None else getattr(identification, "records", ())
+    if not used:
+        raise ValueError("give the records of the identification")
+    found = tangent(used, identification.model, chosen)
+    return dressed(Uncertainty, found, nominal_poles=identification.model.poles)
+
+
+def _options(kind: type[Options], options: Options | None, settings: dict[str, Any]) -> Options | None:
+    """The options, or those that the settings make; every refusal in one line."""
+    if options is not None and settings:
+        raise ValueError(f"give options or single settings, not both; got options and {', '.join(settings)}")
+    try:
+        return kind(**settings) if settings else options
+    except ValidationError as error:
+        raise ValueError(f"{kind.__name__}: {one_line(error)}") from None

@@ -1,0 +1,51 @@
+"""Results that say what was found: in text, in a notebook, in a picture."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import fields
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+T = TypeVar("T")
+
+
+class Shown:
+    """Put before the class of a result: the sentences are the macro of the same name in results.j2."""
+
+    def __repr__(self) -> str:
+        return "\n".join(_lines(self))
+
+    def _repr_html_(self) -> str:
+        first, *others = (html.escape(line.strip()) for line in _lines(self))
+        return f"<p>{'<br>'.join([f'<b>{first}</b>', *others])}</p>"
+
+    def plot(self) -> Figure:
+        """The picture one wants of it (matplotlib is imported now); see `flexlink.plot`."""
+        from flexlink.pictures import plot
+
+        return plot(self)
+
+
+def dressed(kind: type[T], value: Any, **more: Any) -> T:
+    """A numerical result as the class of the front door that shows itself; the fields are the same."""
+    return kind(**{field.name: getattr(value, field.name) for field in fields(value)}, **more)
+
+
+def _lines(result: object) -> list[str]:
+    text = str(getattr(_macros(), type(result).__name__)(result))
+    return [line.rstrip() for line in text.splitlines() if line.strip()]
+
+
+@cache
+def _macros() -> Any:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    # Text; the HTML is escaped line by line.
+    loader = PackageLoader("flexlink")
+    environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.globals |= {"zip": zip, "abs": abs}
+    return environment.get_template("results.j2").module

@@ -1,0 +1,125 @@
+"""The front door: every example in it runs, everything it names is there, and importing it costs nothing."""
+
+from __future__ import annotations
+
+import doctest
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy.signal import lfilter
+
+import flexlink
+
+ROOT = Path(__file__).resolve().parents[1]
+GUIDE = ROOT / "docs" / "from_python.md"
+RESULTS = {"Identification", "Uncertainty", "SynthesisResult", "Certificate", "LoopRun", "Simulation"}
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def example_record() -> flexlink.Record:
+    """A mode of 20 rad/s and damping ratio 0.05 behind noise of 0.01."""
+    rng = np.random.default_rng(0)
+    u = flexlink.prbs(9, 4, 1.0, 2000)
+    b, a = (
+        [0.0, 0.01, 0.01],
+        np.poly(flexlink.Poles.from_continuous(omega_rad_s=[20], zeta=[0.05], dt_s=0.01).values),
+    )
+    return flexlink.Record(u, lfilter(b, a.real, u) + 0.01 * rng.standard_normal(u.size), 0.01)
+
+
+def example_plant() -> flexlink.UncertainPlant:
+    """A slow real pole, known exactly."""
+    return flexlink.UncertainPlant(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01), name="motor")
+
+
+def example_specification() -> flexlink.Specification:
+    return flexlink.Specification(bandwidth_rad_s=1.0, integrator=True, controller_order=2)
+
+
+GIVEN = {
+    "flexlink": flexlink,
+    "default_rng": np.random.default_rng,
+    "example_record": example_record,
+    "example_plant": example_plant,
+    "example_specification": example_specification,
+}
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["__init__", "models", "design", "machines", "pictures", pytest.param("causes", marks=pytest.mark.slow)],
+)
+def test_examples_run(module):
+    found = import_module("flexlink" if module == "__init__" else f"flexlink.{module}")
+    result = doctest.testmod(found, extraglobs=GIVEN, optionflags=FLAGS)
+    assert result.failed == 0
+
+
+@pytest.mark.parametrize("path", [GUIDE, ROOT / "README.md"], ids=lambda path: path.name)
+def test_documents_run(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = doctest.testfile(str(path), module_relative=False, optionflags=FLAGS)
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+def test_every_name_is_there_and_shown_in_an_example():
+    shown = GUIDE.read_text(encoding="utf-8")
+    for module, names in flexlink._MODULES.items():
+        found = import_module(f"flexlink.{module}")
+        assert set(found.__all__) == set(names)
+        shown += "".join(vars(found)[name].__doc__ for name in names)
+    for name in flexlink.__all__:
+        assert f"`{name}`" in flexlink.__doc__
+        assert name in RESULTS or f"flexlink.{name}" in shown
+
+
+def test_importing_it_imports_nothing_else():
+    code = "import sys, flexlink; assert not {'numpy', 'ident', 'matplotlib', 'control'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    with pytest.raises(AttributeError, match="nothing_of_ours"):
+        _ = flexlink.nothing_of_ours
+
+
+def test_results_show_draw_and_convert():
+    record, plant, asked = example_record(), example_plant(), example_specification()
+    found = flexlink.identify(record, n_pairs=1, n_real=0)
+    spread = flexlink.uncertainty(found)
+    given = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    certificate = flexlink.certify(given, plant, asked)
+    run = flexlink.simulate_loop(given, plant, [1.0] * 100)
+    machine = flexlink.simulate(flexlink.paper_link(), record.input[:100, 0])
+    for result in (record, found, spread, certificate, run, machine):
+        assert "object at" not in repr(result)
+        assert result._repr_html_().startswith("<p><b>")
+        assert isinstance(result.plot(), Figure)
+    assert "Certified" in repr(certificate)
+    assert isinstance(flexlink.plot(found.model), Figure)
+    np.testing.assert_allclose(found.to_control().poles(), found.model.to_control().poles())
+    assert spread.to_control().dt == record.dt_s
+    assert type(record.slice(0, 10)) is flexlink.Record
+    with pytest.raises(TypeError, match="no picture of a int"):
+        flexlink.plot(1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: flexlink.Record(u=[1.0, 2.0], dt_s=0.1), "give y"),
+        (lambda: flexlink.Record(u=[1.0, 2.0], y=[1.0, 2.0]), "dt_s"),
+        (lambda: flexlink.Record(u=[1.0, 2.0], y=[1.0], dt_s=0.1), "equally long"),
+        (lambda: flexlink.identify(example_record(), pairs=1), "pairs"),
+        (lambda: flexlink.identify(example_record(), flexlink.IdentOptions(), n_pairs=1), "not both"),
+        (lambda: flexlink.effect("magic"), "unknown effect 'magic'"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(call, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
