@@ -25,7 +25,7 @@ class Shown:
 
     def plot(self) -> Figure:
         """The picture one wants of it (matplotlib is imported now); see `flexlink.plot`."""
-        from flexlink.pictures import plot
+        from flexlink import plot
 
         return plot(self)
 
