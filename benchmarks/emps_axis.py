@@ -21,7 +21,7 @@ from numba import njit
 from scipy.signal import butter, filtfilt
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-from diagnosis.machine.case import Role
+from diagnosis.machine.machine_protocol import Role
 
 Real = npt.NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
             PlantEffect(
                 "actuator_saturation", (P("limit_V", 1.0, LIMIT_V),), grows=False, dependence="continuous"
             ),
-            PlantEffect("encoder_quantisation", (P("step_m", 1e-7, 1e-4),), dependence="jagged"),
+            PlantEffect("encoder_quantisation", (P("step_m", 1e-7, 1e-4),), dependence="non-smooth"),
         ]
     if refined:
         found += [

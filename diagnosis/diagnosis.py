@@ -10,17 +10,18 @@ import numpy as np
 
 from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
-from diagnosis.evidence.look_alikes import IMITATED, imitations
+from diagnosis.evidence.look_alikes import look_alikes
 from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.model_error import at_its_own_level
 from diagnosis.fit.residual import ResidualModel, pooled_rms
-from diagnosis.machine.candidates import Candidate
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.machine.rounding import Rounding, leads_over, rounding_effect
 from diagnosis.next_experiment.competing import rival_of_fit, rivals_of
 from diagnosis.next_experiment.discrimination import Rival
+from plant.effects import LOOK_ALIKES
+from plant.effects.search_space import Candidate
 
 Verdict = Literal["none", "effect", "unknown"]
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
@@ -156,7 +157,7 @@ def diagnose(
     found = search(case, progress)
     model = ResidualModel(case)
     every: Sequence[Hypothesis]
-    every = (*found.hypotheses, *imitations(model, found.hypotheses, found.base))
+    every = (*found.hypotheses, *look_alikes(model, found.hypotheses, found.base))
     weighed = probabilities(every, temperature=temperature)
     accepted = _accepted(every, weighed.answer)
     seen = confronted(model, every, accepted) if weighed.answer != "unknown" else None
@@ -165,7 +166,7 @@ def diagnose(
         weighed = probabilities(every, temperature=temperature)
         accepted = _accepted(every, weighed.answer)
     hypotheses = [h for h in every if h.is_answer]
-    imitated = [h for h in every if not h.is_answer]
+    alike = [h for h in every if not h.is_answer]
     likeliest = max(every, key=lambda h: h.unknown_weight)
     last = _polished(model, accepted.fit)
     before = model.by_experiment(np.zeros(model.nominal.count), ())
@@ -206,7 +207,7 @@ def diagnose(
         simulations=found.simulations + model.simulations,
         held_out_decided=seen is not None,
         unlisted=likeliest.fit.effects if verdict == "unknown" and not likeliest.is_answer else (),
-        rivals=_to_part(case, hypotheses, weighed, imitated) if isinstance(case, Case) else (),
+        rivals=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),
     )
 
 
@@ -214,13 +215,16 @@ def _to_part(
     case: Case,
     hypotheses: Sequence[Hypothesis],
     weighed: Probabilities,
-    imitated: Sequence[Hypothesis],
+    alike: Sequence[Hypothesis],
 ) -> tuple[Rival, ...]:
     """Rivals of the next experiment; what is unknown is one where it has a name, as the double of gravity."""
     rivals = rivals_of(case, hypotheses, weighed.sets)
-    if not imitated or min(weighed.presence[IMITATED], weighed.cause["unknown"]) < _RIVAL:
+    if not alike:
         return rivals
-    likeliest = max(imitated, key=lambda h: h.unknown_weight)
+    likeliest = max(alike, key=lambda h: h.unknown_weight)
+    imitated = [LOOK_ALIKES[n].look_alike_of for n in likeliest.names if n in LOOK_ALIKES]
+    if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < _RIVAL:
+        return rivals
     double = rival_of_fit(case, likeliest.fit, weighed.cause["unknown"])
     return tuple(sorted((*rivals, double), key=lambda rival: -rival.probability))[:_RIVALS]
 
@@ -353,10 +357,10 @@ def _solver_variance(end: Fit, samples_per_record: float) -> float:
     Two correct solvers of play drift apart once a contact falls differently, and stay apart to the end of a
     record: an error of their usual disagreement that is correlated over the record.
     """
-    if not end.jagged:
+    if not end.non_smooth:
         return 1.0
     # median of the half-normal prior of the disagreement's size
-    usual = 0.674 * DISAGREEMENT["jagged"]
+    usual = 0.674 * DISAGREEMENT["non-smooth"]
     return 1.0 + usual**2 * samples_per_record
 
 

@@ -19,16 +19,16 @@ from diagnosis.fit.solver_spread import NO_DRIFT, Drift
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); with play two correct solvers differ by 0.2.
-DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "jagged": 0.25}
+DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
 _PRIOR_NONE, _PRIOR_UNKNOWN = 0.25, 0.1
 _PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
 _UNKNOWN = ("unknown",)
 # An unknown cause beside a set of effects, relative to that set alone.
 _UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
-# Where contacts switch, what two correct solvers disagree about is not white: further effects beside a jagged
-# one can follow some of it, so they have to gain more (in log weight) to be believed.
-BESIDE_JAGGED = 20.0
+# Where contacts switch, what two correct solvers disagree about is not white: further effects beside a
+# non-smooth one can follow some of it, so they have to gain more (in log weight) to be believed.
+BESIDE_NON_SMOOTH = 20.0
 # log prior density lost per squared deviation beyond three: no evidence pays for that.
 _CUT = 1e3
 # Something unknown may have any size over four decades; what solvers of play disagree about has one known to
@@ -79,7 +79,7 @@ class Hypothesis:
     def of(cls, fit: Fit, rest: Leftover, drift: Drift = NO_DRIFT) -> Hypothesis:
         """rest: what the fit leaves over, of residuals without the drift of correct solvers."""
         beside = len(fit.names) - 1
-        allowed = BESIDE_JAGGED * beside if fit.jagged else 0.0
+        allowed = BESIDE_NON_SMOOTH * beside if fit.non_smooth else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
         prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
         if fit.weighing.model_error > 0:
@@ -115,7 +115,7 @@ def disagreement_gain(fit: Fit, rest: Leftover) -> float:
     """
     solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
     z = rest.size / max(solvers)
-    expected = _KNOWN_SIZE if fit.jagged else 0.0
+    expected = _KNOWN_SIZE if fit.non_smooth else 0.0
     return max(0.0, rest.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
 
 

@@ -7,7 +7,6 @@ hose. The list has no such spring; what it explains as well as gravity does is u
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,58 +14,42 @@ from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, log_prior,
 from diagnosis.evidence.search import weighed
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.machine.candidates import Axis, Candidate
 from diagnosis.machine.case import Case
-from diagnosis.machine.machine_protocol import Dependence, Real
-from plant.effects import GroundSpring
-from plant.modal import static_moment_kg_m
+from plant.effects import LOOK_ALIKES, Effect
+from plant.effects.search_space import Candidate, log_axis
 
-IMITATED = "gravity"
-# Of unknown causes this share is a spring to ground: a third as probable as gravity.
+# Of unknown causes this share is a look-alike of an effect: a third as probable as the effect itself.
 _SHARE = 0.06
 _ITERATIONS = 15
 
 
-@dataclass(frozen=True)
-class _Spring(Candidate):
-    """A spring to ground as a search space."""
-
-    @property
-    def dependence(self) -> Dependence:
-        return GroundSpring.dependence
-
-    def effect_at(self, x: Real) -> GroundSpring:
-        return GroundSpring(**self.parameters(x))
-
-
-def imitations(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fit) -> tuple[Hypothesis, ...]:
-    """Hypotheses with a spring to ground in place of gravity, wherever gravity may be an answer.
+def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fit) -> tuple[Hypothesis, ...]:
+    """Hypotheses with a look-alike in place of an effect, wherever that effect may be an answer.
 
     They are no answers themselves (their log weight is -inf) but part of what is unknown. Only a flexible
-    link hangs: other machines have none.
+    link has effects with look-alikes.
     """
     if not isinstance(model.case, Case):
         return ()
     best = max(h.largest_weight for h in hypotheses)
-    # As probable as a set with gravity would be, times what an unknown cause is beside a listed one.
-    unlisted = log_prior_unknown() + float(np.log(_SHARE)) - log_prior((IMITATED,))
-    springs = [
-        weighed(model, _with_spring(model, h.fit), base)
-        for h in hypotheses
-        if IMITATED in h.names and h.largest_weight > best - STILL_POSSIBLE
-    ]
-    return tuple(Hypothesis(s.fit, -np.inf, s.log_weight + unlisted) for s in springs)
+    found = []
+    for kind in LOOK_ALIKES.values():
+        name = str(kind.look_alike_of)
+        # As probable as a set with the effect would be, times what an unknown cause is beside a listed one.
+        unlisted = log_prior_unknown() + float(np.log(_SHARE)) - log_prior((name,))
+        for h in hypotheses:
+            if name in h.names and h.largest_weight > best - STILL_POSSIBLE:
+                other = weighed(model, _with(model, h.fit, name, kind), base)
+                found.append(Hypothesis(other.fit, -np.inf, other.log_weight + unlisted))
+    return tuple(found)
 
 
-def _with_spring(model: ResidualModel, end: Fit) -> Fit:
-    k = end.names.index(IMITATED)
-    moment = static_moment_kg_m(model.nominal.at(end.deviations).description)
+def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> Fit:
+    """The fit with the look-alike in place of the effect of this name; first parameters are sizes."""
+    k = end.names.index(name)
+    scale = kind.look_alike_scale(model.nominal.at(end.deviations).description)
     axis = end.candidates[k].axes[0]
-    spring = _Spring(
-        "ground_spring",
-        (Axis("stiffness_Nm_rad", "log", axis.low * moment, axis.high * moment, axis.step),),
-        (),
-    )
-    candidates = (*end.candidates[:k], spring, *end.candidates[k + 1 :])
-    x = (*end.coordinates[:k], end.coordinates[k] + np.log(moment), *end.coordinates[k + 1 :])
+    size = log_axis(next(iter(kind.model_fields)), axis.low * scale, axis.high * scale, axis.step)
+    candidates = (*end.candidates[:k], Candidate(kind, (size,), ()), *end.candidates[k + 1 :])
+    x = (*end.coordinates[:k], end.coordinates[k] + np.log(scale), *end.coordinates[k + 1 :])
     return fit(model, candidates, x, end.deviations, iterations=_ITERATIONS)

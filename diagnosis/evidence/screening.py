@@ -12,17 +12,15 @@ from scipy.linalg import cho_factor, cho_solve
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.machine.candidates import Candidate
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
+from plant.effects.search_space import Candidate
 from plant.rig import Rig
 from plant.simulate import simulate
 
 # Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
 # of the inverse of the largest angle for the other.
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
-
-HARMONIC = ("torque_ripple", "periodic_disturbance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +52,7 @@ class Screening:
     def starts(self, candidate: Candidate) -> list[Start]:
         """Every start of the candidate, best first."""
         machine = self.model.nominal.at(self.around.deviations)
-        if candidate.effect in HARMONIC and isinstance(machine, FlexibleArm):
+        if candidate.kind.harmonic and isinstance(machine, FlexibleArm):
             found = self._harmonic(candidate, machine.rig)
         else:
             found = [
@@ -84,7 +82,7 @@ class Screening:
         return sorted(found, key=lambda start: start.cost)
 
     def zoomed(self, candidate: Candidate, starts: list[Start]) -> list[Start]:
-        """Two finer grids around the best points of a jagged cost, one size coordinate; best first."""
+        """Two finer grids around the best points of a non-smooth cost, one size coordinate; best first."""
         found = list(starts)
         for points, reach in ((24, 0.25), (16, 0.02)):
             found.sort(key=lambda start: start.cost)
@@ -131,7 +129,7 @@ class Screening:
         pulse[0] = 1.0
         response = simulate(rig, np.zeros(longest), hub_torque_Nm=pulse).output / noise
         model.simulations += 1
-        periodic = candidate.effect == "periodic_disturbance"
+        periodic = candidate.kind.harmonic == "time"
         if periodic:
             lines = np.arange(candidate.axes[1].low, min(60.0, 0.45 / dt), 0.4 / (longest * dt))
         else:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from diagnosis.evidence.hypotheses import BESIDE_JAGGED, DISAGREEMENT, Hypothesis
-from diagnosis.evidence.screening import HARMONIC, Screening, Start, smallest_size
+from diagnosis.evidence.hypotheses import BESIDE_NON_SMOOTH, DISAGREEMENT, Hypothesis
+from diagnosis.evidence.screening import Screening, Start, smallest_size
 from diagnosis.fit.discrepancy import leftover
 from diagnosis.fit.fit import Fit, cost_at, fit
 from diagnosis.fit.non_smooth import refined
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
-from diagnosis.machine.candidates import Candidate, in_place_of, without_fall
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from plant.effects import Effect
+from plant.effects.search_space import Candidate
 
 Progress = Callable[[float, str], None]
 
@@ -37,12 +39,12 @@ _SETS_TO_REDUCE = 3
 # Further effects that are fitted beside the best hypothesis, by the cost their screening promises.
 _BESIDE = 6
 # Starts of a further effect that are simulated beside a lead; fewer where a record takes ten times as long.
-_STARTS_TO_SIMULATE, _JAGGED_TO_SIMULATE = 40, 8
+_STARTS_TO_SIMULATE, _NON_SMOOTH_TO_SIMULATE = 40, 8
 # A stated value pulled this far (tolerances) may stand for an effect.
 _BEYOND_BELIEF = 2.0
 # Single effects, and pairs, that are extended where no set explains everything.
 _BEAM = {1: 3, 2: 1}
-# Sizes of jagged effects are refined where no more than this share of the gap is left, or this much energy.
+# Sizes of non-smooth effects are refined where no more than this share of the gap, or this energy, is left.
 _NEAR, _NEAR_FLOOR = 0.25, 0.3
 
 
@@ -68,7 +70,7 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     N = base.residuals.size
     first: list[_Trial] = []
     listed: list[tuple[Candidate, list[Start]]] = []
-    spaces = case.machine.candidates(case)
+    spaces = case.machine.candidates(case.experiments)
     for k, candidate in enumerate(spaces):
         report(0.05 + 0.3 * k / len(spaces), f"looking at {candidate.effect}")
         starts = screening.starts(candidate)
@@ -76,7 +78,7 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
         beside = smallest_size(candidate, starts, SMALLEST_SIZE_BESIDE) if starts else None
         if alone is None or beside is None:
             continue
-        if candidate.dependence == "jagged" and starts[0].cost - N < 0.5 * (base.cost - N):
+        if candidate.dependence == "non-smooth" and starts[0].cost - N < 0.5 * (base.cost - N):
             starts = screening.zoomed(candidate, starts)
         first.append(_Trial(base, candidate.from_size(alone), starts))
         listed.append((candidate.from_size(beside), starts))
@@ -148,8 +150,7 @@ def _further(
         for candidate, starts in listed:
             if candidate.effect not in lead.names:
                 # Phases and amplitudes found without the lead are of no use beside it.
-                harmonic = candidate.effect in HARMONIC
-                beside = anew.starts(candidate) if harmonic else screening.beside(lead, starts)
+                beside = anew.starts(candidate) if candidate.kind.harmonic else screening.beside(lead, starts)
                 trials.append(_Trial(lead, candidate, beside))
     chosen: dict[tuple[frozenset[str], int], _Trial] = {}
     for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
@@ -170,7 +171,7 @@ def _least_promise(lead: Fit) -> float:
     """
     if lead.weighing.model_error > 0:
         return -np.inf
-    return _PROMISE + (BESIDE_JAGGED if lead.jagged else 0.0)
+    return _PROMISE + (BESIDE_NON_SMOOTH if lead.non_smooth else 0.0)
 
 
 def _pulled(model: ResidualModel, lead: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
@@ -187,12 +188,21 @@ def _pulled(model: ResidualModel, lead: Fit, listed: Sequence[Candidate]) -> lis
     return trials
 
 
+def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
+    """The effect that multiplies a stated value by this factor, or by the nearest one worth a name."""
+    sign = 1 if factor > 1 else -1
+    for candidate in listed:
+        if candidate.kind.multiplies == key and candidate.sign == sign:
+            return candidate, np.clip([candidate.axes[0].coordinate(factor)], *candidate.box)
+    return None
+
+
 def _simulated(screening: Screening, trial: _Trial) -> _Trial:
     """The trial with its best starts judged by simulation."""
-    if trial.candidate.effect in HARMONIC:
+    if trial.candidate.kind.harmonic:
         return trial
-    jagged = trial.candidate.dependence == "jagged"
-    best = trial.starts[: _JAGGED_TO_SIMULATE if jagged else _STARTS_TO_SIMULATE]
+    non_smooth = trial.candidate.dependence == "non-smooth"
+    best = trial.starts[: _NON_SMOOTH_TO_SIMULATE if non_smooth else _STARTS_TO_SIMULATE]
     starts = screening.simulated_beside(trial.around, trial.candidate, best)
     return replace(trial, starts=starts) if starts else trial
 
@@ -207,10 +217,10 @@ def _hopeless(end: Fit, base: Fit) -> bool:
 
 def _as_solvers_differ(model: ResidualModel, end: Fit) -> bool:
     """Whether play is in the set and what is left is no more than correct solvers of it may differ by."""
-    if not end.jagged:
+    if not end.non_smooth:
         return False
     e, drift = without_drift(end.residuals, solver_spread(model, end))
-    return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["jagged"], drift.size) ** 2
+    return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["non-smooth"], drift.size) ** 2
 
 
 def weighed(model: ResidualModel, end: Fit, base: Fit) -> Hypothesis:
@@ -256,7 +266,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
         promising = close and (quick or item.cost < around.cost - _LEAST_GAIN)
         promising = promising or (quick and not around.candidates)
         # An imitation of something else by play takes as long as everything besides.
-        costly = item.jagged and not _near(item, base)
+        costly = item.non_smooth and not _near(item, base)
         if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
             item = _refined(model, fine if fine.cost <= item.cost else item, base)
@@ -295,8 +305,8 @@ def _reduced(
             before = known.get(tuple(sorted(c.effect for c in rest)))
             start = cost_at(model, rest, x, whole.deviations)
             # From one contact sequence to the next the cost jumps: there a bad start says nothing.
-            jagged = any(c.dependence == "jagged" for c in rest)
-            if before is not None and start > before.cost + _CLOSE and not jagged:
+            non_smooth = any(c.dependence == "non-smooth" for c in rest)
+            if before is not None and start > before.cost + _CLOSE and not non_smooth:
                 continue
             end = _refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS), base)
             if before is None or end.cost < before.cost:
@@ -312,12 +322,22 @@ def _simpler(
         before, after = slice(None, k), slice(k + 1, None)
         others = whole.candidates[before] + whole.candidates[after]
         yield others, whole.coordinates[before] + whole.coordinates[after]
-        simple = without_fall(candidate, x, listed)
+        simple = _without_extras(candidate.effect_at(x), listed)
         if simple is not None and simple[0].effect not in {c.effect for c in others}:
             yield (
                 (*whole.candidates[before], simple[0], *whole.candidates[after]),
                 (*whole.coordinates[before], simple[1], *whole.coordinates[after]),
             )
+
+
+def _without_extras(effect: Any, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
+    """The simpler effect that this one contains (Coulomb friction in Stribeck's), where it is looked for."""
+    simple = effect.simpler() if isinstance(effect, Effect) else None
+    for candidate in listed:
+        if simple is not None and candidate.effect == simple.id:
+            x = [axis.coordinate(getattr(simple, axis.parameter)) for axis in candidate.axes]
+            return candidate, np.clip(x, *candidate.box)
+    return None
 
 
 def _apart(starts: list[Start], without: float, *, most: int) -> list[Start]:

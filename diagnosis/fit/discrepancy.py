@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.machine.case import Real
+from diagnosis.machine.machine_protocol import Real
 
 # A band holds something with this probability before its residuals are seen.
 _ACTIVE = 0.15

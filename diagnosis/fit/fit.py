@@ -16,14 +16,14 @@ from scipy.special import log_ndtr
 
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.machine.candidates import Candidate
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine, Weighing
+from plant.effects.search_space import Candidate
 
 # Steps of difference quotients along the deviations. Where contacts switch, a small step measures which way
 # one contact fell; a large one averages over many.
-_DEVIATION_STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
-# The same for coordinates of effects beside a jagged one, which have small steps of their own.
-_STEP_BESIDE_JAGGED = {"log": 4e-2, "angle": 4e-2, "linear": 5e-3}
+_DEVIATION_STEP = {"smooth": 1e-4, "continuous": 1e-3, "non-smooth": 3e-2}
+# The same for coordinates of effects beside a non-smooth one, which have small steps of their own.
+_STEP_BESIDE_NON_SMOOTH = {"log": 4e-2, "angle": 4e-2, "linear": 5e-3}
 # Damping of a step: in proportion to the Hessian's diagonal and, so that values the records say little about
 # do not run away along a bent valley, to this (times 1 per tolerance squared, or per unit of a logarithm).
 _UNIT = 1e3
@@ -56,9 +56,9 @@ class Fit:
         return tuple(c.effect for c in self.candidates)
 
     @property
-    def jagged(self) -> bool:
+    def non_smooth(self) -> bool:
         """Whether contacts switch: the cost jumps from one sequence of them to the next."""
-        return any(c.dependence == "jagged" for c in self.candidates)
+        return any(c.dependence == "non-smooth" for c in self.candidates)
 
     @property
     def rms(self) -> float:
@@ -190,11 +190,11 @@ def _box(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
 
 def _steps(candidates: Sequence[Candidate]) -> Real:
     """Of difference quotients along all coordinates (A,)."""
-    jagged = any(c.dependence == "jagged" for c in candidates)
+    non_smooth = any(c.dependence == "non-smooth" for c in candidates)
     return np.array(
         [
-            max(axis.step, _STEP_BESIDE_JAGGED[axis.scale])
-            if jagged and c.dependence != "jagged"
+            max(axis.step, _STEP_BESIDE_NON_SMOOTH[axis.scale])
+            if non_smooth and c.dependence != "non-smooth"
             else axis.step
             for c in candidates
             for axis in c.axes

@@ -1,4 +1,4 @@
-"""Sizes on which the cost depends in jags (play, rounding): shrinking grids, the rest following linearly."""
+"""Sizes on which the cost does not depend smoothly (backlash, rounding): grids, all else following."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _POINTS = 15
 
 
 def refined(model: ResidualModel, end: Fit) -> Fit:
-    """The fit with the sizes of its jagged effects sought on grids around where a descent has left them.
+    """The fit with the sizes of its non-smooth effects sought on grids around where a descent has left them.
 
-    Difference quotients along a jagged size say little, and a descent ends in the nearest jag. Each grid is
-    evaluated with everything else moved along the Jacobian of the present point; the best point is polished
+    Difference quotients along a non-smooth size say little, and a descent ends in the nearest jump. Each grid
+    is evaluated with everything else moved along the Jacobian of the present point; the best point is refined
     without moving the size.
     """
     best = end
     for k, candidate in enumerate(end.candidates):
-        if candidate.dependence != "jagged":
+        if candidate.dependence != "non-smooth":
             continue
         for reach in _REACHES:
             best = _round(model, best, k, reach)

@@ -18,7 +18,7 @@ from diagnosis.fit.fit import Fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
-# Changes of a jagged size, in steps of its difference quotients (one step is half a per cent of a play).
+# Changes of a non-smooth size, in steps of its difference quotients (one step is half a per cent of a gap).
 _CHANGES = (-0.4, -0.2, 0.2, 0.4)
 # Machine and model drift away from each other, each as far as such changes make the model drift.
 _INDEPENDENT = 2.0
@@ -34,17 +34,17 @@ def solver_spread(
     """Variance (N,) in units of the noise's that correct solvers may add to the residuals of a fit.
 
     Record by record, sample by sample, all outputs, as `ResidualModel.of` has them; experiments default to
-    the estimation records. Zero where no effect is jagged.
+    the estimation records. Zero where no effect is non-smooth.
     """
     records = model.case.estimation if experiments is None else experiments
     outputs = model.case.noise.size
     sizes = [len(record.output) * outputs for record in records]
     total = np.zeros(sum(sizes))
-    jagged = [k for k, candidate in enumerate(end.candidates) if candidate.dependence == "jagged"]
-    if not jagged:
+    non_smooth = [k for k, candidate in enumerate(end.candidates) if candidate.dependence == "non-smooth"]
+    if not non_smooth:
         return total
     here = model.of(end.deviations, end.effects, records)
-    for k in jagged:
+    for k in non_smooth:
         candidate = end.candidates[k]
         for change in _CHANGES:
             x = [part.copy() for part in end.coordinates]

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from diagnosis.machine.flexible_arm import FlexibleArm
-from diagnosis.machine.machine_protocol import RecordOfMachine
-from diagnosis.machine.quantisation_grid import lattice_step
+from diagnosis.machine.machine_protocol import Real, Role, check_names_and_roles, check_record, readonly
+from diagnosis.machine.quantisation_grid import grid_step
 from plant.rig import Rig
-
-Real = npt.NDArray[np.float64]
-Role = Literal["estimation", "held_out"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,46 +40,16 @@ class Experiment:
     closed_loop: bool = False
 
     def __post_init__(self) -> None:
-        voltage = np.array(self.voltage_V, dtype=np.float64)
-        output = np.array(self.output, dtype=np.float64)
-        if voltage.ndim != 1 or output.shape != (voltage.size, 2):
-            raise ValueError(
-                f"experiment {self.name}: needs voltage_V (T,) and output (T, 2); got {voltage.shape} and "
-                f"{output.shape}"
-            )
-        if self.role not in ("estimation", "held_out"):
-            raise ValueError(
-                f"experiment {self.name}: role must be estimation or held_out; got {self.role!r}"
-            )
-        if not (np.all(np.isfinite(voltage)) and np.all(np.isfinite(output))):
-            raise ValueError(f"experiment {self.name}: a value is not finite")
-        if voltage.size < 20:
-            raise ValueError(f"experiment {self.name}: {voltage.size} samples, needs at least 20")
-        for column, name in zip(output.T, ("hub_angle_rad", "tip_m"), strict=True):
-            if np.ptp(column) == 0:
-                raise ValueError(
-                    f"experiment {self.name}: {name} is {column[0]:.6g} throughout: is the sensor dead?"
-                )
-        voltage.setflags(write=False)
-        output.setflags(write=False)
-        object.__setattr__(self, "voltage_V", voltage)
-        object.__setattr__(self, "output", output)
+        object.__setattr__(self, "voltage_V", readonly(self.voltage_V))
+        object.__setattr__(self, "output", readonly(self.output))
+        if self.voltage_V.ndim != 1:
+            raise ValueError(f"experiment {self.name}: voltage_V must be (T,); got {self.voltage_V.shape}")
+        check_record(self, ("hub_angle_rad", "tip_m"))
 
     @property
     def input(self) -> Real:
         """(T, 1) the voltage."""
         return self.voltage_V[:, None]
-
-
-def check_names_and_roles(case: str, experiments: Sequence[RecordOfMachine]) -> None:
-    """Every name once, both roles there; ValueError otherwise."""
-    names = [experiment.name for experiment in experiments]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"case {case}: experiment {name} is given twice")
-    for role in ("estimation", "held_out"):
-        if not any(experiment.role == role for experiment in experiments):
-            raise ValueError(f"case {case}: no experiment has the role {role}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,17 +80,13 @@ class Case:
 
     @cached_property
     def steps(self) -> Real:
-        """(2,) steps of the lattice that all records of an output lie on, 0 where they lie on none."""
-        return np.array(
-            [
-                lattice_step([e.output[:, k] for e in self.experiments], float(sigma))
-                for k, sigma in enumerate(self.noise)
-            ]
-        )
+        """(2,) steps of the quantisation grids that the outputs of all records lie on; 0: on none."""
+        outputs = [[e.output[:, k] for e in self.experiments] for k in range(2)]
+        return np.array([grid_step(y, float(sigma)) for y, sigma in zip(outputs, self.noise, strict=True)])
 
     @property
     def machine(self) -> FlexibleArm:
-        """The rig in the form the engine asks for (see `diagnosis.machine.machine_protocol`)."""
+        """The rig in the form that fits and evidence ask for (see `diagnosis.machine.machine_protocol`)."""
         return FlexibleArm(self.rig)
 
     @property

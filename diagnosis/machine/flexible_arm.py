@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diagnosis.machine.candidates import Candidate, candidates
-from diagnosis.machine.machine_protocol import Real, Weighing
-from plant.effects import Effect
+from diagnosis.machine.machine_protocol import Real, RecordOfMachine, Weighing
+from plant.effects import EFFECTS, Effect
+from plant.effects.search_space import Candidate, Scales
 from plant.rig import Rig
 from plant.simulate import Simulator
 
-if TYPE_CHECKING:
-    from diagnosis.machine.case import Case
-
 _WEIGHING = Weighing()
+_SPEED_SAMPLES = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,5 +51,21 @@ class FlexibleArm:
         prepared = Simulator(self.rig, effects)
         return lambda inputs: prepared.run(inputs[:, 0]).output
 
-    def candidates(self, case: Case) -> tuple[Candidate, ...]:
-        return candidates(case)
+    def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
+        """Every effect of the registry that a fit can find; signed ones twice."""
+        scales = scales_of(self.rig, experiments)
+        return tuple(found for effect in EFFECTS.values() for found in effect.candidates(scales))
+
+
+def scales_of(rig: Rig, experiments: Sequence[RecordOfMachine]) -> Scales:
+    """Magnitudes of the largest motion in the records; speeds are means over ten samples."""
+    angles = [e.output[:, 0] for e in experiments]
+    k, dt = _SPEED_SAMPLES, rig.sampling.dt_s
+    return Scales(
+        rig,
+        voltage_V=max(float(np.max(np.abs(e.input))) for e in experiments),
+        angle_rad=max(float(np.max(np.abs(angle))) for angle in angles),
+        swing_rad=max(float(np.ptp(angle)) for angle in angles),
+        speed_rad_s=max(float(np.max(np.abs(angle[k:] - angle[:-k]))) / k for angle in angles) / dt,
+        duration_s=max(len(e.input) for e in experiments) * dt,
+    )

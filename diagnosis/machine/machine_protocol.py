@@ -1,27 +1,26 @@
 """What the diagnosis asks of a machine and its records; a flexible link is one of many that can answer.
 
 `diagnosis.machine.flexible_arm.FlexibleArm` answers for a rig, `diagnosis.machine.own_plant.Plant` for a
-simulation somebody brings. The engine (residual, nominal, screening, fit, hypotheses, search, diagnosis)
-knows no other machine.
+simulation somebody brings. Fits, evidence and `diagnose` know no other machine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from plant.effects import EFFECTS
-
-if TYPE_CHECKING:
-    from diagnosis.machine.candidates import Candidate
+from plant.effects.search_space import Candidate
 
 Real = npt.NDArray[np.float64]
-Dependence = Literal["smooth", "continuous", "jagged"]
+Role = Literal["estimation", "held_out"]
 Stated = TypeVar("Stated", bound="StatedValues")
+
+_FEWEST_SAMPLES = 20
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,8 @@ class Machine(StatedValues, Protocol):
     def simulator(self, effects: Sequence[Any]) -> Callable[[Real], Real]:
         """Inputs (T, U) -> outputs (T, Y) without noise; effects as its own candidates make them."""
 
-    def candidates(self, case: Any) -> tuple[Candidate, ...]:
-        """Effects that may be missing, as search spaces with ranges that fit the case's records."""
+    def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
+        """Effects that may be missing, as search spaces with ranges that fit the records."""
 
 
 class RecordOfMachine(Protocol):
@@ -94,7 +93,7 @@ class RecordOfMachine(Protocol):
     def name(self) -> str: ...
 
     @property
-    def role(self) -> Literal["estimation", "held_out"]: ...
+    def role(self) -> Role: ...
 
     @property
     def input(self) -> Real:
@@ -128,4 +127,40 @@ class CaseOfMachine(Protocol):
 
     @property
     def steps(self) -> Real:
-        """(Y,) steps of outputs whose values lie on a lattice, 0 for all others."""
+        """(Y,) steps of outputs whose values lie on a quantisation grid, 0 for all others."""
+
+
+def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> None:
+    """Raises ValueError, one line: shapes that do not fit, too few samples, a value that is not finite, or an
+    output with a name that never moves."""
+    u, y, what = record.input, record.output, f"experiment {record.name}"
+    if u.ndim != 2 or y.ndim != 2 or len(u) != len(y) or (output_names and y.shape[1] != len(output_names)):
+        outputs = len(output_names) or "Y"
+        raise ValueError(f"{what}: needs input (T, U) and output (T, {outputs}); got {u.shape} and {y.shape}")
+    if record.role not in ("estimation", "held_out"):
+        raise ValueError(f"{what}: role must be estimation or held_out; got {record.role!r}")
+    if not (np.all(np.isfinite(u)) and np.all(np.isfinite(y))):
+        raise ValueError(f"{what}: a value is not finite")
+    if len(u) < _FEWEST_SAMPLES:
+        raise ValueError(f"{what}: {len(u)} samples, needs at least {_FEWEST_SAMPLES}")
+    for column, output in zip(y.T, output_names, strict=False):
+        if np.ptp(column) == 0:
+            raise ValueError(f"{what}: {output} is {column[0]:.6g} throughout: is the sensor dead?")
+
+
+def check_names_and_roles(case: str, experiments: Sequence[RecordOfMachine]) -> None:
+    """Every name once, both roles there; ValueError otherwise."""
+    names = [experiment.name for experiment in experiments]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"case {case}: experiment {name} is given twice")
+    for role in ("estimation", "held_out"):
+        if not any(experiment.role == role for experiment in experiments):
+            raise ValueError(f"case {case}: no experiment has the role {role}")
+
+
+def readonly(values: Any) -> Real:
+    """A copy that nobody changes."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array

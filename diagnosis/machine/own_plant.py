@@ -21,15 +21,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diagnosis.machine.candidates import Axis, Candidate
-from diagnosis.machine.case import check_names_and_roles
-from diagnosis.machine.machine_protocol import Dependence, Real, Weighing
+from diagnosis.machine.machine_protocol import (
+    Real,
+    RecordOfMachine,
+    Role,
+    Weighing,
+    check_names_and_roles,
+    check_record,
+    readonly,
+)
+from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
 
 Simulate = Callable[[Mapping[str, float], Mapping[str, Mapping[str, float]], Real], Real]
-Role = Literal["estimation", "held_out"]
 
-_STEPS = {"smooth": 1e-5, "continuous": 1e-3, "jagged": 5e-3}
-_SHORTEST = 20
+_STEPS = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
 # In noise deviations: beyond any record, and its square is still a number.
 _RUNAWAY = 1e12
 
@@ -104,8 +109,8 @@ class PlantEffect:
     signed : bool
         The size may be negative as well: both sides are searched, as one effect.
     grows : bool
-    dependence : "smooth", "continuous" or "jagged"
-        How outputs depend on the parameters: differentiable; continuous (dry friction); in jags (play,
+    dependence : "smooth", "continuous" or "non-smooth"
+        How outputs depend on the parameters: differentiable; continuous (dry friction); neither (backlash,
         rounding), which takes grids in place of slopes.
     group : str
         Where it acts (actuator, joint, sensor, ...); only shown.
@@ -133,28 +138,26 @@ class PlantEffect:
         values = [p.start_coordinates(n) for p, n in zip(self.parameters, counts, strict=True)]
         starts = tuple(product(*values))
         signs = (1, -1) if self.signed else (1,)
-        return tuple(
-            PlantCandidate(self.name, axes, starts, sign, self.grows, self.dependence) for sign in signs
-        )
+        return tuple(Candidate(self, axes, starts, sign, self.grows) for sign in signs)
 
-
-@dataclass(frozen=True)
-class PlantCandidate(Candidate):
-    """A candidate of an own plant: sign times size, other values as they are."""
-
-    jaggedness: Dependence = "smooth"
+    def from_search(self, values: Mapping[str, float], sign: int) -> Change:
+        """The effect at these values, the size (the first parameter) with its sign."""
+        size = self.parameters[0].name
+        signed = {**values, size: sign * values[size]}
+        return Change(self.name, MappingProxyType(signed), self.dependence)
 
     @property
-    def dependence(self) -> Dependence:
-        return self.jaggedness
+    def id(self) -> str:
+        return self.name
 
-    def parameters(self, x: Real) -> dict[str, float]:
-        values = {axis.parameter: axis.value(v) for axis, v in zip(self.axes, x, strict=True)}
-        values[self.axes[0].parameter] *= self.sign
-        return values
+    @property
+    def multiplies(self) -> str | None:
+        """None: which of its own parameters an effect multiplies nobody said."""
+        return None
 
-    def effect_at(self, x: Real) -> Change:
-        return Change(self.effect, MappingProxyType(self.parameters(x)), self.jaggedness)
+    @property
+    def harmonic(self) -> Harmonic | None:
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +197,7 @@ class Plant:
     _weighing: Weighing = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        noise = np.array(self.noise, dtype=np.float64)
-        noise.setflags(write=False)
+        noise = readonly(self.noise)
         object.__setattr__(self, "noise", noise)
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "output_names", tuple(self.output_names))
@@ -247,7 +249,7 @@ class Plant:
 
         return outputs
 
-    def candidates(self, case: PlantCase) -> tuple[Candidate, ...]:
+    def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
         return tuple(candidate for effect in self.effects for candidate in effect.candidates())
 
 
@@ -261,24 +263,9 @@ class PlantExperiment:
     output: Real
 
     def __post_init__(self) -> None:
-        for key in ("input", "output"):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if values.ndim != 2:
-                raise ValueError(f"experiment {self.name}: {key} must be (T, channels); got {values.shape}")
-            if not np.all(np.isfinite(values)):
-                raise ValueError(f"experiment {self.name}: a value of the {key} is not finite")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
-        if len(self.input) != len(self.output):
-            raise ValueError(
-                f"experiment {self.name}: {len(self.input)} samples of input, {len(self.output)} of output"
-            )
-        if len(self.input) < _SHORTEST:
-            raise ValueError(f"experiment {self.name}: {len(self.input)} samples, needs at least {_SHORTEST}")
-        if self.role not in ("estimation", "held_out"):
-            raise ValueError(
-                f"experiment {self.name}: role must be estimation or held_out; got {self.role!r}"
-            )
+        object.__setattr__(self, "input", readonly(self.input))
+        object.__setattr__(self, "output", readonly(self.output))
+        check_record(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,16 +287,7 @@ class PlantCase:
         object.__setattr__(self, "experiments", tuple(self.experiments))
         check_names_and_roles(self.name, self.experiments)
         for e in self.experiments:
-            if e.output.shape[1] != len(self.plant.output_names):
-                raise ValueError(
-                    f"experiment {e.name}: {e.output.shape[1]} outputs, the plant has "
-                    f"{', '.join(self.plant.output_names)}"
-                )
-            for column, output in zip(e.output.T, self.plant.output_names, strict=True):
-                if np.ptp(column) == 0:
-                    raise ValueError(
-                        f"experiment {e.name}: {output} is {column[0]:.6g} throughout: is the sensor dead?"
-                    )
+            check_record(e, self.plant.output_names)
         first = self.experiments[0]
         found = np.asarray(self.plant.simulation(self.plant.parameters, {}, first.input))
         if found.shape != first.output.shape or not np.all(np.isfinite(found)):

@@ -1,8 +1,8 @@
-"""Outputs on a lattice: the step is read off the values, and fits use the chance of each cell.
+"""Outputs on a quantisation grid: the step is read off the values, and fits use the chance of each cell.
 
 Rounding is no effect to be fitted: a model whose output is rounded differs from the record as much as one
-whose output is not. But values on a lattice are plain, and each of them only says in which cell the unrounded
-one lay.
+whose output is not. But values on a quantisation grid are plain, and each of them only says in which cell
+the unrounded one lay.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from diagnosis.machine.machine_protocol import Real
 
 # Records are written with so many significant digits at least; rounding in the file is no finding.
 _DIGITS = 6
-# A lattice is believed when its step is this much coarser than what the file resolves.
+# A grid is believed when its step is this much coarser than what the file resolves.
 _COARSER = 20.0
-# Few values are a lattice only where each of them is read again and again.
+# Few values are a grid only where each of them is read again and again.
 _MANY, _READINGS = 10, 20
 # And when it widens the noise: step / sqrt(12) against this share of it.
 _NOTICEABLE = 0.1
 
 
-def lattice_step(signals: Sequence[Real], noise: float) -> float:
+def grid_step(signals: Sequence[Real], noise: float) -> float:
     """Common step of all values of these records of one sensor, 0 where there is none.
 
     Raises
@@ -43,7 +43,7 @@ def lattice_step(signals: Sequence[Real], noise: float) -> float:
     gaps = np.diff(np.union1d(values, 0.0))
     gaps = gaps[gaps > 4 * coarse]
     if gaps.size == 0 or np.min(gaps) < _COARSER * coarse:
-        # Values nearer than any believable step: only a lattice finer than the file resolves could hold them.
+        # Values nearer than any believable step: only a grid finer than the file resolves could hold them.
         return 0.0
     step = float(np.min(gaps))
     # Least squares over growing multiples: a step off by 1e-4 slips a cell only beyond 5000 of them.

@@ -1,4 +1,4 @@
-"""A quantised sensor in the answer: certain when its values lie on a lattice, whatever else is wrong."""
+"""A quantised sensor in the answer: certain when its values lie on a grid, whatever else is wrong."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TIP = 1
 
 @dataclass(frozen=True)
 class Rounding:
-    """effect: with the step of the lattice; intervals: of its step; floor: pooled RMS that rounding and noise
+    """effect: with the step of the grid; intervals: of its step; floor: pooled RMS that rounding and noise
     leave over the noise; energy: mean square of rounding alone, over all outputs and the noise's."""
 
     effect: Quantisation
@@ -33,7 +33,7 @@ class Rounding:
 
 
 def rounding_effect(case: CaseOfMachine) -> Rounding | None:
-    """The quantisation of a flexible link's tip sensor, if its records lie on a lattice.
+    """The quantisation of a flexible link's tip sensor, if its records lie on a quantisation grid.
 
     Rounding errors are taken as uniform over a step: step / sqrt(12).
     """

@@ -9,7 +9,8 @@ import numpy as np
 
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.nominal import NominalParameters
-from diagnosis.machine.case import Case, Real
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.next_experiment.discrimination import Rival
 from plant.effects import Effect
 from plant.simulate import simulate
@@ -74,7 +75,7 @@ def rival_of_fit(case: Case, fit: Fit, probability: float) -> Rival:
 
     def directions(voltage: Real) -> Real:
         # Contacts say little about a small change of a nominal parameter and cost most of the time.
-        calm = tuple(e for e in fit.effects if type(e).dependence != "jagged")
+        calm = tuple(e for e in fit.effects if type(e).dependence != "non-smooth")
         start = outputs(fit.deviations, calm, voltage)
         columns = []
         for k in range(nominal.count):

@@ -22,13 +22,13 @@ from itertools import combinations
 import numpy as np
 from scipy.linalg import block_diag
 
-from diagnosis.machine.case import Real
+from diagnosis.machine.machine_protocol import Real
 from plant.effects import EFFECTS, Effect
 from plant.rig import Rig
 from plant.simulate import simulate
 
 # Relative steps of difference quotients; contacts that switch need one that averages over many of them.
-_STEP = {"smooth": 1e-4, "continuous": 1e-3, "jagged": 3e-2}
+_STEP = {"smooth": 1e-4, "continuous": 1e-3, "non-smooth": 3e-2}
 # In tolerances: small against one, large against the wobble of friction.
 _TOLERANCE_STEP = 0.02
 _LOG_PRECISION = 1.0
@@ -47,8 +47,8 @@ class Rival:
     directions : callable, optional
         Voltage (T,) -> derivatives (2 T, P) of the outputs in noise deviations, hub before tip sample by
         sample, by the rival's free parameters. Without it: difference quotients by the logarithms of the
-        effects' parameters and by the tolerances of the rig (there without jagged effects, whose contacts say
-        little about a small change of a parameter and cost most of the time).
+        effects' parameters and by the tolerances of the rig (there without non-smooth effects, whose contacts
+        say little about a small change of a parameter and cost most of the time).
     precision : (P, P), optional
         What is known about the free parameters: the Gauss-Newton Hessian of the fit to the records, prior
         included. Needed with `directions`.
@@ -126,7 +126,7 @@ def _directions(rival: Rival, voltage: Real, whitened: Real, noise: Real) -> tup
         columns.append((output.ravel() - whitened) / step)
         precision.append(_LOG_PRECISION)
     if rival.rig.tolerances:
-        effects = tuple(e for e in rival.effects if type(e).dependence != "jagged")
+        effects = tuple(e for e in rival.effects if type(e).dependence != "non-smooth")
         start = whitened
         if len(effects) < len(rival.effects):
             start = (simulate(rival.rig, voltage, effects).output / noise).ravel()

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from diagnosis.machine.case import Case, Real
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
 from plant.excitation import doublet, log_chirp, multisine, multisine_lines, prbs
 
 Integer = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.machine.case import Real
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.next_experiment.discrimination import Rival, distances, noise_of
 from diagnosis.next_experiment.experiment_choices import (
     ALSO_WEAK,

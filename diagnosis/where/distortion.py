@@ -16,7 +16,8 @@ import numpy.typing as npt
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
-from diagnosis.machine.case import Case, Experiment, Real
+from diagnosis.machine.case import Case, Experiment
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.where_energy import band_edges_Hz
 from diagnosis.where.where_records import SENSORS, FrequencyResponseBand, LineGroup, PeriodicFinding
 

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from diagnosis.machine.case import Case, Real
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.where_records import LinearCorrection
 from ident.basis.functions import regressor
 from ident.basis.poles import Poles

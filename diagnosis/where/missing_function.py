@@ -20,7 +20,8 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.stats import chi2
 
-from diagnosis.machine.case import Case, Real
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.regimes import Motion
 from diagnosis.where.where_records import EquivalentCurve
 from plant.simulate import simulate

@@ -15,7 +15,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from diagnosis.machine.case import Case, Real
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.where_records import SENSORS, RegimeBin, RegimeFinding
 
 Integer = npt.NDArray[np.int64]

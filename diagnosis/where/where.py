@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.machine.case import Case, Real
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.linear_correction import linear_correction
 from diagnosis.where.missing_function import missing_functions
@@ -98,13 +99,9 @@ def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:
     for name, value in probabilities.items():
         if name in ("none", "unknown"):
             mass[name] += float(value)
-        elif name in _ENVIRONMENT:
-            mass["environment"] += float(value)
         elif name in EFFECTS:
-            mass[EFFECTS[name].group] += float(value)
+            effect = EFFECTS[name]
+            mass["environment" if effect.environment else effect.group] += float(value)
         else:
             raise ValueError(f"{name}: no such effect; known: {', '.join(EFFECTS)}, none, unknown")
     return mass
-
-
-_ENVIRONMENT = frozenset({"periodic_disturbance", "gravity"})

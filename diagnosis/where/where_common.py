@@ -13,7 +13,8 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
-from diagnosis.machine.case import Case, Experiment, Real
+from diagnosis.machine.case import Case, Experiment
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.where_records import SENSORS, CommonFinding
 
 _LEAST_EXPERIMENTS, _MOST_EXPERIMENTS = 4, 8

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.fft import dct
 from scipy.stats import chi2, norm
 
-from diagnosis.machine.case import Real
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.where_records import SENSORS, BandGap, ExperimentGap, PartGap, SensorGap
 
 _Z95 = float(norm.ppf(0.975))

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import t as student
 
-from diagnosis.machine.case import Case, Experiment, Real
+from diagnosis.machine.case import Case, Experiment
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.where_records import SENSORS, AmplitudeFinding, DriftFinding, Interval
 
 _UNITS = ("rad/s", "m/s")

@@ -1,6 +1,6 @@
 """Effects that can separate a machine from its nominal rig, and their registry.
 
-A new effect is one class in the module of its group and one line in `EFFECTS`; the contract test follows.
+A new effect is one registered class in the module of its group, and one entry in the contract test.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from plant.effects.actuator import ActuatorDeadZone, ActuatorGain, ActuatorLag, ActuatorSaturation, InputDelay
-from plant.effects.base import Effect
+from plant.effects.base import EFFECTS, LOOK_ALIKES, Effect, register
 from plant.effects.joint import (
     Backlash,
     BaseCompliance,
@@ -30,37 +30,9 @@ from plant.effects.sensor import Quantisation, SensorDrift, SensorGain, SensorLa
 from plant.machine import Machine
 from plant.rig import Rig, one_line
 
-EFFECTS: dict[str, type[Effect]] = {
-    effect.id: effect
-    for effect in (
-        CoulombFriction,
-        StribeckFriction,
-        ViscousFriction,
-        ActuatorSaturation,
-        ActuatorDeadZone,
-        InputDelay,
-        ActuatorGain,
-        TipPayload,
-        LinkStiffness,
-        StructuralDamping,
-        SensorGain,
-        SensorDrift,
-        Quantisation,
-        HubInertia,
-        ActuatorLag,
-        TorqueRipple,
-        PeriodicDisturbance,
-        HardeningSpring,
-        JointCompliance,
-        BaseCompliance,
-        Backlash,
-        Gravity,
-        SensorLag,
-    )
-}
-
 __all__ = [
     "EFFECTS",
+    "LOOK_ALIKES",
     "ActuatorDeadZone",
     "ActuatorGain",
     "ActuatorLag",
@@ -89,6 +61,7 @@ __all__ = [
     "make_machine",
     "parse_effect",
     "parse_effects",
+    "register",
     "without",
 ]
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic, Scales, log_axis
 from plant.machine import JointPath, Machine, SensorPath, VoltagePath
+from plant.rig import Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
 
@@ -17,36 +20,74 @@ P = TypeVar("P", VoltagePath, JointPath, SensorPath)
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
+# A ratio closer to one than this many tolerances of the value it multiplies is not significant; nearly all
+# are within so many tolerances: who states a value to 5 % is seldom wrong by a factor of ten.
+_LEAST_TOLERANCES, USUAL_TOLERANCES = 3.0, 30.0
+
 
 class Effect(BaseModel, ABC):
     """One deviation of a machine from its nominal rig.
 
     A subclass has its parameters as fields, SI units in their names, with bounds; its docstring states the
     equation. An instance is frozen; effects commute, because every one changes fields of its own or
-    multiplies.
+    multiplies. Everything else that is known about an effect stands in its class; `@register` lists it.
 
     Attributes
     ----------
     id : str
         Name in the registry and in configuration files.
+    words : str
+        Its name in a sentence.
     group : str
         Where it acts: actuator, joint, link or sensor.
     neutral : mapping or None
         Parameter values at which the effect vanishes exactly; None if there are none within the bounds.
     dependence : str
-        How the outputs depend on the parameters: smooth (differentiable), continuous, or jagged.
+        How the outputs depend on the parameters: smooth (differentiable), continuous, or non-smooth.
+    environment : bool
+        It comes from outside the machine.
+    multiplies : str or None
+        Key of the stated value that its ratio multiplies, whose tolerance may explain it as well.
+    harmonic : str or None
+        The torque is a sine of the hub angle or of time: amplitude and phase follow by linear least squares.
+    look_alike_of : str or None
+        Not an answer of a diagnosis, but what the effect of this id may be mistaken for.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     id: ClassVar[str]
+    words: ClassVar[str]
     group: ClassVar[Group]
     neutral: ClassVar[Mapping[str, float] | None]
-    dependence: ClassVar[Literal["smooth", "continuous", "jagged"]] = "smooth"
+    dependence: ClassVar[Dependence] = "smooth"
+    environment: ClassVar[bool] = False
+    multiplies: ClassVar[str | None] = None
+    harmonic: ClassVar[Harmonic | None] = None
+    look_alike_of: ClassVar[str | None] = None
 
     @abstractmethod
     def modify(self, machine: Machine) -> Machine:
         """The machine with this effect."""
+
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """Where to look for the effect; none for one that no fit can find."""
+        return ()
+
+    @classmethod
+    def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
+        """The effect at the values of the search's axes; sign: which side of a signed size."""
+        return cls(**values)
+
+    def simpler(self) -> Effect | None:
+        """The effect that this one becomes without its further parameters."""
+        return None
+
+    @classmethod
+    def look_alike_scale(cls, rig: Rig) -> float:
+        """Size of this effect per size of the one it looks like (`look_alike_of`)."""
+        return 1.0
 
     def parameters(self) -> dict[str, float]:
         """Parameter values by name."""
@@ -55,6 +96,68 @@ class Effect(BaseModel, ABC):
     def to_dict(self) -> dict[str, Any]:
         """{"name": id, parameter: value, ...}, the form `parse_effect` reads."""
         return {"name": type(self).id, **self.parameters()}
+
+    @classmethod
+    def _candidate(
+        cls,
+        axes: Sequence[Axis],
+        points: Iterable[Sequence[float]] = (),
+        *,
+        sign: int = 1,
+        grows: bool = True,
+    ) -> Candidate:
+        """A search that starts from these points, given in the units of the axes' parameters."""
+        starts = tuple(
+            tuple(axis.coordinate(v) for axis, v in zip(axes, point, strict=True)) for point in points
+        )
+        return Candidate(cls, tuple(axes), starts, sign, grows)
+
+    @classmethod
+    def _size(cls, axis: Axis, values: Iterable[float], *, sign: int = 1, grows: bool = True) -> Candidate:
+        """A search over the one parameter."""
+        return cls._candidate([axis], ((v,) for v in values), sign=sign, grows=grows)
+
+
+EFFECTS: dict[str, type[Effect]] = {}
+LOOK_ALIKES: dict[str, type[Effect]] = {}
+
+E = TypeVar("E", bound=Effect)
+
+
+def register(kind: type[E]) -> type[E]:
+    """Class decorator: the effect can be configured and diagnosed by its id (look-alikes: only diagnosed)."""
+    (LOOK_ALIKES if kind.look_alike_of else EFFECTS)[kind.id] = kind
+    return kind
+
+
+class RatioEffect(Effect):
+    """A stated value (`multiplies`) times a ratio."""
+
+    largest_ratio: ClassVar[float] = 10.0
+
+    ratio: NotNegative
+
+    def modify(self, machine: Machine) -> Machine:
+        if self.multiplies is None:
+            raise NotImplementedError(f"{self.id} multiplies no stated value: it needs its own modify")
+        return with_parameters(machine, {self.multiplies: machine.rig.value(self.multiplies) * self.ratio})
+
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """Both sides of one, from where the tolerance of the stated value no longer explains the ratio."""
+        tolerance = scales.tolerance(cls.multiplies)
+        least, largest = max(1e-6, _LEAST_TOLERANCES * tolerance), cls.largest_ratio
+        points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
+        points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
+        usual = 1 + USUAL_TOLERANCES * tolerance
+        above = log_axis("ratio", 1 + least, largest, usual=(1 + least, usual) if tolerance > 0 else None)
+        sides = [Candidate(cls, (above,), tuple((float(p),) for p in points))]
+        below = max(1 - least, 0.2) if least < 1 else 0.0
+        if below > 0:
+            axis = log_axis("ratio", 1 / largest, below, usual=(1 / usual, below) if tolerance > 0 else None)
+            starts = tuple((float(v),) for v in np.minimum(-points, np.log(below)))
+            sides.append(Candidate(cls, (axis,), starts, sign=-1, grows=False))
+        return tuple(sides)
 
 
 def with_voltage(machine: Machine, **changes: Any) -> Machine:

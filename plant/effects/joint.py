@@ -2,23 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import product
 from types import MappingProxyType
 from typing import Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
-from plant.effects.base import Effect, NotNegative, Positive, with_joint, with_parameters
+from plant.effects.base import (
+    USUAL_TOLERANCES,
+    Effect,
+    NotNegative,
+    Positive,
+    RatioEffect,
+    register,
+    with_joint,
+    with_parameters,
+)
+from plant.effects.search_space import PHASE, Axis, Candidate, Scales, geometric, log_axis
 from plant.machine import Disturbance, DryFriction, Machine, Ripple, TorsionSpring
+from plant.modal import static_moment_kg_m
+from plant.rig import Rig
 
 # Bounds that only keep the step of the simulation reasonable: a stiffer pre-sliding, a steeper fall or a
 # finer ripple needs a shorter one (see plant.plan).
 _LARGEST_LEVEL_NM = 1e4
+# Friction smaller than this many tolerances of the stated value it is added to is not significant.
+_VISCOUS_TOLERANCES = 2.0
 
 
+@register
 class CoulombFriction(Effect):
     """Dry friction -Tc sign(omega); at rest up to Tc is held (with 10 microradian of elastic pre-sliding)."""
 
     id = "coulomb_friction"
+    words = "dry (Coulomb) friction"
     group = "joint"
     neutral = MappingProxyType({"torque_Nm": 0.0})
     dependence = "continuous"
@@ -29,11 +48,19 @@ class CoulombFriction(Effect):
         friction = DryFriction(self.torque_Nm, self.torque_Nm, 1.0)
         return with_joint(machine, friction=(*machine.joint.friction, friction))
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        tau = scales.torque_Nm
+        axis = log_axis("torque_Nm", 1e-5 * tau, tau, 1e-3)
+        return (cls._size(axis, geometric(3e-4 * tau, 0.6 * tau, 14)),)
 
+
+@register
 class StribeckFriction(Effect):
     """Dry friction of size Tc + (Ts - Tc) exp(-|omega| / vs); at rest up to Ts is held (same pre-sliding)."""
 
     id = "stribeck_friction"
+    words = "dry friction that falls with speed (Stribeck)"
     group = "joint"
     neutral = MappingProxyType(
         {"static_torque_Nm": 0.0, "coulomb_torque_Nm": 0.0, "stribeck_velocity_rad_s": 0.1}
@@ -59,11 +86,36 @@ class StribeckFriction(Effect):
         friction = DryFriction(self.static_torque_Nm, self.coulomb_torque_Nm, self.stribeck_velocity_rad_s)
         return with_joint(machine, friction=(*machine.joint.friction, friction))
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        tau, speed = scales.torque_Nm, scales.speed_rad_s
+        axes = [
+            log_axis("static_torque_Nm", 1e-5 * tau, 2 * tau, 2e-3),
+            Axis("coulomb_torque_Nm", "linear", 0.0, 0.98, 2e-3),  # share of the static level
+            # A fall over less than a hundredth of the largest speed is over before it shows: dry friction of
+            # the Coulomb kind by another name.
+            log_axis("stribeck_velocity_rad_s", 0.01 * speed, 2.0 * speed, 2e-3),
+        ]
+        levels, speeds = geometric(3e-4 * tau, 0.6 * tau, 8), geometric(0.012 * speed, 0.3 * speed, 3)
+        return (cls._candidate(axes, product(levels, [0.5, 0.8], speeds)),)
 
+    @classmethod
+    def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
+        """The Coulomb level is sought as a share of the static one."""
+        level = values["coulomb_torque_Nm"] * values["static_torque_Nm"]
+        return cls(**{**values, "coulomb_torque_Nm": level})
+
+    def simpler(self) -> CoulombFriction:
+        """Coulomb friction halfway between the levels."""
+        return CoulombFriction(torque_Nm=0.5 * (self.static_torque_Nm + self.coulomb_torque_Nm))
+
+
+@register
 class ViscousFriction(Effect):
     """Torque -c omega, added to the linear friction of the rig."""
 
     id = "viscous_friction"
+    words = "additional viscous friction"
     group = "joint"
     neutral = MappingProxyType({"coefficient_Nms": 0.0})
 
@@ -73,27 +125,39 @@ class ViscousFriction(Effect):
         total = machine.rig.hub.viscous_friction_Nms + self.coefficient_Nms
         return with_parameters(machine, {"hub.viscous_friction_Nms": total})
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        rig = scales.rig
+        spread = scales.tolerance("hub.viscous_friction_Nms") * rig.hub.viscous_friction_Nms
+        damping = rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms
+        least = _VISCOUS_TOLERANCES * spread
+        usual = (least, USUAL_TOLERANCES * spread) if least > 0 else None
+        axis = log_axis("coefficient_Nms", max(1e-5 * damping, least), 30 * damping, usual=usual)
+        return (cls._size(axis, geometric(max(1e-4 * damping, 1.2 * least), 3 * damping, 8)),)
 
-class HubInertia(Effect):
+
+@register
+class HubInertia(RatioEffect):
     """Hub inertia J multiplied by a ratio."""
 
     id = "hub_inertia"
+    words = "a wrong inertia of the hub"
     group = "joint"
     neutral = MappingProxyType({"ratio": 1.0})
+    multiplies = "hub.inertia_kg_m2"
 
     ratio: Positive = Field(description="true over nominal hub inertia")
 
-    def modify(self, machine: Machine) -> Machine:
-        total = machine.rig.hub.inertia_kg_m2 * self.ratio
-        return with_parameters(machine, {"hub.inertia_kg_m2": total})
 
-
+@register
 class TorqueRipple(Effect):
     """Extra motor torque a sin(N theta + p), theta the shaft angle; N counts per hub revolution."""
 
     id = "torque_ripple"
+    words = "torque ripple over the hub angle"
     group = "joint"
     neutral = MappingProxyType({"amplitude_Nm": 0.0, "cycles_per_rev": 1.0, "phase_rad": 0.0})
+    harmonic = "hub_angle"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")
     cycles_per_rev: float = Field(ge=0, le=1e4, description="cycles N per hub revolution")
@@ -103,13 +167,25 @@ class TorqueRipple(Effect):
         ripple = Ripple(self.amplitude_Nm, self.cycles_per_rev, self.phase_rad)
         return with_joint(machine, ripple=(*machine.joint.ripple, ripple))
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        # Less than a quarter of a period looks like a spring or a constant torque.
+        fewest = float(np.clip(0.5 * np.pi / scales.swing_rad, 1.0, 20.0))
+        amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, scales.torque_Nm)
+        cycles = Axis("cycles_per_rev", "linear", fewest, 80.0, 1e-4, edge=True)
+        return (cls._candidate([amplitude, cycles, PHASE]),)
 
+
+@register
 class PeriodicDisturbance(Effect):
     """Torque a sin(2 pi f t + p) from ground on the hub, t from the start of the record."""
 
     id = "periodic_disturbance"
+    words = "a periodic disturbance torque"
     group = "joint"
+    environment = True
     neutral = MappingProxyType({"amplitude_Nm": 0.0, "frequency_Hz": 1.0, "phase_rad": 0.0})
+    harmonic = "time"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")
     frequency_Hz: NotNegative = Field(description="frequency f")
@@ -119,11 +195,20 @@ class PeriodicDisturbance(Effect):
         disturbance = Disturbance(self.amplitude_Nm, self.frequency_Hz, self.phase_rad)
         return with_joint(machine, disturbance=(*machine.joint.disturbance, disturbance))
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, scales.torque_Nm)
+        low, high = 0.3 / scales.duration_s, 0.5 / scales.dt_s
+        frequency = Axis("frequency_Hz", "linear", low, high, 1e-5, edge=True)
+        return (cls._candidate([amplitude, frequency, PHASE]),)
 
+
+@register
 class HardeningSpring(Effect):
     """Cubic spring from hub (motor side, with backlash) to ground, torque -k3 theta^3, no linear part."""
 
     id = "hardening_spring"
+    words = "a hardening spring at the hub (cable, hose)"
     group = "joint"
     neutral = MappingProxyType({"cubic_Nm_rad3": 0.0})
 
@@ -133,15 +218,25 @@ class HardeningSpring(Effect):
         total = machine.joint.cubic_spring_Nm_rad3 + self.cubic_Nm_rad3
         return with_joint(machine, cubic_spring_Nm_rad3=total)
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        tau, cube = scales.torque_Nm, scales.angle_rad**3
+        axis = log_axis("cubic_Nm_rad3", 1e-7 * tau / cube, 1e3 * tau / cube)
+        return (cls._size(axis, geometric(1e-5 * tau / cube, 10 * tau / cube, 12)),)
 
+
+@register
 class GroundSpring(Effect):
     """Linear spring from hub (motor side, with backlash) to ground, torque -k theta.
 
-    Not in `EFFECTS`: no answer of a diagnosis, which needs it to tell gravity from what looks like it.
+    At small angles that is the torque of gravity on a hanging link: no answer of a diagnosis, which needs it
+    to tell gravity from what looks like it.
     """
 
     id = "ground_spring"
+    words = "a linear spring from hub to ground"
     group = "joint"
+    look_alike_of = "gravity"
     neutral = MappingProxyType({"stiffness_Nm_rad": 0.0})
 
     stiffness_Nm_rad: NotNegative = Field(description="stiffness k")
@@ -150,7 +245,12 @@ class GroundSpring(Effect):
         total = machine.joint.ground_spring_Nm_rad + self.stiffness_Nm_rad
         return with_joint(machine, ground_spring_Nm_rad=total)
 
+    @classmethod
+    def look_alike_scale(cls, rig: Rig) -> float:
+        return static_moment_kg_m(rig)
 
+
+@register
 class JointCompliance(Effect):
     """Torsion spring and damper, coaxial with the hub and without inertia, between hub and link root.
 
@@ -159,6 +259,7 @@ class JointCompliance(Effect):
     """
 
     id = "joint_compliance"
+    words = "a compliant joint between hub and link"
     group = "joint"
     neutral = None  # the rigid joint is the limit of infinite stiffness
 
@@ -168,7 +269,19 @@ class JointCompliance(Effect):
     def modify(self, machine: Machine) -> Machine:
         return with_joint(machine, compliance=TorsionSpring(self.stiffness_Nm_rad, self.damping_Nms))
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        k = scales.link_stiffness_Nm_rad
+        axes = [
+            log_axis("stiffness_Nm_rad", 0.05 * k, 1e4 * k),
+            log_axis("damping_Nms", 1e-6 * k, 100 * k),
+        ]
+        # Damping in proportion to the stiffness: time constants, not torques.
+        points = product(geometric(0.2 * k, 1e3 * k, 12), [3e-4, 3e-3, 2e-2])
+        return (cls._candidate(axes, ((kj, time_s * kj) for kj, time_s in points), grows=False),)
 
+
+@register
 class BaseCompliance(Effect):
     """Hub axis and motor housing sit on a base that turns about the same axis, sprung and damped to ground.
 
@@ -177,6 +290,7 @@ class BaseCompliance(Effect):
     """
 
     id = "base_compliance"
+    words = "a compliant base under the motor"
     group = "joint"
     neutral = None  # the fixed base is the limit of infinite stiffness
 
@@ -189,9 +303,26 @@ class BaseCompliance(Effect):
             machine, base=TorsionSpring(self.stiffness_Nm_rad, self.damping_Nms, self.inertia_kg_m2)
         )
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        k, J = scales.link_stiffness_Nm_rad, scales.rig.hub.inertia_kg_m2
+        axes = [
+            log_axis("stiffness_Nm_rad", 1e-3 * k, 1e5 * k),
+            log_axis("damping_Nms", 1e-6 * k, 10 * k),
+            log_axis("inertia_kg_m2", 0.02 * J, 300 * J),
+        ]
+        starts = []
+        for frequency_Hz, ratio, inertias in product(
+            geometric(1.0, 40.0, 14), [0.02, 0.15], [0.5, 2.0, 8.0, 30.0]
+        ):
+            inertia, omega = inertias * J, 2 * np.pi * frequency_Hz
+            starts.append((omega**2 * inertia, 2 * ratio * omega * inertia, inertia))
+        return (cls._candidate(axes, starts, grows=False),)
 
+
+@register
 class Backlash(Effect):
-    """Play between motor side (30 % of J, friction, back-EMF, motor torque) and hub (70 % of J, link).
+    """Backlash between motor side (30 % of J, friction, back-EMF, motor torque) and hub (70 % of J, link).
 
     They touch at a relative angle of +-gap/2 and start in the middle. The contact is a damped spring that
     only pushes: torque max(kc p + cc dp/dt, 0) at the penetration p, kc = 0.21 J (2 pi 180)^2, cc = 0.8
@@ -199,11 +330,16 @@ class Backlash(Effect):
     """
 
     id = "backlash"
+    words = "backlash in the gear"
     group = "joint"
-    neutral = None  # without play the contact is still elastic
-    dependence = "jagged"
+    neutral = None  # without a gap the contact is still elastic
+    dependence = "non-smooth"
 
-    gap_rad: Positive = Field(description="total play")
+    gap_rad: Positive = Field(description="total gap")
 
     def modify(self, machine: Machine) -> Machine:
         return with_joint(machine, backlash_gap_rad=self.gap_rad)
+
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        return (cls._size(log_axis("gap_rad", 1e-5, 0.5, 5e-3), geometric(3e-4, 0.2, 30)),)

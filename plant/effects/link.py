@@ -7,14 +7,17 @@ from types import MappingProxyType
 
 from pydantic import Field
 
-from plant.effects.base import Effect, NotNegative, Positive, with_parameters
+from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_parameters
+from plant.effects.search_space import Candidate, Scales, geometric, log_axis
 from plant.machine import Machine
 
 
+@register
 class TipPayload(Effect):
     """A point mass added to the payload of the rig."""
 
     id = "tip_payload"
+    words = "an additional mass at the tip"
     group = "link"
     neutral = MappingProxyType({"mass_kg": 0.0})
 
@@ -23,35 +26,40 @@ class TipPayload(Effect):
     def modify(self, machine: Machine) -> Machine:
         return with_parameters(machine, {"payload.mass_kg": machine.rig.payload.mass_kg + self.mass_kg})
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        m = scales.link_mass_kg
+        return (cls._size(log_axis("mass_kg", 1e-6 * m, 5 * m), geometric(1e-4 * m, 1.5 * m, 14)),)
 
-class LinkStiffness(Effect):
+
+@register
+class LinkStiffness(RatioEffect):
     """E I multiplied by a ratio; kappa unchanged, so the damping moment scales too."""
 
     id = "link_stiffness"
+    words = "a wrong bending stiffness of the link"
     group = "link"
     neutral = MappingProxyType({"ratio": 1.0})
+    multiplies = "link.youngs_modulus_Pa"
 
     ratio: Positive = Field(description="true over nominal bending stiffness")
 
-    def modify(self, machine: Machine) -> Machine:
-        return with_parameters(
-            machine, {"link.youngs_modulus_Pa": machine.rig.link.youngs_modulus_Pa * self.ratio}
-        )
 
-
-class StructuralDamping(Effect):
+@register
+class StructuralDamping(RatioEffect):
     """Kelvin-Voigt constant kappa multiplied by a ratio."""
 
     id = "structural_damping"
+    words = "wrong damping of the link"
     group = "link"
     neutral = MappingProxyType({"ratio": 1.0})
+    multiplies = "link.kelvin_voigt_s"
+    largest_ratio = 50.0
 
     ratio: NotNegative = Field(description="true over nominal kappa")
 
-    def modify(self, machine: Machine) -> Machine:
-        return with_parameters(machine, {"link.kelvin_voigt_s": machine.rig.link.kelvin_voigt_s * self.ratio})
 
-
+@register
 class Gravity(Effect):
     """The plane is tilted: in-plane gravity g along the link axis at theta = 0, pointing away from the hub.
 
@@ -60,10 +68,16 @@ class Gravity(Effect):
     """
 
     id = "gravity"
+    words = "gravity in a tilted plane"
     group = "link"
+    environment = True
     neutral = MappingProxyType({"acceleration_m_s2": 0.0})
 
     acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
 
     def modify(self, machine: Machine) -> Machine:
         return replace(machine, gravity_m_s2=machine.gravity_m_s2 + self.acceleration_m_s2)
+
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        return (cls._size(log_axis("acceleration_m_s2", 1e-4, 20.0), geometric(1e-3, 10.0, 12)),)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Self
 
 from pydantic import Field
 
-from plant.effects.base import Effect, NotNegative, Positive, with_sensor
+from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_sensor
+from plant.effects.search_space import Candidate, Scales, geometric, log_axis
 from plant.machine import Machine
 
 
-class SensorGain(Effect):
+@register
+class SensorGain(RatioEffect):
     """tip_m multiplied by a ratio, before its noise."""
 
     id = "sensor_gain"
+    words = "a wrong gain of the tip sensor"
     group = "sensor"
     neutral = MappingProxyType({"ratio": 1.0})
 
@@ -23,10 +28,12 @@ class SensorGain(Effect):
         return with_sensor(machine, gain=machine.sensor.gain * self.ratio)
 
 
+@register
 class SensorDrift(Effect):
     """rate * time added to tip_m, time from the start of the record."""
 
     id = "sensor_drift"
+    words = "a drift of the tip sensor"
     group = "sensor"
     neutral = MappingProxyType({"rate_m_s": 0.0})
 
@@ -35,25 +42,40 @@ class SensorDrift(Effect):
     def modify(self, machine: Machine) -> Machine:
         return with_sensor(machine, drift_m_s=machine.sensor.drift_m_s + self.rate_m_s)
 
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        rate = scales.rig.sensors.tip_noise_m / scales.duration_s
+        axis, starts = log_axis("rate_m_s", 1e-3 * rate, 1e4 * rate), geometric(0.1 * rate, 100 * rate, 6)
+        return tuple(cls._size(axis, starts, sign=sign) for sign in (1, -1))
 
+    @classmethod
+    def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
+        return cls(rate_m_s=sign * values["rate_m_s"])
+
+
+@register
 class Quantisation(Effect):
     """tip_m rounded to the nearest multiple of a step, after the noise."""
 
     id = "quantisation"
+    words = "coarse quantisation of the tip sensor"
     group = "sensor"
     neutral = MappingProxyType({"step_m": 0.0})
-    dependence = "jagged"
+    dependence = "non-smooth"
 
+    # Values on a grid are plain to see: the step is read off them (`diagnosis.machine.quantisation_grid`).
     step_m: NotNegative = Field(description="resolution of the tip sensor; 0 is none")
 
     def modify(self, machine: Machine) -> Machine:
         return with_sensor(machine, step_m=max(machine.sensor.step_m, self.step_m))
 
 
+@register
 class SensorLag(Effect):
     """First-order lag on the tip sensor, before its gain, drift and noise."""
 
     id = "sensor_lag"
+    words = "a lag of the tip sensor"
     group = "sensor"
     neutral = MappingProxyType({"time_constant_s": 0.0})
 
@@ -61,3 +83,9 @@ class SensorLag(Effect):
 
     def modify(self, machine: Machine) -> Machine:
         return with_sensor(machine, lag_s=self.time_constant_s)
+
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        dt = scales.dt_s
+        axis = log_axis("time_constant_s", 2e-4 * dt, 200 * dt)
+        return (cls._size(axis, geometric(0.02 * dt, 40 * dt, 10)),)

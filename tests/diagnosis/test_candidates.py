@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import quad
 
 from diagnosis.evidence.hypotheses import Hypothesis
+from diagnosis.evidence.search import in_place_of
 from diagnosis.fit.discrepancy import leftover
 from diagnosis.fit.fit import Fit
-from diagnosis.machine.candidates import candidates, in_place_of
 from diagnosis.machine.case import Case, Experiment
 from plant.presets import paper_link
 
@@ -24,7 +24,8 @@ def listed():
     rig = paper_link().model_copy(update={"tolerances": {"hub.inertia_kg_m2": TOLERANCE}})
     output = np.column_stack([np.linspace(-0.5, 0.5, 50)] * 2)
     record = Experiment("only", "estimation", np.ones(50), output)
-    return candidates(Case("arm", rig, (record, replace(record, name="other", role="held_out"))))
+    case = Case("arm", rig, (record, replace(record, name="other", role="held_out")))
+    return case.machine.candidates(case.experiments)
 
 
 def test_every_prior_density_integrates_to_one(listed):

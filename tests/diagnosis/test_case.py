@@ -7,7 +7,6 @@ import pytest
 
 from diagnosis import Case, Experiment
 from diagnosis.fit.nominal import NominalParameters
-from diagnosis.machine.candidates import candidates
 from plant import EFFECTS, paper_link
 
 RNG = np.random.default_rng(5)
@@ -26,7 +25,7 @@ def _case(*experiments, rig=None):
     ("changes", "message"),
     [
         ({"output": np.zeros((50, 2))}, "dead"),
-        ({"output": np.ones((49, 2))}, r"\(T,\)"),
+        ({"output": np.ones((49, 2))}, r"\(T, U\)"),
         ({"voltage_V": np.full(50, np.nan)}, "finite"),
         ({"role": "check"}, "role"),
         ({"voltage_V": np.ones(5), "output": RNG.standard_normal((5, 2))}, "at least 20"),
@@ -56,13 +55,13 @@ def test_a_stated_value_one_tolerance_too_high_means_a_lower_true_one():
 
 def test_every_effect_is_a_candidate_whose_starts_make_an_effect():
     case = _case(_experiment(), _experiment("b", "held_out"))
-    found = candidates(case)
-    # Quantisation is read off the values (tests/diagnosis/test_lattice.py), not fitted.
+    found = case.machine.candidates(case.experiments)
+    # Quantisation is read off the values (tests/diagnosis/test_quantisation_grid.py), not fitted.
     assert {candidate.effect for candidate in found} == set(EFFECTS) - {"quantisation"}
     for candidate in found:
         low, high = candidate.box
-        assert np.all(low < high), candidate.label
+        assert np.all(low < high), candidate.effect
         for start in candidate.starts:
             effect = candidate.effect_at(np.array(start))
             assert effect.id == candidate.effect
-            assert np.all((np.array(start) >= low) & (np.array(start) <= high)), candidate.label
+            assert np.all((np.array(start) >= low) & (np.array(start) <= high)), candidate.effect

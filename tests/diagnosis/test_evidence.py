@@ -11,14 +11,14 @@ from scipy.integrate import quad
 from diagnosis.evidence.hypotheses import Hypothesis, log_prior, probabilities
 from diagnosis.fit.discrepancy import leftover
 from diagnosis.fit.fit import Fit, log_evidence
-from diagnosis.machine.candidates import Axis, Candidate
 from plant import EFFECTS
+from plant.effects.search_space import Axis, Candidate
 
 SLOPE = np.array([0.5, -1.2, 0.8, 2.0])
 
 
 def _candidate(low, high):
-    return Candidate("actuator_gain", (Axis("ratio", "linear", low, high, 1e-4),), ())
+    return Candidate(EFFECTS["actuator_gain"], (Axis("ratio", "linear", low, high, 1e-4),), ())
 
 
 def _linear_fit(target, low, high):
@@ -99,7 +99,7 @@ def test_probabilities_sum_to_one_and_prefer_what_explains_the_records():
 
 def _fit_with(residuals, effect):
     axis = Axis("mass_kg" if effect == "tip_payload" else "delay_s", "log", 1e-3, 1.0, 1e-5)
-    candidate = Candidate(effect, (axis,), ())
+    candidate = Candidate(EFFECTS[effect], (axis,), ())
     J = np.full((residuals.size, 1), 0.1)
     return Fit(
         (candidate,), np.zeros(0), (np.array([-3.0]),), residuals, J, float(residuals @ residuals), True

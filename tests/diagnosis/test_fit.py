@@ -9,7 +9,6 @@ from diagnosis import Case, Experiment
 from diagnosis.evidence.screening import Screening
 from diagnosis.fit.fit import fit
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.machine.candidates import candidates
 from plant import Rig, prbs
 from validation.blind.rigs import draw_rig, draw_tolerances, rig_toml, stated
 from validation.blind.truth import Truth
@@ -42,7 +41,9 @@ def ends(compliant):
     """Where the best starts of the screening end, as in a search."""
     model = ResidualModel(compliant)
     base = fit(model, (), (), np.zeros(model.nominal.count))
-    (space,) = [c for c in candidates(compliant) if c.effect == "joint_compliance"]
+    (space,) = [
+        c for c in compliant.machine.candidates(compliant.experiments) if c.effect == "joint_compliance"
+    ]
     starts = Screening(model, base).starts(space)[:12]
     return [
         fit(model, (space,), (s.coordinates,), model.nominal.within(s.deviations), iterations=40)
@@ -84,7 +85,7 @@ def test_a_disturbance_beside_play_is_found_from_a_fifth_off(tmp_path, seed):
         measured = machine.record(voltage).measured(rng.standard_normal((900, 2)) * machine.noise)
         records.append(Experiment(role, role, voltage, measured, "prbs"))
     case = Case("play", Rig.from_toml(tmp_path / "rig.toml"), tuple(records))
-    listed = {c.effect: c for c in candidates(case)}
+    listed = {c.effect: c for c in case.machine.candidates(case.experiments)}
     sets = [listed["backlash"], listed["periodic_disturbance"]]
     starts = [np.log([0.0295]), np.array([np.log(0.036), 0.56, 4.6])]
     end = fit(ResidualModel(case), sets, starts, np.zeros(0))

@@ -11,7 +11,6 @@ from scipy.optimize import minimize_scalar
 
 from diagnosis import ResidualModel
 from diagnosis.fit.fit import fit
-from diagnosis.machine.candidates import candidates
 from diagnosis.next_experiment.competing import rival_of_fit, rivals_of
 from diagnosis.next_experiment.discrimination import Rival
 from diagnosis.next_experiment.experiment_choices import Excitation, Limits, excitations
@@ -162,7 +161,7 @@ def test_records_sharpen_the_separation():
     model = ResidualModel(case)
     fits = []
     for name in ("input_delay", "actuator_lag"):
-        candidate = next(c for c in candidates(case) if c.effect == name)
+        candidate = next(c for c in case.machine.candidates(case.experiments) if c.effect == name)
         start = np.array([candidate.axes[0].coordinate(0.006)])
         fits.append(fit(model, (candidate,), (start,), np.zeros(0)))
     known = [rival_of_fit(case, f, 0.5) for f in fits]
@@ -180,7 +179,11 @@ def test_records_sharpen_the_separation():
 def test_sets_that_name_the_same_cause_are_no_rivals():
     residuals = white(np.random.default_rng(0))
     case = made(residuals)
-    chosen = {c.effect: c for c in candidates(case) if c.effect in ("input_delay", "actuator_lag")}
+    chosen = {
+        c.effect: c
+        for c in case.machine.candidates(case.experiments)
+        if c.effect in ("input_delay", "actuator_lag")
+    }
     start = {name: np.array([c.axes[0].coordinate(0.004)]) for name, c in chosen.items()}
 
     def fitted(*names):

@@ -181,8 +181,8 @@ PLANT = Plant(
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: replace(GOOD, input=np.ones(30)), r"input must be \(T, channels\)"),
-        (lambda: replace(GOOD, input=np.ones((31, 1))), "31 samples of input, 30 of output"),
+        (lambda: replace(GOOD, input=np.ones(30)), r"needs input \(T, U\)"),
+        (lambda: replace(GOOD, input=np.ones((31, 1))), r"got \(31, 1\) and \(30, 1\)"),
         (lambda: replace(GOOD, role="test"), "role must be"),
         (lambda: replace(GOOD, output=np.full((30, 1), np.nan)), "not finite"),
         (lambda: PlantExperiment("s", "held_out", np.ones((9, 1)), np.ones((9, 1))), "needs at least 20"),

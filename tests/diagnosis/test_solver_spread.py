@@ -11,7 +11,6 @@ from diagnosis.fit.discrepancy import Leftover
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
-from diagnosis.machine.candidates import candidates
 from plant import Rig, prbs
 from validation.blind.rigs import draw_rig, rig_toml
 from validation.blind.truth import Truth
@@ -30,7 +29,7 @@ def _near_the_truth(folder, effect, values, *, seed, off=1.0):
         measured = machine.record(voltage).measured(rng.standard_normal((900, 2)) * machine.noise)
         records.append(Experiment(role, role, voltage, measured, "prbs"))
     case = Case("drift", Rig.from_toml(file), tuple(records))
-    candidate = next(c for c in candidates(case) if c.effect == effect)
+    candidate = next(c for c in case.machine.candidates(case.experiments) if c.effect == effect)
     x = np.array([axis.coordinate(values[axis.parameter]) for axis in candidate.axes])
     model = ResidualModel(case)
     e = model.of(np.zeros(0), (candidate.effect_at(x),), case.experiments)

@@ -119,7 +119,7 @@ def test_a_trajectory_survives_its_arrays_and_is_read_only():
         Trajectory.from_arrays({**arrays, "tip_m": arrays["tip_m"][:-1]})
 
 
-@pytest.mark.parametrize("name", [n for n in EFFECTS if EFFECTS[n].dependence != "jagged"])
+@pytest.mark.parametrize("name", [n for n in EFFECTS if EFFECTS[n].dependence != "non-smooth"])
 def test_a_ten_times_finer_step_gives_the_same_record(name):
     voltage = prbs(8, 4, 2.0, 1200, np.random.default_rng(0))
     effect = parse_effect({"name": name, **EXAMPLES[name]})

@@ -16,7 +16,6 @@ from scipy.stats import chi2
 
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.residual import ResidualModel, pooled_rms
-from diagnosis.machine.candidates import candidates
 from diagnosis.machine.case import Case
 
 # A false alarm in a thousand cases without effect, if noise were all there is.
@@ -53,7 +52,7 @@ def _shares(case: Case, model: ResidualModel, base: Fit) -> dict[str, float]:
     Q = np.linalg.qr(base.jacobian[:, :P])[0] if P else np.zeros((base.residuals.size, 0))
     left = base.residuals - Q @ (Q.T @ base.residuals)
     found: dict[str, float] = {}
-    for candidate in candidates(case):
+    for candidate in case.machine.candidates(case.experiments):
         for start in candidate.starts:
             change = model.of(base.deviations, (candidate.effect_at(np.array(start)),)) - base.residuals
             change = change - Q @ (Q.T @ change)

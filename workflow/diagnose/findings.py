@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.evidence.look_alikes import IMITATED
 from workflow.diagnose.words import (
     effect_words,
     key_words,
@@ -110,7 +109,7 @@ def which_sentences(found: Diagnosis) -> list[str]:
             f"{effect_words(n)} ({probability_words(presence_of(found, n))})" for n in found.ambiguous_with
         ]
         words.append(f"It could also be {listing(others)}: these records do not rule that out.")
-        if IMITATED in found.combination and "unknown" in found.ambiguous_with:
+        if "gravity" in found.combination and "unknown" in found.ambiguous_with:
             words.append(
                 "A linear spring from hub to ground (a cable, a hose) is not on the list and pulls as "
                 "gravity does while angles are small; larger swings would tell them apart."

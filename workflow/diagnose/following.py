@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.evidence.look_alikes import IMITATED
 from diagnosis.next_experiment.discrimination import Rival
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
@@ -55,7 +54,7 @@ class Following:
 
 def following(found: Diagnosis) -> Following:
     """As long as the longest record, within the largest voltage, angle and deflection of all of them."""
-    if found.verdict == "unknown" and IMITATED not in found.ambiguous_with:
+    if found.verdict == "unknown" and "gravity" not in found.ambiguous_with:
         if found.unlisted:
             return Following(
                 (f"Look at the machine for {unlisted_words(found)}: one run without it would confirm it.",)

@@ -6,38 +6,10 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
+from plant.effects import EFFECTS, LOOK_ALIKES
 from workflow.report.formats import number
 
-_EFFECTS: Mapping[str, str] = {
-    "coulomb_friction": "dry (Coulomb) friction",
-    "stribeck_friction": "dry friction that falls with speed (Stribeck)",
-    "viscous_friction": "additional viscous friction",
-    "actuator_saturation": "saturation of the actuator",
-    "actuator_dead_zone": "a dead zone of the actuator",
-    "input_delay": "a delay of the command",
-    "actuator_gain": "a wrong gain of the actuator",
-    "tip_payload": "an additional mass at the tip",
-    "link_stiffness": "a wrong bending stiffness of the link",
-    "structural_damping": "wrong damping of the link",
-    "sensor_gain": "a wrong gain of the tip sensor",
-    "sensor_drift": "a drift of the tip sensor",
-    "quantisation": "coarse steps of the tip sensor",
-    "hub_inertia": "a wrong inertia of the hub",
-    "actuator_lag": "a lag of the actuator",
-    "torque_ripple": "torque ripple over the hub angle",
-    "periodic_disturbance": "a periodic disturbance torque",
-    "hardening_spring": "a hardening spring at the hub (cable, hose)",
-    "joint_compliance": "a compliant joint between hub and link",
-    "base_compliance": "a compliant base under the motor",
-    "backlash": "play (backlash) in the gear",
-    "gravity": "gravity in a tilted plane",
-    "sensor_lag": "a lag of the tip sensor",
-}
-_OTHERS: Mapping[str, str] = {
-    "none": "no effect at all",
-    "unknown": "a cause outside the list",
-    "ground_spring": "a linear spring from hub to ground",
-}
+_OTHERS: Mapping[str, str] = {"none": "no effect at all", "unknown": "a cause outside the list"}
 
 GROUPS: Mapping[str, str] = {
     "actuator": "actuator",
@@ -75,7 +47,8 @@ _UNITS: Mapping[str, str] = {
 
 def effect_words(name: str) -> str:
     """An effect, "none" or "unknown" in words; a user's own effect by its id without underscores."""
-    return _EFFECTS.get(name) or _OTHERS.get(name) or name.replace("_", " ")
+    known = EFFECTS.get(name) or LOOK_ALIKES.get(name)
+    return known.words if known else _OTHERS.get(name, name.replace("_", " "))
 
 
 def unit_of(parameter: str) -> str:

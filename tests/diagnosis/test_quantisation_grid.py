@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from diagnosis import Case, diagnose
-from diagnosis.machine.quantisation_grid import cell_residual, lattice_step
+from diagnosis.machine.quantisation_grid import cell_residual, grid_step
 from tests.diagnosis.recorded import recorded_case
 
 NOISE = 1e-3
@@ -30,7 +30,7 @@ def _records(rng, step):
 @pytest.mark.parametrize("step", [4e-4, 1e-3, 3.7e-3, 0.02137])
 def test_step_of_rounded_records(step):
     # Values of about 1 m written with six digits: 5e-6 over the largest multiple of the step.
-    assert lattice_step(_records(np.random.default_rng(0), step), NOISE) == pytest.approx(step, rel=1e-6)
+    assert grid_step(_records(np.random.default_rng(0), step), NOISE) == pytest.approx(step, rel=1e-6)
 
 
 @pytest.mark.parametrize("reach", [0.6, 1.4, 3.4])
@@ -39,16 +39,16 @@ def test_step_of_a_sensor_that_moves_by_a_few_steps_only(reach):
     step = 0.0707
     records = [np.round(reach * step * np.sin(rng.uniform(0, 7, 800)) / step) * step for _ in range(2)]
     assert np.unique(np.concatenate(records)).size == 2 * round(reach) + 1
-    assert lattice_step(records, NOISE) == pytest.approx(step, rel=1e-6)
+    assert grid_step(records, NOISE) == pytest.approx(step, rel=1e-6)
 
 
 def test_no_step_where_there_is_none_or_none_that_matters():
     rng = np.random.default_rng(1)
-    assert lattice_step(_records(rng, 0.0), NOISE) == 0
-    assert lattice_step(_records(rng, 2e-4), NOISE) == 0  # 0.06 of the noise
-    assert lattice_step([np.array([0.0, 0.1, 0.2])], NOISE) == 0
+    assert grid_step(_records(rng, 0.0), NOISE) == 0
+    assert grid_step(_records(rng, 2e-4), NOISE) == 0  # 0.06 of the noise
+    assert grid_step([np.array([0.0, 0.1, 0.2])], NOISE) == 0
     with pytest.raises(ValueError, match="noise"):
-        lattice_step([np.zeros(3)], 0.0)
+        grid_step([np.zeros(3)], 0.0)
 
 
 @pytest.mark.parametrize("step", [0.5, 3.0, 8.0])
