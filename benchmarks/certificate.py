@@ -21,13 +21,12 @@ frequency of the unstable draws in its own standard deviations.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
+from benchmarks.harness import Print, main
 from benchmarks.random_designs import LOW_EFFORT, RADIUS, random_case
-from benchmarks.results_file import ResultsFile
 from control_design import (
     Controller,
     Specification,
@@ -139,64 +138,54 @@ def mode_shifts(scenario: Scenario, rng: np.random.Generator, count: int) -> lis
     return [float(value) for value in (omega[np.argmax(np.abs(responses), axis=1)] - 15) / spread]
 
 
-def main() -> None:
-    """All tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--draws", type=int, default=3000)
-    parser.add_argument("--scenarios", nargs="+", choices=["A", "B", "C"], default=["A", "B", "C"])
-    arguments = parser.parse_args()
+def run(out: Print, *, draws: int = 3000, scenarios: tuple[Scenario, ...] = ("A", "B", "C")) -> None:
     controllers = {}
-    with ResultsFile("certificate", seeds="design 1, calibration 11, check 12") as out:
-        out("scenario  dense max  bound, all w  excess %  400k points  intervals  bound s  certify s")
-        for scenario in arguments.scenarios:
-            plant, specification = flexible_link(scenario), flexible_link_specification(5)
-            controller = synthesise([plant], specification, rng=np.random.default_rng(1)).controller
-            controllers[scenario] = controller
-            certificate = certify(controller, [plant], specification)
-            proof = certificate.plants[0].all_frequencies
-            brute = brute_force(controller, plant, specification)
-            if not (proof.proved and brute <= proof.gamma):
-                raise RuntimeError(f"scenario {scenario}: {brute} lies above the bound {proof.gamma}")
-            out(
-                f"{scenario:>8}  {certificate.gamma:9.4f}  {proof.gamma:12.4f}  "
-                f"{100 * (proof.gamma / certificate.gamma - 1):8.3f}  {brute:11.4f}  {proof.intervals:9d}  "
-                f"{bound_seconds(controller, plant, specification):7.3f}  "
-                f"{certify_seconds(controller, plant, specification):9.3f}"
-            )
-        plain = dict(controllers)
-        out()
-        out("designs for joint coverage (stable share asked 99.9 %):")
-        for scenario in arguments.scenarios:
-            plant, specification = flexible_link(scenario), flexible_link_specification(5)
-            design = synthesise_jointly([plant], specification, rng=np.random.default_rng(1))
-            controllers[scenario] = design.result.controller
-            gamma = certify(design.result.controller, [plant], specification).gamma
-            out(f"{scenario}: worst case {gamma:.4f}; {design.sentence()}")
-        out()
-        out(f"joint coverage asked 95 %, {arguments.draws} fresh draws (right: 95 % ellipses as given)")
+    out("scenario  dense max  bound, all w  excess %  400k points  intervals  bound s  certify s")
+    for scenario in scenarios:
+        plant, specification = flexible_link(scenario), flexible_link_specification(5)
+        controller = synthesise([plant], specification, rng=np.random.default_rng(1)).controller
+        controllers[scenario] = controller
+        certificate = certify(controller, [plant], specification)
+        proof = certificate.plants[0].all_frequencies
+        brute = brute_force(controller, plant, specification)
+        if not (proof.proved and brute <= proof.gamma):
+            raise RuntimeError(f"scenario {scenario}: {brute} lies above the bound {proof.gamma}")
         out(
-            "draws              certified  level %  holds in % stable %  worst case  holds in % in all ell. %"
+            f"{scenario:>8}  {certificate.gamma:9.4f}  {proof.gamma:12.4f}  "
+            f"{100 * (proof.gamma / certificate.gamma - 1):8.3f}  {brute:11.4f}  {proof.intervals:9d}  "
+            f"{bound_seconds(controller, plant, specification):7.3f}  "
+            f"{certify_seconds(controller, plant, specification):9.3f}"
         )
-        for scenario, controller in controllers.items():
-            plant, specification = flexible_link(scenario), flexible_link_specification(5)
-            linear = UncertainPlant("linear", plant.nominal, Linear(LinkUncertainty(scenario)))
-            out(joint_line(f"{scenario}, parameters", controller, plant, specification, arguments.draws))
-            out(joint_line(f"{scenario}, linear", controller, linear, specification, arguments.draws))
-        for seed in (0, 1, 3):
-            plant, _, specification = random_case(seed)
-            controller = synthesise(
-                [plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed)
-            ).controller
-            out(joint_line(f"posterior, case {seed}", controller, plant, specification, arguments.draws))
-        out()
-        out(f"unstable of {MANY} parameter draws")
-        out("scenario  design  ellipses reach -1 at  unstable  mode of the unstable, least / mean / largest")
-        for scenario in arguments.scenarios:
-            for name, designs in (("plain", plain), ("joint", controllers)):
-                out(unstable_line(scenario, name, designs[scenario]))
+    plain = dict(controllers)
+    out()
+    out("designs for joint coverage (stable share asked 99.9 %):")
+    for scenario in scenarios:
+        plant, specification = flexible_link(scenario), flexible_link_specification(5)
+        design = synthesise_jointly([plant], specification, rng=np.random.default_rng(1))
+        controllers[scenario] = design.result.controller
+        gamma = certify(design.result.controller, [plant], specification).gamma
+        out(f"{scenario}: worst case {gamma:.4f}; {design.sentence()}")
+    out()
+    out(f"joint coverage asked 95 %, {draws} fresh draws (right: 95 % ellipses as given)")
+    out("draws              certified  level %  holds in % stable %  worst case  holds in % in all ell. %")
+    for scenario, controller in controllers.items():
+        plant, specification = flexible_link(scenario), flexible_link_specification(5)
+        linear = UncertainPlant("linear", plant.nominal, Linear(LinkUncertainty(scenario)))
+        out(joint_line(f"{scenario}, parameters", controller, plant, specification, draws))
+        out(joint_line(f"{scenario}, linear", controller, linear, specification, draws))
+    for seed in (0, 1, 3):
+        plant, _, specification = random_case(seed)
+        controller = synthesise(
+            [plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed)
+        ).controller
+        out(joint_line(f"posterior, case {seed}", controller, plant, specification, draws))
+    out()
+    out(f"unstable of {MANY} parameter draws")
+    out("scenario  design  ellipses reach -1 at  unstable  mode of the unstable, least / mean / largest")
+    for scenario in scenarios:
+        for name, designs in (("plain", plain), ("joint", controllers)):
+            out(unstable_line(scenario, name, designs[scenario]))
 
 
 if __name__ == "__main__":
-    main()
+    main(run, seeds="design 1, calibration 11, check 12")

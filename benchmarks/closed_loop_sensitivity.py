@@ -19,7 +19,6 @@ measured should not exceed certified by more than its own scatter.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from control_design.analysis.certificate import Certificate, certify
 from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
@@ -117,7 +116,7 @@ def measured(
     )
 
 
-def same_plant(out: ResultsFile, config: RunConfig, seeds: int, folder: Path) -> list[float]:
+def same_plant(out: Print, config: RunConfig, seeds: int, folder: Path) -> list[float]:
     """The arm that was identified: several seeds of records, noise and phases, two sizes of excitation."""
     out("1. The arm that was identified, dry friction 0.02 N m; one design per seed of records and noise")
     out("   off: measured against the nominal prediction, %")
@@ -141,7 +140,7 @@ def same_plant(out: ResultsFile, config: RunConfig, seeds: int, folder: Path) ->
     return deviations
 
 
-def several_payloads(out: ResultsFile, config: RunConfig, folder: Path) -> float:
+def several_payloads(out: Print, config: RunConfig, folder: Path) -> float:
     """One controller for three identified payloads, measured on these and between."""
     plants = []
     for mass in PAYLOADS_KG:
@@ -173,7 +172,7 @@ def several_payloads(out: ResultsFile, config: RunConfig, folder: Path) -> float
     return off
 
 
-def friction(out: ResultsFile, config: RunConfig, folder: Path) -> None:
+def friction(out: Print, config: RunConfig, folder: Path) -> None:
     """The controller of seed 2006 on arms with other dry friction, by size of excitation."""
     plant = identified(altered(config), folder / "friction")
     controller, certificate = designed([plant], config)
@@ -196,27 +195,14 @@ def words(found: MeasuredSensitivity) -> str:
     return f"{value:.4f} +- {std:.4f} at {omega:5.2f}"
 
 
-def main() -> None:
+def run(out: Print, *, seeds: int = 5) -> None:
     """The three tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--trial", action="store_true", help="print only, write no results file")
-    arguments = parser.parse_args()
     config, _ = built_in_config()
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        ResultsFile(
-            "closed_loop_sensitivity",
-            seeds=f"records 2006 to {2005 + arguments.seeds}, payloads 7, friction 3",
-            write=not arguments.trial,
-        ) as out,
-    ):
-        same_plant(out, config, arguments.seeds, Path(folder))
+    with tempfile.TemporaryDirectory() as folder:
+        same_plant(out, config, seeds, Path(folder))
         several_payloads(out, config, Path(folder))
         friction(out, config, Path(folder))
 
 
 if __name__ == "__main__":
-    main()
+    main(run, seeds="{seeds} records from 2006, payloads 7, friction 3")

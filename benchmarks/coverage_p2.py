@@ -1,6 +1,6 @@
 """P2 (three modes): do 95 % ellipses hold the truth 95 % of the time, poles and order from the same data?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.coverage_p2 [--cases main,random] [--seeds 200] [--file NAME]
+    OMP_NUM_THREADS=1 python -m benchmarks.coverage_p2 [--cases main random] [--seeds 200] [--name NAME]
 
 Plants, inputs and noise: `benchmarks.p2_plants`; every run has its own input and noise, and its own plant
 where the case says so. Poles and order by identify([record]) with default options.
@@ -8,8 +8,8 @@ where the case says so. Poles and order by identify([record]) with default optio
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.harness import Print, main
 from benchmarks.p2_plants import DT_S, Run, Setting, draw
-from benchmarks.results_file import ResultsFile
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.posterior import ResponsePosterior
@@ -234,7 +234,7 @@ def verdict(ok: bool) -> str:
     return "met" if ok else "NOT MET"
 
 
-def report(out: ResultsFile, case: Case, runs: Sequence[RunOutcome]) -> None:
+def report(out: Print, case: Case, runs: Sequence[RunOutcome]) -> None:
     pairs = np.bincount([run.pairs for run in runs])
     counted = ", ".join(f"{k} x {count}" for k, count in enumerate(pairs) if count)
     out()
@@ -289,35 +289,26 @@ def report(out: ResultsFile, case: Case, runs: Sequence[RunOutcome]) -> None:
         out(text)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="coverage of 95 % ellipses on P2")
-    parser.add_argument("--cases", default=",".join(CASES), help="comma-separated; default: all")
-    parser.add_argument("--file", default="coverage_p2", help="name of the results file, without ending")
-    parser.add_argument("--seeds", type=int, default=200, help="runs per case")
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--trial", action="store_true", help="print only, leave the results file alone")
-    arguments = parser.parse_args()
-    names = arguments.cases.split(",")
-    unknown = sorted(set(names) - set(CASES))
-    if unknown:
-        parser.error(f"unknown cases {', '.join(unknown)}; choose from {', '.join(CASES)}")
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    label = f"{seeds.start} to {seeds.stop - 1}"
+def run(
+    out: Print,
+    *,
+    cases: tuple[str, ...] = tuple(CASES),
+    seeds: int = 200,
+    first_seed: int = 0,
+    processes: int = 2,
+) -> None:
+    if unknown := sorted(set(cases) - set(CASES)):
+        sys.exit(f"unknown cases {', '.join(unknown)}; choose from {', '.join(CASES)}")
     # Processes started afresh: forking after the numerical libraries have started their threads can hang.
     context = multiprocessing.get_context("spawn")
-    with (
-        ResultsFile(arguments.file, seeds=label, write=not arguments.trial) as out,
-        ProcessPoolExecutor(max(1, min(2, arguments.processes)), mp_context=context) as pool,
-    ):
-        for line in HEADER.strip().splitlines():
-            out(line)
-        for name in names:
+    with ProcessPoolExecutor(max(1, min(2, processes)), mp_context=context) as pool:
+        out(HEADER.strip())
+        for name in cases:
             # Cases without a number to reach get half the seeds.
-            some = seeds[: max(1, len(seeds) // 2)] if CASES[name].reported_only else seeds
-            runs = list(pool.map(one_run, [name] * len(some), some, chunksize=5))
-            report(out, CASES[name], runs)
+            count = max(1, seeds // 2) if CASES[name].reported_only else seeds
+            some = range(first_seed, first_seed + count)
+            report(out, CASES[name], list(pool.map(one_run, [name] * count, some, chunksize=5)))
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

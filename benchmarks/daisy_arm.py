@@ -17,17 +17,13 @@ others for the judgement, so that the model has to know the response where it wa
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, data_folder, main
 from ident import GobfModel, IdentOptions, Record, identify
 from ident.basis.functions import free_response
 from ident.basis.poles import Poles
@@ -48,7 +44,6 @@ THROUGH = 94.0
 DESCENTS = 60
 
 Model = GobfModel | PolynomialModel
-Print = Callable[[str], None]
 
 
 def percent(y: np.ndarray, error: np.ndarray) -> float:
@@ -247,50 +242,43 @@ def lines(record: Record, say: Print) -> None:
         say(f"{order:>6}{fits[0]:>16.2f}{fits[1]:>18.2f}")
 
 
-def main() -> None:
-    argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
-    folder = os.environ.get("FLEXLINK_DATA")
-    if not folder or not Path(folder).is_dir():
-        sys.exit("set FLEXLINK_DATA to the folder that holds daisy_robot_arm")
-    path = Path(folder) / "daisy_robot_arm" / "robot_arm.csv"
+def run(say: Print) -> None:
+    path = data_folder("daisy_robot_arm") / "daisy_robot_arm" / "robot_arm.csv"
     record = Record.from_csv(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
     y, u = record.output[:, 0], record.input[:, 0]
     first = record.slice(0, HALF)
-    with ResultsFile("daisy_arm", seeds="none: measured data") as say:
-        say("Fit in per cent, GOBF with order / 2 pairs and a direct term, fitted to samples 0-511")
-        head = "".join(
-            f"{name:>10}" for name in ("first", "own state", "carried", "through", "whole", "periodic")
-        )
-        say(f"order   reach own / through{head}   largest |pole|")
-        for order in ORDERS:
-            item = score(gobf(first, order), record)
-            # Both to the two decimals printed.
-            met = "met " if round(item.own_state, 2) >= REACH[order] and item.through >= THROUGH else "FAIL"
-            reach = f"{REACH[order]:.1f} / {THROUGH:.1f}"
-            say(f"{order:>5}   {reach}  {met}   {numbers(item)}   {item.radius:.5f}")
-        mirrored = percent(y[HALF:], y[HALF:] + y[:HALF])
-        say(
-            f"No model at all, the first half with its sign turned: {mirrored:.2f} (input: "
-            f"{percent(u[HALF:], u[HALF:] + u[:HALF]):.2f}). That much is in the split, whatever the model."
-        )
-        minima(record, say)
-        say("\nPeers in the same run, same half; OE and ARMAX take it to start from rest, ARX does not")
-        say(f"{'method':<30}{'order':>6}{head}   largest |pole|")
-        for name, method in PEERS.items():
-            for order in (*ORDERS, 12) if name.startswith("ARX") else ORDERS:
-                item = score(method(first, order), record)
-                say(f"{name:<30}{order:>6}{numbers(item)}   {item.radius:.5f}")
-        for order in ORDERS:
-            mean = posterior_mean_fit(record, order)
-            say(f"{'tangent posterior mean around':<30}{order:>6}{'':>10}{mean:>10.2f}")
-        say("ARX as noted with the data, free run on the second half: 73.9, 92.5, 94.9, 93.9 at 4, 6, 8, 12.")
-        say("Published: no error figure (SLICOT: MOESP/N4SID of order 4 'good enough', 6 'slightly better';")
-        say("ControlSystemIdentification.jl: order 4 on half the data, low coherence near the notches).")
-        sweeps(record, say)
-        lines(record, say)
+    say("Fit in per cent, GOBF with order / 2 pairs and a direct term, fitted to samples 0-511")
+    head = "".join(
+        f"{name:>10}" for name in ("first", "own state", "carried", "through", "whole", "periodic")
+    )
+    say(f"order   reach own / through{head}   largest |pole|")
+    for order in ORDERS:
+        item = score(gobf(first, order), record)
+        # Both to the two decimals printed.
+        met = "met " if round(item.own_state, 2) >= REACH[order] and item.through >= THROUGH else "FAIL"
+        reach = f"{REACH[order]:.1f} / {THROUGH:.1f}"
+        say(f"{order:>5}   {reach}  {met}   {numbers(item)}   {item.radius:.5f}")
+    mirrored = percent(y[HALF:], y[HALF:] + y[:HALF])
+    say(
+        f"No model at all, the first half with its sign turned: {mirrored:.2f} (input: "
+        f"{percent(u[HALF:], u[HALF:] + u[:HALF]):.2f}). That much is in the split, whatever the model."
+    )
+    minima(record, say)
+    say("\nPeers in the same run, same half; OE and ARMAX take it to start from rest, ARX does not")
+    say(f"{'method':<30}{'order':>6}{head}   largest |pole|")
+    for name, method in PEERS.items():
+        for order in (*ORDERS, 12) if name.startswith("ARX") else ORDERS:
+            item = score(method(first, order), record)
+            say(f"{name:<30}{order:>6}{numbers(item)}   {item.radius:.5f}")
+    for order in ORDERS:
+        mean = posterior_mean_fit(record, order)
+        say(f"{'tangent posterior mean around':<30}{order:>6}{'':>10}{mean:>10.2f}")
+    say("ARX as noted with the data, free run on the second half: 73.9, 92.5, 94.9, 93.9 at 4, 6, 8, 12.")
+    say("Published: no error figure (SLICOT: MOESP/N4SID of order 4 'good enough', 6 'slightly better';")
+    say("ControlSystemIdentification.jl: order 4 on half the data, low coherence near the notches).")
+    sweeps(record, say)
+    lines(record, say)
 
 
 if __name__ == "__main__":
-    main()
+    main(run, seeds="none: measured data")

@@ -2,7 +2,7 @@
 with times.
 
     OMP_NUM_THREADS=1 python -m benchmarks.ellipse_link [--orders 5 6 4 3] [--scenarios A B C] [--seed 1]
-                                                        [--jobs 1 2] [--repeat 3] [--no-write]
+                                                        [--jobs 1 2] [--repeat 3]
 
 The worst case is max(|W1 S|, |W3 K S|) over all ellipses from the certificate (its own refined grid, not the
 optimiser's). Reach beside it: the same orders by a prototype, and the exact-ellipse Youla value.
@@ -16,7 +16,6 @@ evenly dealt work.
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import time
@@ -24,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from control_design import Controller, SynthesisOptions, certify, synthesise
 from validation.example_plants import Scenario, flexible_link, flexible_link_specification
 
@@ -92,31 +91,27 @@ def time_row(scenario: Scenario, jobs: int, runs: list[Run]) -> str:
     )
 
 
-def main() -> None:
-    """Design, certify, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--orders", type=int, nargs="+", choices=[3, 4, 5, 6], default=[5, 6, 4, 3])
-    parser.add_argument("--scenarios", nargs="+", choices=list(REFERENCE), default=list(REFERENCE))
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--no-write", action="store_true")
-    arguments = parser.parse_args()
-    with ResultsFile("ellipse_link", seeds=str(arguments.seed), write=not arguments.no_write) as out:
-        out("scenario order  certified  (reach)  over youla %  stable  CPU s  certify s")
-        for scenario in arguments.scenarios:
-            for order in arguments.orders:
-                out(row(scenario, order, design(scenario, order, 1, arguments.seed)))
-        out()
-        out(f"time of an order-{TIMED_ORDER} design, smallest of {arguments.repeat}; reach in brackets")
-        out("scenario jobs  wall s (reach)  load meanwhile  free cores s  CPU s  own s  workers s")
-        for scenario in arguments.scenarios:
-            for jobs in arguments.jobs:
-                runs = [design(scenario, TIMED_ORDER, jobs, arguments.seed) for _ in range(arguments.repeat)]
-                out(time_row(scenario, jobs, runs))
+def run(
+    out: Print,
+    *,
+    orders: tuple[int, ...] = (5, 6, 4, 3),
+    scenarios: tuple[Scenario, ...] = ("A", "B", "C"),
+    seed: int = 1,
+    jobs: tuple[int, ...] = (1, 2),
+    repeat: int = 3,
+) -> None:
+    out("scenario order  certified  (reach)  over youla %  stable  CPU s  certify s")
+    for scenario in scenarios:
+        for order in orders:
+            out(row(scenario, order, design(scenario, order, 1, seed)))
+    out()
+    out(f"time of an order-{TIMED_ORDER} design, smallest of {repeat}; reach in brackets")
+    out("scenario jobs  wall s (reach)  load meanwhile  free cores s  CPU s  own s  workers s")
+    for scenario in scenarios:
+        for processes in jobs:
+            runs = [design(scenario, TIMED_ORDER, processes, seed) for _ in range(repeat)]
+            out(time_row(scenario, processes, runs))
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -1,9 +1,9 @@
 """CPU time of an order-4 fit and of its hot loop, the cost of candidate poles, beside their yardsticks.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.fit_time [--fits 50]
+    OMP_NUM_THREADS=1 python -m benchmarks.fit_time [--seeds 50]
 
 Plant P1 (one mode, double integrator, 30 dB). Fits: two real poles and a pair sought without prior
-knowledge, N = 1000, on noise seeds 0 .. FITS - 1, ours and an output-error fit (Steiglitz-McBride start,
+knowledge, N = 1000, on noise seeds 0 .. SEEDS - 1, ours and an output-error fit (Steiglitz-McBride start,
 NumPy and SciPy) taking turns. Warnings are worked out when they are asked for: the row that names them asks.
 Cost: residual sum of squares at points of the unit cube of that search, with the offset of the output as
 nuisance; "one by one" as an optimiser calls it, "together" as the search does.
@@ -13,19 +13,17 @@ without any stored code, and of the first fit of one that finds it.
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main, median_s, taking_turns
 from ident import IdentOptions, identify
 from ident.basis.coordinates import search_space
 from ident.basis.poles import Poles
@@ -36,7 +34,6 @@ from validation.comparators.comparators import oe
 
 FOURTH_ORDER = IdentOptions(n_real=2, n_pairs=1)
 FIRST_FIT = """
-import time
 from benchmarks.fit_time import FOURTH_ORDER, identify, p1
 record = p1(0).record
 begin = time.process_time()
@@ -45,37 +42,17 @@ print(time.process_time() - begin)
 """
 
 
-def median_s(call: Callable[[], object], repeats: int, at_once: int = 1) -> float:
-    """Median CPU seconds of a call, after one to warm up; `at_once` calls between readings of the clock,
-    which takes a microsecond itself."""
-    call()
-    times = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        for _ in range(at_once):
-            call()
-        times.append((time.process_time() - begin) / at_once)
-    return float(np.median(times))
-
-
-def fits(out: ResultsFile, count: int) -> None:
+def fits(out: Print, count: int) -> None:
     methods: dict[str, Callable[..., object]] = {
         "GOBF, 2 real + 1 pair": lambda record: identify([record], FOURTH_ORDER),
         "    and its warnings": lambda record: identify([record], FOURTH_ORDER).warnings,
         "GOBF, order from data": lambda record: identify([record]),
         "OE 4/4": lambda record: oe(record, 4, 4, arx_start=False),
     }
-    times: dict[str, list[float]] = {name: [] for name in methods}
-    for method in methods.values():
-        method(p1(0).record)
-    for seed in range(count):
-        record = p1(seed).record
-        for name, method in methods.items():
-            begin = time.process_time()
-            method(record)
-            times[name].append(1e3 * (time.process_time() - begin))
+    times = taking_turns(methods, [p1(seed).record for seed in range(count)])
     out(f"{'fit, N = 1000':<26}  CPU ms median   10th    90th   reach")
-    for name, each in times.items():
+    for name, seconds in times.items():
+        each = 1e3 * np.array(seconds)
         low, high = np.quantile(each, [0.1, 0.9])
         reach = "3" if "pair" in name else ""
         out(f"{name:<26}  {np.median(each):>13.2f}  {low:>5.2f}  {high:>6.2f}   {reach:>5}")
@@ -115,7 +92,7 @@ def lfilter_and_lstsq(n_samples: int) -> Callable[[], object]:
     return call
 
 
-def costs(out: ResultsFile) -> None:
+def costs(out: Print) -> None:
     out(f"{'cost, n = 4':<26}  us per candidate                      together")
     out(f"{'N':<26}  one by one  together  lfilter+lstsq  ns per sample  peak memory MB")
     out(f"{'reach (N = 1000)':<26}  {'12':>10}  {'4':>8}  {'':>13}  {'constant':>13}  {'2000':>14}")
@@ -135,7 +112,7 @@ def costs(out: ResultsFile) -> None:
     out()
 
 
-def searches(out: ResultsFile) -> None:
+def searches(out: Print) -> None:
     evaluations = FOURTH_ORDER.evaluations
     cost, _ = cost_of(1000)
     out(f"{f'DIRECT-L, {evaluations} evaluations':<26}  CPU ms")
@@ -145,7 +122,7 @@ def searches(out: ResultsFile) -> None:
     out()
 
 
-def compiling(out: ResultsFile) -> None:
+def compiling(out: Print) -> None:
     with tempfile.TemporaryDirectory() as directory:
         environment = {**os.environ, "NUMBA_CACHE_DIR": directory}
         out(f"{'first fit of a process':<26}  CPU s")
@@ -156,18 +133,12 @@ def compiling(out: ResultsFile) -> None:
             out(f"{name:<26}  {float(run.stdout):>5.2f}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--fits", type=int, default=50, help="noise seeds 0 .. FITS - 1 of the fits")
-    count = parser.parse_args().fits
-    with ResultsFile("fit_time", seeds=f"0 to {count - 1}", write=count >= 50) as out:
-        fits(out, count)
-        costs(out)
-        searches(out)
-        compiling(out)
+def run(out: Print, *, seeds: int = 50) -> None:
+    fits(out, seeds)
+    costs(out)
+    searches(out)
+    compiling(out)
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -12,23 +12,19 @@ covariances; every structure fitted to one date and judged on the other.
 
 from __future__ import annotations
 
-import argparse
-import os
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, data_folder, main
 from ident import IdentOptions
 from ident.data.frf_records import FrfRepeats
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
 
-Print = Callable[[str], None]
 OMEGA = np.geomspace(0.5, 300, 120)
 GRID = np.geomspace(0.5, 300, 200)
 BANDS = (
@@ -209,22 +205,14 @@ def cell(chi: float, criterion: float | None, errors: list[float], note: str = "
     return f"{note} {chi:.0f}{judged} {100 * errors[0]:.1f} / {100 * errors[1]:.1f} %"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def run(say: Print, *, seeds: int = 100) -> None:
+    known_plant(seeds, say)
+    points = FrfRepeats.from_csv(
+        data_folder("quanser_rfl_frf") / "quanser_rfl_frf" / "frf_repeats.csv", label="date"
     )
-    parser.add_argument("--seeds", type=int, default=100, help="noise seeds 0 .. SEEDS - 1")
-    seeds = parser.parse_args().seeds
-    folder = os.environ.get("FLEXLINK_DATA")
-    with ResultsFile("frequency_fit", seeds=f"0 to {seeds - 1}", write=seeds >= 100) as say:
-        known_plant(seeds, say)
-        if folder is None:
-            say("\nKyoto arm: no data (set FLEXLINK_DATA)")
-            return
-        points = FrfRepeats.from_csv(Path(folder) / "quanser_rfl_frf" / "frf_repeats.csv", label="date")
-        plant = points.open_loop(1.0, 1.65)
-        orders(plant, (plant.labels[0], plant.labels[2]), say)
+    plant = points.open_loop(1.0, 1.65)
+    orders(plant, (plant.labels[0], plant.labels[2]), say)
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -10,7 +10,6 @@ diagnoses the 15 labelled cases twice, with the exact and with the uncertain rig
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -18,9 +17,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from validation.blind.report import scores_text
 from validation.blind.score import score
+from workflow.engine.errors import EXIT_NOT_CERTIFIED, EXIT_OK
 from workflow.engine.storage import read_json
 
 LABELLED = Path(os.environ.get("FLEXLINK_GAP", Path(__file__).parents[2] / "shared" / "gap")) / "labelled"
@@ -36,12 +36,11 @@ def diagnose(cases: Sequence[Path], rig: str, out: Path, jobs: int) -> None:
         stdout=subprocess.DEVNULL,
         check=False,
     )
-    # 1: finished, and some answer is not certain.
-    if done.returncode not in (0, 1):
+    if done.returncode not in (EXIT_OK, EXIT_NOT_CERTIFIED):  # the second: some answer is not certain
         raise SystemExit(f"flexlink diagnose ended with {done.returncode}")
 
 
-def tell(out: ResultsFile, diagnosis: Path, cases: Path) -> None:
+def tell(out: Print, diagnosis: Path, cases: Path) -> None:
     """A line a case, then the scores."""
     timings = read_json(diagnosis / "timings.json")
     for path in sorted(diagnosis.glob("*.json")):
@@ -59,33 +58,23 @@ def tell(out: ResultsFile, diagnosis: Path, cases: Path) -> None:
     if missing:
         raise SystemExit(f"no diagnosis of {', '.join(missing)}")
     out()
-    for line in scores_text(scored).splitlines():
-        out(line)
+    out(scores_text(scored).rstrip("\n"))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--cases", type=Path, default=LABELLED, help="folder of case folders with answer.toml"
-    )
-    parser.add_argument("--name", default="gap_diagnosis", help="results file")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--keep", type=Path, help="keep documents and pages here")
-    given = parser.parse_args()
-    folders = sorted(path for path in given.cases.iterdir() if (path / "answer.toml").is_file())
+def run(out: Print, *, cases: Path = LABELLED, jobs: int = 2, keep: str = "") -> None:
+    """keep: directory for documents and pages, which are thrown away without it."""
+    folders = sorted(path for path in cases.iterdir() if (path / "answer.toml").is_file())
     if not folders:
-        parser.exit(2, f"{given.cases}: no case folders with answer.toml\n")
-    rigs = (
-        ["rig.toml", "rig_uncertain.toml"] if (folders[0] / "rig_uncertain.toml").is_file() else ["rig.toml"]
-    )
-    with tempfile.TemporaryDirectory() as room, ResultsFile(given.name, seeds="of the cases") as out:
+        sys.exit(f"{cases}: no case folders with answer.toml")
+    rigs = [name for name in ("rig.toml", "rig_uncertain.toml") if (folders[0] / name).is_file()]
+    with tempfile.TemporaryDirectory() as room:
         for rig in rigs:
-            where = (given.keep or Path(room)) / rig.removesuffix(".toml")
-            diagnose(folders, rig, where, given.jobs)
+            where = Path(keep or room) / rig.removesuffix(".toml")
+            diagnose(folders, rig, where, jobs)
             out()
             out(f"rig file: {rig}")
-            tell(out, where, given.cases)
+            tell(out, where, cases)
 
 
 if __name__ == "__main__":
-    main()
+    main(run, seeds="of the cases")

@@ -1,6 +1,6 @@
 """P1 with its structure known (relative degree 2, integrators), and the tests that the data put to it.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.known_structure_p1 [--seeds 50] [--try]
+    OMP_NUM_THREADS=1 python -m benchmarks.known_structure_p1 [--seeds 50]
 
 First the models: ours with the structure tested and kept, beside ours and the peers without it and the peer
 that can be told of the integrators (output error on the summed input). Then the variant with friction,
@@ -10,16 +10,15 @@ what the tests said. Measures and Cramer-Rao bounds: `benchmarks.p1_measures`.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from benchmarks.harness import Print, main
 from benchmarks.identification_p1 import PEERS, REACH_HEADER, Fit, ours, quantile, reach_line
 from benchmarks.p1_measures import FRICTION, HEADER, PLAIN, Score, Variant, bounds, row, score
-from benchmarks.results_file import ResultsFile
 from ident import IdentOptions, Record, identify
 from ident.basis.structure import filter_input
 from tests.ident.benchmark_plants import DT_S, Truth
@@ -72,7 +71,7 @@ def methods(integrators: int) -> dict[str, Fit]:
     }
 
 
-def compared(out: ResultsFile, variant: Variant, truths: Sequence[Truth], integrators: int) -> list[Score]:
+def compared(out: Print, variant: Variant, truths: Sequence[Truth], integrators: int) -> list[Score]:
     """Table of one variant; the scores of our fit with the structure known."""
     out(f"P1, {variant.name}")
     for line in HEADER.splitlines():
@@ -99,60 +98,50 @@ def refusals(variant: Variant, truths: Sequence[Truth], **settings: Any) -> dict
     return counts
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=50, help="noise seeds 0 .. SEEDS - 1")
-    parser.add_argument("--try", action="store_true", dest="trial", help="do not write the results file")
-    arguments = parser.parse_args()
-    seeds = arguments.seeds
+def run(out: Print, *, seeds: int = 50) -> None:
     plain = [PLAIN.truth(seed) for seed in range(seeds)]
     friction = [FRICTION.truth(seed) for seed in range(seeds)]
-    with ResultsFile("known_structure_p1", seeds=f"0 to {seeds - 1}", write=not arguments.trial) as out:
-        out(
-            "Published for the best peer, output error: 0.89 / 2.1, NRMSE 0.011. The bounds hold for unbiased"
+    out("Published for the best peer, output error: 0.89 / 2.1, NRMSE 0.011. The bounds hold for unbiased")
+    out("fits; one that keeps all poles inside the unit circle knows more and can lie below them.")
+    out()
+    best = compared(out, PLAIN, plain, 2)
+    compared(out, FRICTION, friction, 1)
+    out(REACH_HEADER)
+    error = quantile(best, "whole", 0.5), quantile(best, "whole", 0.9)
+    out(
+        reach_line(
+            "known: RMS relative error 0.1-600 rad/s, median / 90th",
+            "0.013 / 0.025",
+            f"{error[0]:.4f} / {error[1]:.4f}",
+            error[0] <= 0.013 and error[1] <= 0.025,
         )
-        out("fits; one that keeps all poles inside the unit circle knows more and can lie below them.")
-        out()
-        best = compared(out, PLAIN, plain, 2)
-        compared(out, FRICTION, friction, 1)
-        out(REACH_HEADER)
-        error = quantile(best, "whole", 0.5), quantile(best, "whole", 0.9)
-        out(
-            reach_line(
-                "known: RMS relative error 0.1-600 rad/s, median / 90th",
-                "0.013 / 0.025",
-                f"{error[0]:.4f} / {error[1]:.4f}",
-                error[0] <= 0.013 and error[1] <= 0.025,
-            )
-        )
-        nrmse = quantile(best, "nrmse", 0.5)
-        out(reach_line("known: validation NRMSE, median", "0.005", f"{nrmse:.4f}", nrmse <= 0.005))
-        most = int(0.05 * seeds)
-        both = {"integrators", "relative_degree"}
-        orders = {"n_real": 0, "n_pairs": 1}
-        trials: list[tuple[Variant, list[Truth], dict[str, int], set[str]]] = [
-            (PLAIN, plain, {"integrators": 2, "relative_degree": 2}, both),
-            (PLAIN, plain, {"integrators": 2, "relative_degree": 3}, {"integrators"}),
-            (FRICTION, friction, {"integrators": 1, "relative_degree": 2}, both),
-            (FRICTION, friction, {"integrators": 2}, set()),
-            (FRICTION, friction, {"integrators": 2} | orders, set()),
-        ]
-        for variant, truths, settings, true in trials:
-            asked = ", ".join(f"{key} {value}" for key, value in settings.items())
-            out(f"{variant.name}, asked: {asked}")
-            for prior, count in refusals(variant, truths, **settings).items():
-                holds = prior.split()[0] in true
-                out(
-                    reach_line(
-                        f"    {prior} ({'true' if holds else 'wrong'}) refused",
-                        f"<= {most}/{seeds}" if holds else f"{seeds}/{seeds}",
-                        f"{count}/{seeds}",
-                        count <= most if holds else count == seeds,
-                    )
+    )
+    nrmse = quantile(best, "nrmse", 0.5)
+    out(reach_line("known: validation NRMSE, median", "0.005", f"{nrmse:.4f}", nrmse <= 0.005))
+    most = int(0.05 * seeds)
+    both = {"integrators", "relative_degree"}
+    orders = {"n_real": 0, "n_pairs": 1}
+    trials: list[tuple[Variant, list[Truth], dict[str, int], set[str]]] = [
+        (PLAIN, plain, {"integrators": 2, "relative_degree": 2}, both),
+        (PLAIN, plain, {"integrators": 2, "relative_degree": 3}, {"integrators"}),
+        (FRICTION, friction, {"integrators": 1, "relative_degree": 2}, both),
+        (FRICTION, friction, {"integrators": 2}, set()),
+        (FRICTION, friction, {"integrators": 2} | orders, set()),
+    ]
+    for variant, truths, settings, true in trials:
+        asked = ", ".join(f"{key} {value}" for key, value in settings.items())
+        out(f"{variant.name}, asked: {asked}")
+        for prior, count in refusals(variant, truths, **settings).items():
+            holds = prior.split()[0] in true
+            out(
+                reach_line(
+                    f"    {prior} ({'true' if holds else 'wrong'}) refused",
+                    f"<= {most}/{seeds}" if holds else f"{seeds}/{seeds}",
+                    f"{count}/{seeds}",
+                    count <= most if holds else count == seeds,
                 )
+            )
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

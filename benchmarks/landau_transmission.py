@@ -1,7 +1,7 @@
 """Landau's flexible transmission, three loads: the published score, then the smallest margin over the
 specification.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.landau_transmission [--seed 1] [--no-write]
+    OMP_NUM_THREADS=1 python -m benchmarks.landau_transmission [--seed 1]
 
 Six free parameters. First our synthesis for the three loads at once from the frequency-domain items (order 3
 with integrator: six parameters), then a direct search from its controller, because four items are read off
@@ -11,15 +11,14 @@ parameters.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import control
 import numpy as np
 
+from benchmarks.harness import Print, main
 from benchmarks.landau_score import ITEMS, LOADS, TS_S, Law, all_values, margins, score
 from benchmarks.landau_search import law_of, search
-from benchmarks.results_file import ResultsFile
 from control_design import Specification, SynthesisOptions, UncertainPlant, synthesise
 
 SPECIFICATION = Specification(
@@ -78,7 +77,7 @@ def synthesised(seed: int) -> tuple[np.ndarray, float]:
     return np.concatenate([s, inner[1:]]), result.gamma
 
 
-def table(out: ResultsFile, law: Law) -> None:
+def table(out: Print, law: Law) -> None:
     found = all_values(law)
     assert found is not None
     smallest = margins(law)
@@ -90,45 +89,38 @@ def table(out: ResultsFile, law: Law) -> None:
     out(f"  S = {np.round(law.S, 7).tolist()}, T = S(1) = {law.T[0]:.7f}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def run(out: Print, *, seed: int = 1) -> None:
+    begin = time.process_time()
+    start, gamma = synthesised(seed)
+    designed = time.process_time()
+    x = search(start, 4, np.random.default_rng(seed), generations=150)
+    done = time.process_time()
+    law = law_of(x, 4)
+    out("Reach: 100/100 with at most 6 free parameters in at most 10 s.")
+    out(
+        f"synthesis, order 3: gamma {gamma:.3f}, score {score(law_of(start, 4)):.1f}, "
+        f"{designed - begin:.1f} s CPU; with the direct search: score {score(law):.1f}, "
+        f"6 parameters, {done - begin:.1f} s CPU in all"
     )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--no-write", action="store_true")
-    arguments = parser.parse_args()
-    with ResultsFile("landau_transmission", seeds=str(arguments.seed), write=not arguments.no_write) as out:
+    table(out, law)
+    out()
+    out("Largest smallest margin over the specification (share of each limit), 6 free parameters:")
+    best: tuple[float, Law] | None = None
+    for (s_free, r_free), first in SPLITS.items():
         begin = time.process_time()
-        start, gamma = synthesised(arguments.seed)
-        designed = time.process_time()
-        x = search(start, 4, np.random.default_rng(arguments.seed), generations=150)
-        done = time.process_time()
-        law = law_of(x, 4)
-        out("Reach: 100/100 with at most 6 free parameters in at most 10 s.")
+        x = search(first, s_free, np.random.default_rng(seed), generations=1500)
+        law = law_of(x, s_free)
+        least = min(margins(law).values())
         out(
-            f"synthesis, order 3: gamma {gamma:.3f}, score {score(law_of(start, 4)):.1f}, "
-            f"{designed - begin:.1f} s CPU; with the direct search: score {score(law):.1f}, "
-            f"6 parameters, {done - begin:.1f} s CPU in all"
+            f"  {s_free} in S, {r_free} in R: score {score(law):.1f}, smallest margin "
+            f"{100 * least:.2f} %, {time.process_time() - begin:.1f} s CPU"
         )
-        table(out, law)
-        out()
-        out("Largest smallest margin over the specification (share of each limit), 6 free parameters:")
-        best: tuple[float, Law] | None = None
-        for (s_free, r_free), first in SPLITS.items():
-            begin = time.process_time()
-            x = search(first, s_free, np.random.default_rng(arguments.seed), generations=1500)
-            law = law_of(x, s_free)
-            least = min(margins(law).values())
-            out(
-                f"  {s_free} in S, {r_free} in R: score {score(law):.1f}, smallest margin "
-                f"{100 * least:.2f} %, {time.process_time() - begin:.1f} s CPU"
-            )
-            if best is None or least > best[0]:
-                best = least, law
-        assert best is not None
-        out("best of them:")
-        table(out, best[1])
+        if best is None or least > best[0]:
+            best = least, law
+    assert best is not None
+    out("best of them:")
+    table(out, best[1])
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -1,7 +1,6 @@
 """What damping of the flexible mode costs: the published link at order 6 with W4, a weight on G S.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.mode_damping [--part exact A B A-damped B-damped] [--ratios ...]
-    OMP_NUM_THREADS=1 python -m benchmarks.mode_damping --summary
+    OMP_NUM_THREADS=1 python -m benchmarks.mode_damping [--parts exact A B A-damped B-damped] [--ratios ...]
 
 W1 and W3 as published, W4 = 1/(r max|G|) on G S within a factor 1.5 of the mode; r runs. Cost: largest
 max(|W1 S|, |W3 K S|), without ellipses and as the worst case over the ellipses of scenarios A and B (from the
@@ -15,21 +14,18 @@ then rings in its stead: |G S| is small, a pole in the band is not damped. Youla
 `youla_bracket`, none below the first, the second reached by some controller of any order (W4 enters it by the
 largest |G| of the ellipse, on the safe side, so fixed orders may lie below it).
 
-Every part is a results file of its own; --summary compares and draws those that are there.
-
 Reference: full-order `hinfsyn` with the same plant and weights, as published: it is not run here, because
 it needs slycot, which pip does not install without a Fortran compiler.
 """
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 
 import control
 import numpy as np
 
-from benchmarks.results_file import RESULTS, ResultsFile
+from benchmarks.harness import RESULTS, Print, main
 from control_design import (
     Controller,
     Specification,
@@ -43,7 +39,7 @@ from validation.example_plants import flexible_link, flexible_link_specification
 
 ORDER = 6
 PUBLISHED = ((0.015, 0.965), (0.028, 1.137), (0.050, 1.40))  # damping, max(|W1 S|, |W3 K S|)
-RATIOS: tuple[float | None, ...] = (None, 0.9, 0.7, 0.5, 0.3, 0.15)
+RATIOS = (0.9, 0.7, 0.5, 0.3, 0.15)
 NAMES = {
     "exact": "no ellipses",
     "A": "ellipses A",
@@ -54,6 +50,14 @@ NAMES = {
 CONTROLLER_DAMPING = 0.3
 OPTIONS = SynthesisOptions(starts=2)
 BAND = (10.0, 22.5)
+READING = f"""
+Over the ellipses of B the weight W4 is met without damping the pole: the controller puts a
+lightly damped pole pair of its own beside the mode, nearly cancelled by its zeros; |G S| is
+small on every ellipse while one closed-loop pole stays about as it was. W4 asks no more. The
+search did not fail in gamma: it lies below what the Youla step is known to reach with W4; the
+lower bound is too loose to show it the least. With the controller's own poles damped
+({CONTROLLER_DAMPING} or more) those of the loop are too: row 'controller damped' is the price.
+"""
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Point:
     stable: bool
 
     def line(self, part: str) -> str:
-        """As in the results file; `read` is the inverse."""
+        """As in the results file."""
         name = "none" if self.ratio is None else f"{self.ratio:.2f}"
         return (
             f"{part:9s}  {name:4s}  {self.cost:6.4f}  {self.gamma:6.4f}  {self.nearest:7.4f}  "
@@ -152,22 +156,6 @@ def design(part: str, ratio: float | None, seed: int) -> Point:
     )
 
 
-def read(part: str) -> list[Point]:
-    """Points of a part's results file; none where there is no file."""
-    path = RESULTS / f"{file_name(part)}.txt"
-    points = []
-    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
-        cells = line.split()
-        if cells and cells[0] == part:
-            ratio = None if cells[1] == "none" else float(cells[1])
-            points.append(Point(ratio, *(float(cell) for cell in cells[2:10]), cells[10] == "True"))
-    return points
-
-
-def file_name(part: str) -> str:
-    return f"mode_damping_{part.replace('-', '_')}"
-
-
 def draw(curves: dict[str, list[Point]]) -> None:
     """Cost over damping as benchmarks/results/mode_damping.png."""
     import matplotlib
@@ -217,84 +205,58 @@ def pareto(points: list[Point]) -> list[Point]:
     return sorted(kept, key=lambda p: p.least)
 
 
-def main() -> None:
-    """Run the parts asked for, or compare and draw those that are there."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--part", nargs="+", choices=list(NAMES), default=list(NAMES))
-    parser.add_argument("--ratios", type=float, nargs="+", default=None)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--summary", action="store_true")
-    parser.add_argument("--no-write", action="store_true")
-    arguments = parser.parse_args()
-    if arguments.summary:
-        curves = {part: points for part in NAMES if (points := read(part))}
-        draw(curves)
-        summarise(curves, arguments.seed)
-        return
-    ratios = RATIOS if arguments.ratios is None else tuple(arguments.ratios)
-    for part in arguments.part:
-        measure(part, ratios, arguments.seed, write=not arguments.no_write)
-
-
-def summarise(curves: dict[str, list[Point]], seed: int) -> None:
+def summarise(out: Print, curves: dict[str, list[Point]]) -> None:
     """Least cost of a damping over all parts, whose pole is the least damped one, distance from Youla."""
-    with ResultsFile("mode_damping", seeds=str(seed)) as out:
-        out("least cost max(|W1 S|, |W3 K S|) of order 6 with at least the damping (nearest and least pole)")
-        names = "  ".join(f"{zeta:>7.3f}" for zeta, _ in PUBLISHED)
-        out(f"{'damping':30s}  {names}")
-        out(f"{'hinfsyn, full order (reach)':30s}  " + "  ".join(f"{cost:7.3f}" for _, cost in PUBLISHED))
-        for part, points in curves.items():
-            costs = [
-                min((p.cost for p in points if p.stable and min(p.least, p.nearest) >= zeta), default=np.inf)
-                for zeta, _ in PUBLISHED
-            ]
-            told = "  ".join(f"{cost:7.4f}" if np.isfinite(cost) else "      -" for cost in costs)
-            out(f"{NAMES[part]:30s}  {told}")
-        out()
-        out("gamma with W4 against the Youla values (none goes below the first, the second is reached),")
-        out("and the least damped pole pair of the controller itself where it is best damped:")
-        for part, points in curves.items():
-            weighted = [p for p in points if p.ratio is not None]
-            floor = max(100 * (p.gamma / p.floor - 1) for p in weighted)
-            over = max(100 * (p.gamma / p.reachable - 1) for p in weighted)
-            ringing = max(p.own for p in weighted)
-            out(f"{NAMES[part]:30s}  at most {floor:5.1f} % and {over:5.1f} % above;  {ringing:.3f}")
-        out()
-        out("Over the ellipses of B the weight W4 is met without damping the pole: the controller puts a")
-        out("lightly damped pole pair of its own beside the mode, nearly cancelled by its zeros; |G S| is")
-        out("small on every ellipse while one closed-loop pole stays about as it was. W4 asks no more. The")
-        out("search did not fail in gamma: it lies below what the Youla step is known to reach with W4; the")
-        out("lower bound is too loose to show it the least. With the controller's own poles damped")
-        out(
-            f"({CONTROLLER_DAMPING} or more) those of the loop are too: row 'controller damped' is the price."
-        )
+    out("least cost max(|W1 S|, |W3 K S|) of order 6 with at least the damping (nearest and least pole)")
+    names = "  ".join(f"{zeta:>7.3f}" for zeta, _ in PUBLISHED)
+    out(f"{'damping':30s}  {names}")
+    out(f"{'hinfsyn, full order (reach)':30s}  " + "  ".join(f"{cost:7.3f}" for _, cost in PUBLISHED))
+    for part, points in curves.items():
+        costs = [
+            min((p.cost for p in points if p.stable and min(p.least, p.nearest) >= zeta), default=np.inf)
+            for zeta, _ in PUBLISHED
+        ]
+        told = "  ".join(f"{cost:7.4f}" if np.isfinite(cost) else "      -" for cost in costs)
+        out(f"{NAMES[part]:30s}  {told}")
+    out()
+    out("gamma with W4 against the Youla values (none goes below the first, the second is reached),")
+    out("and the least damped pole pair of the controller itself where it is best damped:")
+    for part, points in curves.items():
+        weighted = [p for p in points if p.ratio is not None]
+        floor = max(100 * (p.gamma / p.floor - 1) for p in weighted)
+        over = max(100 * (p.gamma / p.reachable - 1) for p in weighted)
+        ringing = max(p.own for p in weighted)
+        out(f"{NAMES[part]:30s}  at most {floor:5.1f} % and {over:5.1f} % above;  {ringing:.3f}")
+    out()
+    out(READING.strip())
 
 
-def measure(part: str, ratios: tuple[float | None, ...], seed: int, *, write: bool) -> None:
-    """One part into its file."""
-    with ResultsFile(file_name(part), seeds=str(seed), write=write) as out:
-        out(f"{NAMES[part]}: cost = largest max(|W1 S|, |W3 K S|); gamma = with |W4 G S| as well")
-        out("damping of closed-loop poles: nearest 15 rad/s, least in 10..22.5 rad/s and its frequency;")
-        out("least of the controller's own poles within 5..45 rad/s; Youla values of gamma")
-        out(
-            "part       r     cost    gamma   nearest   least  at rad/s  controller  none under  reachable"
-            "  stable"
-        )
-        points = []
-        for ratio in ratios:
-            points.append(design(part, ratio, seed))
-            out(points[-1].line(part))
-        if part == "exact":
-            out()
-            out("against full-order hinfsyn:")
-            out("damping  hinfsyn cost (reach)  our least cost with that damping or more (measured)  reached")
-            for wanted, reach in PUBLISHED:
-                costs = [p.cost for p in points if p.stable and min(p.least, p.nearest) >= wanted]
-                cost = min(costs, default=np.inf)
-                out(f"{wanted:7.3f}  {reach:20.3f}  {cost:52.4f}  {cost <= reach!s:>7}")
+def measure(out: Print, part: str, ratios: tuple[float, ...], seed: int) -> list[Point]:
+    """Table of one part."""
+    out(f"{NAMES[part]}: cost = largest max(|W1 S|, |W3 K S|); gamma = with |W4 G S| as well")
+    out("damping of closed-loop poles: nearest 15 rad/s, least in 10..22.5 rad/s and its frequency;")
+    out("least of the controller's own poles within 5..45 rad/s; Youla values of gamma")
+    out(
+        "part       r     cost    gamma   nearest   least  at rad/s  controller  none under  reachable"
+        "  stable"
+    )
+    points = []
+    for ratio in (None, *ratios):
+        points.append(design(part, ratio, seed))
+        out(points[-1].line(part))
+    out()
+    return points
+
+
+def run(
+    out: Print, *, parts: tuple[str, ...] = tuple(NAMES), ratios: tuple[float, ...] = RATIOS, seed: int = 1
+) -> None:
+    """Every part, then all compared and drawn."""
+    curves = {part: measure(out, part, ratios, seed) for part in parts}
+    summarise(out, curves)
+    if set(parts) == set(NAMES):
+        draw(curves)
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

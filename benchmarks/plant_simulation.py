@@ -1,17 +1,15 @@
 """How long the plant takes: a 6 s record at 5 ms per effect, and one step of a closed loop.
 
-Run as `python benchmarks/plant_simulation.py`; one thread. The first call of a fresh machine also compiles
-the stepper.
+    OMP_NUM_THREADS=1 python -m benchmarks.plant_simulation
+
+CPU time, medians. The first call of a fresh machine also compiles the stepper.
 """
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable
-
 import numpy as np
 
+from benchmarks.harness import Print, main, median_s, timed
 from plant import EFFECTS, Rig, SampledArm, paper_link, parse_effects, prbs, simulate
 from plant.effects import Effect
 
@@ -29,18 +27,8 @@ SIZES: dict[str, dict[str, float]] = {
 }
 
 
-def median_of(repeats: int, work: Callable[[], object]) -> float:
-    """Median wall time in seconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
-
-
 def step_time_s(rig: Rig, effects: tuple[Effect, ...], voltage: np.ndarray, measure: bool) -> float:
-    """Wall time per sample of a loop that advances the arm, and measures it if asked to."""
+    """CPU time per sample of a loop that advances the arm, and measures it if asked to."""
     arm = SampledArm(rig, effects, np.random.default_rng(0))
 
     def loop() -> None:
@@ -49,28 +37,28 @@ def step_time_s(rig: Rig, effects: tuple[Effect, ...], voltage: np.ndarray, meas
                 arm.measure()
             arm.advance(value)
 
-    return median_of(3, loop) / voltage.size
+    return median_s(loop, 3) / voltage.size
 
 
-def main() -> None:
+def run(out: Print, *, seed: int = 0) -> None:
     rig = paper_link()
-    voltage = prbs(10, 4, 2.0, 1200, np.random.default_rng(0))
-    start = time.perf_counter()
-    simulate(rig, voltage)
-    print(f"first call (compiles, or loads what was compiled): {time.perf_counter() - start:.2f} s")
+    voltage = prbs(10, 4, 2.0, 1200, np.random.default_rng(seed))
+    first = timed(lambda: simulate(rig, voltage))[1]
+    out(f"first call (compiles, or loads what was compiled): {first:.2f} s")
     cases: dict[str, tuple[Effect, ...]] = {"nominal": ()}
     for name, size in SIZES.items():
         assert name in EFFECTS
         cases[name] = parse_effects([{"name": name, **size}])
-    print(f"{'6 s record at 5 ms':28s} {'ms':>8s}")
+    out(f"{'6 s record at 5 ms':28s} {'ms':>8s}")
     for name, effects in cases.items():
-        print(f"{name:28s} {1e3 * median_of(9, lambda e=effects: simulate(rig, voltage, e)):8.2f}")
-    print(f"{'closed-loop step':28s} {'us':>8s}")
+        seconds = median_s(lambda e=effects: simulate(rig, voltage, e), 9)
+        out(f"{name:28s} {1e3 * seconds:8.2f}")
+    out(f"{'closed-loop step':28s} {'us':>8s}")
     for name in ("nominal", "coulomb_friction"):
         for measure in (False, True):
             label = f"{name}, {'measure and advance' if measure else 'advance'}"
-            print(f"{label:40s} {1e6 * step_time_s(rig, cases[name], voltage, measure):8.2f}")
+            out(f"{label:40s} {1e6 * step_time_s(rig, cases[name], voltage, measure):8.2f}")
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -11,12 +11,11 @@ descents. CPU time after a warm-up search.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from ident import IdentOptions
 from ident.fit.regression import Regression, prepare
 from ident.search.pole_search import PoleSearch
@@ -42,12 +41,7 @@ def search(data: Regression, options: IdentOptions, rescan: bool) -> tuple[float
     return end.rss, poles.evaluations, time.process_time() - begin
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=50, help="noise and input seeds 0 .. SEEDS - 1")
-    seeds = parser.parse_args().seeds
+def run(out: Print, *, seeds: int = 50) -> None:
     plain = IdentOptions(estimate_offset=False, estimate_initial_state=False)
     data = [prepare([p2(seed).record], plain.structure()) for seed in range(seeds)]
     found: dict[str, list[tuple[float, int, float]]] = {}
@@ -56,18 +50,17 @@ def main() -> None:
         search(data[0], options, name != NO_RESCAN)
         found[name] = [search(each, options, name != NO_RESCAN) for each in data]
     best = np.min([[rss for rss, *_ in results] for results in found.values()], axis=0)
-    with ResultsFile("pole_search_p2", seeds=f"0 to {seeds - 1}", write=seeds >= 50) as out:
-        out(f"{'':<26}  within 0.2 %   evaluations       CPU ms")
-        out(f"{'search':<26}  of the best    median   most   median    most")
-        out(f"{'reach':<26}  >= 96 %                <= 2000          < 1000")
-        for name in ROWS:
-            rss, evaluations, cpu = (np.array(column) for column in zip(*found[name], strict=True))
-            hits = int(np.sum(rss <= 1.002 * best))
-            out(
-                f"{name:<26}  {hits:>3}/{seeds} {hits / seeds:>6.0%}  {np.median(evaluations):>7.0f} "
-                f"{evaluations.max():>6}  {1e3 * np.median(cpu):>7.1f} {1e3 * cpu.max():>7.1f}"
-            )
+    out(f"{'':<26}  within 0.2 %   evaluations       CPU ms")
+    out(f"{'search':<26}  of the best    median   most   median    most")
+    out(f"{'reach':<26}  >= 96 %                <= 2000          < 1000")
+    for name in ROWS:
+        rss, evaluations, cpu = (np.array(column) for column in zip(*found[name], strict=True))
+        hits = int(np.sum(rss <= 1.002 * best))
+        out(
+            f"{name:<26}  {hits:>3}/{seeds} {hits / seeds:>6.0%}  {np.median(evaluations):>7.0f} "
+            f"{evaluations.max():>6}  {1e3 * np.median(cpu):>7.1f} {1e3 * cpu.max():>7.1f}"
+        )
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

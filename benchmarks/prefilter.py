@@ -1,7 +1,7 @@
 """Two degrees of freedom on the flexible link, scenario B: worst-case model-matching error with and without
 prefilter.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.prefilter [--seed 1] [--no-write]
+    OMP_NUM_THREADS=1 python -m benchmarks.prefilter [--seed 1]
 
 Feedback: our order-5 design. Model T_ref = 1/(s/2 + 1)^2, W = 1. 'members' evaluates the error once more by
 python-control on 720 members of the boundary of every ellipse at 1500 frequencies of its own.
@@ -9,13 +9,12 @@ python-control on 720 members of the boundary of every ellipse at 1500 frequenci
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import control
 import numpy as np
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from control_design import certify, synthesise
 from control_design.convex.reference_filter import Prefilter, PrefilterOptions, design_prefilter
 from control_design.plants.ellipses import Ellipses
@@ -40,42 +39,33 @@ def error_of_members(
     return float(np.max(np.abs(follow * tracking - target)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--no-write", action="store_true")
-    arguments = parser.parse_args()
+def run(out: Print, *, seed: int = 1) -> None:
     plant, specification = flexible_link("B"), flexible_link_specification(5)
-    with ResultsFile("prefilter", seeds=str(arguments.seed), write=not arguments.no_write) as out:
-        result = synthesise([plant], specification, rng=np.random.default_rng(arguments.seed))
-        certificate = certify(result.controller, [plant], specification)
-        out(f"Scenario B, feedback of order 5: certified worst case {certificate.gamma:.4f}")
-        out(
-            "Largest |F T - T_ref| over all ellipses, T_ref = 1/(s/2 + 1)^2; reach: at least 4 times smaller,"
+    result = synthesise([plant], specification, rng=np.random.default_rng(seed))
+    certificate = certify(result.controller, [plant], specification)
+    out(f"Scenario B, feedback of order 5: certified worst case {certificate.gamma:.4f}")
+    out("Largest |F T - T_ref| over all ellipses, T_ref = 1/(s/2 + 1)^2; reach: at least 4 times smaller,")
+    out("prototype 0.95 to 0.23 with a first-order F. Certified = exact on 8000 frequencies.")
+    out("order  unit gain  certified before  after   ratio (reach 4)  members before  after   CPU s")
+    omega = np.geomspace(1.3e-4, 0.999 * plant.nyquist_rad_s, 1500)
+    loop = np.asarray(
+        control.frequency_response(result.controller.to_control(include_delay=True), omega).complex
+    ).ravel()
+    ellipses = plant.at(omega)
+    cases = [(1, True), (1, False), (2, True), (3, True)]
+    for order, unit_gain in cases:
+        begin = time.process_time()
+        f = design_prefilter(
+            result.controller, plant, MODEL, PrefilterOptions(order=order, unit_gain=unit_gain)
         )
-        out("prototype 0.95 to 0.23 with a first-order F. Certified = exact on 8000 frequencies.")
-        out("order  unit gain  certified before  after   ratio (reach 4)  members before  after   CPU s")
-        omega = np.geomspace(1.3e-4, 0.999 * plant.nyquist_rad_s, 1500)
-        loop = np.asarray(
-            control.frequency_response(result.controller.to_control(include_delay=True), omega).complex
-        ).ravel()
-        ellipses = plant.at(omega)
-        cases = [(1, True), (1, False), (2, True), (3, True)]
-        for order, unit_gain in cases:
-            begin = time.process_time()
-            f = design_prefilter(
-                result.controller, plant, MODEL, PrefilterOptions(order=order, unit_gain=unit_gain)
-            )
-            spent = time.process_time() - begin
-            members = [error_of_members(ellipses, loop, each, omega, plant.dt_s) for each in (None, f)]
-            out(
-                f"{order:>5}  {unit_gain!s:>9}  {f.error_before:>16.4f}  {f.error_after:.4f}"
-                f"  {f.error_before / f.error_after:>15.2f}  {members[0]:>14.4f}  {members[1]:.4f}"
-                f"  {spent:>6.1f}"
-            )
+        spent = time.process_time() - begin
+        members = [error_of_members(ellipses, loop, each, omega, plant.dt_s) for each in (None, f)]
+        out(
+            f"{order:>5}  {unit_gain!s:>9}  {f.error_before:>16.4f}  {f.error_after:.4f}"
+            f"  {f.error_before / f.error_after:>15.2f}  {members[0]:>14.4f}  {members[1]:.4f}"
+            f"  {spent:>6.1f}"
+        )
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

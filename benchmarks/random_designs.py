@@ -1,9 +1,8 @@
 """Random plants and specifications: is every returned design stable, and what does an impossible one say?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.random_designs --first 0 --count 20
-    OMP_NUM_THREADS=1 python -m benchmarks.random_designs --summary
+    OMP_NUM_THREADS=1 python -m benchmarks.random_designs [--first-seed 0] [--seeds 200]
 
-Runs in parts (a results file each); --summary adds up the parts that are there. A case draws one to three
+A case draws one to three
 flexible modes, up to two integrators, up to two samples of delay, a first-order lag, and a posterior over
 coefficients from spreads of gain, lag, mode frequencies and dampings plus a short impulse response; a
 specification; designs with low effort (with the default options where that finds nothing stable); certifies.
@@ -13,14 +12,13 @@ the generators' ball lies in the ellipse of every frequency) and the closed-loop
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import dataclass
 
 import control
 import numpy as np
 
-from benchmarks.results_file import RESULTS, ResultsFile
+from benchmarks.harness import Print, main
 from control_design import (
     Controller,
     Outcome,
@@ -46,7 +44,6 @@ MEANING = (
     "(met: certified; proved: robust stability for all frequencies; unstable: designs with an unstable\n"
     "nominal or sampled plant; refused: before optimising; silent: not met and no word on what blocks)"
 )
-_WIDTH = 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,93 +212,56 @@ def unstable_samples(controller: Controller, posterior: ResponsePosterior, rng: 
     return unstable
 
 
-def summarise() -> None:
-    """Add up the last lines of the parts; a part that overlaps another is refused."""
-    covered: list[int] = []
-    rows: list[tuple[str, dict[str, int]]] = []
-    for path in sorted(RESULTS.glob("random_designs_*_*.txt")):
-        first, last = (int(number) for number in path.stem.split("_")[-2:])
-        covered += range(first, last + 1)
-        text = next(line for line in path.read_text("utf-8").splitlines() if line.startswith("designs "))
-        cells = (cell.rsplit(" ", 1) for cell in text.split(", "))
-        rows.append((f"{first:3d} to {last:3d}", {key: int(value) for key, value in cells}))
-    if len(set(covered)) != len(covered):
-        raise SystemExit("the parts overlap: a seed would count twice")
-    with ResultsFile("random_designs", seeds=f"{min(covered)} to {max(covered)}") as out:
-        out(f"{len(covered)} random plants and specifications; parts: random_designs_FIRST_LAST.txt")
-        out("seeds       " + "  ".join(f"{key:>{_WIDTH}}" for key in COUNTED))
-        for name, counts in rows:
-            out(f"{name}  " + "  ".join(f"{counts[key]:{_WIDTH}d}" for key in COUNTED))
-        total = {key: sum(counts[key] for _, counts in rows) for key in COUNTED}
-        out("together    " + "  ".join(f"{total[key]:{_WIDTH}d}" for key in COUNTED))
-        out()
-        out(MEANING)
-
-
-def main() -> None:
-    """Run a part and write it, or add up the parts."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--count", type=int, default=50)
-    parser.add_argument("--summary", action="store_true")
-    arguments = parser.parse_args()
-    if arguments.summary:
-        summarise()
-        return
-    seeds = range(arguments.first, arguments.first + arguments.count)
+def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
     counts = dict.fromkeys(COUNTED, 0)
-    name = f"random_designs_{seeds[0]:03d}_{seeds[-1]:03d}"
-    with ResultsFile(name, seeds=f"{seeds[0]} to {seeds[-1]}") as out:
-        out("seed int modes delay order  outcome        gamma  bound/dense  proved  certify s  unstable")
-        for seed in seeds:
-            plant, posterior, specification = random_case(seed)
-            head = (
-                f"{seed:4d} {plant.n_integrators:3d} {posterior.poles.pairs.size // 2:5d} "
-                f"{posterior.input_delay_samples:5d} {specification.controller_order:5d}  "
-            )
-            try:
-                result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
-            except SpecificationError as error:
-                counts["refused"] += 1
-                counts["silent"] += "rad/s" not in str(error) and "delay" not in str(error)
-                out(f"{head}refused before optimising: {str(error).split(':', 1)[1].strip()}")
-                continue
-            if result.outcome is Outcome.NOT_CONVERGED:
-                counts["full effort"] += 1
-                out(f"{head}no stable design with low effort; with the default options:")
-                out(f"       {result.explain()}")
-                result = synthesise([plant], specification, rng=np.random.default_rng(seed))
-            if result.outcome is Outcome.NOT_CONVERGED:
-                counts["not converged"] += 1
-                counts["silent"] += not result.blocking
-                out(f"{head}no stable design found")
-                out(f"       {result.explain()}")
-                continue
-            counts["designs"] += 1
-            begin = time.process_time()
-            certificate = certify(result.controller, [plant], specification)
-            spent = time.process_time() - begin
-            proof = certificate.plants[0].all_frequencies
-            unstable = unstable_samples(result.controller, posterior, np.random.default_rng([seed, 2]))
-            counts["unstable"] += unstable > 0 or not certificate.plants[0].stable
-            counts["proved"] += proof.proved
-            counts["met"] += certificate.certified
-            ratio = proof.gamma / certificate.gamma if np.isfinite(proof.gamma) else np.inf
-            out(
-                f"{head}{result.outcome.name:12s} {certificate.gamma:7.3f}  {ratio:11.5f}  "
-                f"{proof.proved!s:>6}  {spent:9.2f}  {unstable:3d} of {SAMPLED}"
-            )
-            if not proof.proved:
-                out(f"       {proof.reason}")
-            if result.outcome is Outcome.NOT_MET:
-                counts["silent"] += not result.blocking
-                out(f"       {result.explain()}")
-        out()
-        out(", ".join(f"{key} {value}" for key, value in counts.items()))
-        out(MEANING)
+    out("seed int modes delay order  outcome        gamma  bound/dense  proved  certify s  unstable")
+    for seed in range(first_seed, first_seed + seeds):
+        plant, posterior, specification = random_case(seed)
+        head = (
+            f"{seed:4d} {plant.n_integrators:3d} {posterior.poles.pairs.size // 2:5d} "
+            f"{posterior.input_delay_samples:5d} {specification.controller_order:5d}  "
+        )
+        try:
+            result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
+        except SpecificationError as error:
+            counts["refused"] += 1
+            counts["silent"] += "rad/s" not in str(error) and "delay" not in str(error)
+            out(f"{head}refused before optimising: {str(error).split(':', 1)[1].strip()}")
+            continue
+        if result.outcome is Outcome.NOT_CONVERGED:
+            counts["full effort"] += 1
+            out(f"{head}no stable design with low effort; with the default options:")
+            out(f"       {result.explain()}")
+            result = synthesise([plant], specification, rng=np.random.default_rng(seed))
+        if result.outcome is Outcome.NOT_CONVERGED:
+            counts["not converged"] += 1
+            counts["silent"] += not result.blocking
+            out(f"{head}no stable design found")
+            out(f"       {result.explain()}")
+            continue
+        counts["designs"] += 1
+        begin = time.process_time()
+        certificate = certify(result.controller, [plant], specification)
+        spent = time.process_time() - begin
+        proof = certificate.plants[0].all_frequencies
+        unstable = unstable_samples(result.controller, posterior, np.random.default_rng([seed, 2]))
+        counts["unstable"] += unstable > 0 or not certificate.plants[0].stable
+        counts["proved"] += proof.proved
+        counts["met"] += certificate.certified
+        ratio = proof.gamma / certificate.gamma if np.isfinite(proof.gamma) else np.inf
+        out(
+            f"{head}{result.outcome.name:12s} {certificate.gamma:7.3f}  {ratio:11.5f}  "
+            f"{proof.proved!s:>6}  {spent:9.2f}  {unstable:3d} of {SAMPLED}"
+        )
+        if not proof.proved:
+            out(f"       {proof.reason}")
+        if result.outcome is Outcome.NOT_MET:
+            counts["silent"] += not result.blocking
+            out(f"       {result.explain()}")
+    out()
+    out(", ".join(f"{key} {value}" for key, value in counts.items()))
+    out(MEANING)
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -10,20 +10,15 @@ model)/noise on held-out records. "closed" is relative to the model as stated wi
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import emps_axis, ruler_robot, serial_link_stage
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, data_folder, main
 from diagnosis import Diagnosis, PlantCase, diagnose, pooled_rms
 from diagnosis.fit.model_error import correlation_length
-
-Print = Callable[[str], None]
 
 
 def settled(make: Callable[[float], PlantCase], passes: float = 1.0) -> tuple[Diagnosis, float]:
@@ -215,19 +210,12 @@ def slfr(out: Print, folder: Path) -> None:
             out(f"    {e.name}: gap {gaps[0]:.2f} values moved, {gaps[1]:.2f} repaired")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", choices=("emps", "quanser", "slfr"), help="one machine, nothing written")
-    only = parser.parse_args().only
-    named = os.environ.get("FLEXLINK_DATA")
-    if not named or not Path(named).is_dir():
-        sys.exit("set FLEXLINK_DATA to the folder that holds emps, quanser_2dsfl and slfr_krauss_2009")
-    folder = Path(named)
-    with ResultsFile("real_machine_gaps", seeds="none", write=only is None) as out:
-        for name, tell_of in (("emps", emps), ("quanser", quanser), ("slfr", slfr)):
-            if only in (None, name):
-                tell_of(out, folder)
+def run(out: Print, *, only: str = "") -> None:
+    folder = data_folder("emps", "quanser_2dsfl", "slfr_krauss_2009")
+    for name, tell_of in (("emps", emps), ("quanser", quanser), ("slfr", slfr)):
+        if only in ("", name):
+            tell_of(out, folder)
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

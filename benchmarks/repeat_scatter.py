@@ -12,18 +12,15 @@ opened point by point. Predicted from one date, held against the points and mean
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, data_folder, main
 from ident import IdentOptions, Record, band_limited, identify
 from ident.checks.validation import repeat_scatter
 from ident.closed_loop import indirect, two_stage
@@ -34,7 +31,6 @@ from ident.uncertainty.conditions import combine_posteriors, combine_responses, 
 from ident.uncertainty.embedding import EmbeddingOptions
 
 HZ = 2 * np.pi
-Print = Callable[[str], None]
 
 SLFR_BANDS_HZ = ((0.8, 2), (2, 4), (4, 8), (8, 16), (16, 17.3), (17.3, 18.6), (18.6, 25), (25, 30))
 SLFR_SWEEPS = [(amplitude, repeat) for amplitude in (50, 75) for repeat in (1, 2, 3)]
@@ -376,22 +372,14 @@ def describe(date: str, found: FrfIdentification, gain: float, say: Print) -> No
     say(f"    {found.verdicts[0]}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", choices=("slfr", "kyoto"), help="one arm, results not written")
-    only = parser.parse_args().only
-    folder = os.environ.get("FLEXLINK_DATA")
-    if not folder or not Path(folder).is_dir():
-        sys.exit("set FLEXLINK_DATA to the folder that holds slfr_krauss_2009 and quanser_rfl_frf")
-    with ResultsFile("repeat_scatter", seeds="none: measured data", write=only is None) as say:
-        if only != "kyoto":
-            for channel in SLFR_CHANNELS:
-                slfr(Path(folder) / "slfr_krauss_2009", channel, say)
-        if only != "slfr":
-            kyoto(Path(folder) / "quanser_rfl_frf" / "frf_repeats.csv", say)
+def run(say: Print, *, only: str = "") -> None:
+    folder = data_folder("slfr_krauss_2009", "quanser_rfl_frf")
+    if only != "kyoto":
+        for channel in SLFR_CHANNELS:
+            slfr(folder / "slfr_krauss_2009", channel, say)
+    if only != "slfr":
+        kyoto(folder / "quanser_rfl_frf" / "frf_repeats.csv", say)
 
 
 if __name__ == "__main__":
-    main()
+    main(run, seeds="none: measured data")

@@ -10,55 +10,49 @@ CPU time after a warm-up fit.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from ident import IdentOptions, identify
-from tests.ident.benchmark_plants import P3_MODES, max_length_sequence, p3, run
+from tests.ident.benchmark_plants import P3_MODES, max_length_sequence, p3
+from tests.ident.benchmark_plants import run as simulated
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=8, help="noise seeds 0 .. SEEDS - 1")
-    seeds = parser.parse_args().seeds
+def run(out: Print, *, seeds: int = 8) -> None:
     fresh = max_length_sequence(77, 2000)
-    with ResultsFile("several_modes_p3", seeds=f"0 to {seeds - 1}", write=seeds >= 8) as out:
-        for title, given in (("numbers of poles given", True), ("order from data", False)):
-            out(f"{title:<24}  residual/noise  global   validation    CPU ms")
-            out(f"{'modes, SNR':<24}  largest         optima   median    median    most   pairs")
-            out(f"{'reach':<24}  <= 1.02         all                         100")
-            total = 0
-            for n_modes in P3_MODES:
-                options = IdentOptions(n_real=2, n_pairs=n_modes) if given else IdentOptions()
-                for snr_db in (30, 50):
-                    truths = [p3(n_modes, seed, snr_db) for seed in range(seeds)]
-                    identify([truths[0].record], options)
-                    ratios, errors, cpu, pairs = [], [], [], []
-                    y = run(truths[0].system, fresh)
-                    for truth in truths:
-                        begin = time.process_time()
-                        result = identify([truth.record], options)
-                        cpu.append(1e3 * (time.process_time() - begin))
-                        ratios.append(result.rss / (truth.clean.size * truth.noise_std**2))
-                        error = y - result.model.simulate(fresh)
-                        errors.append(float(np.linalg.norm(error) / np.linalg.norm(y - y.mean())))
-                        pairs.append(result.model.poles.pairs.size)
-                    hits = int(np.sum(np.array(ratios) <= 1.02))
-                    total += hits
-                    name = f"{n_modes} modes, {snr_db} dB"
-                    out(
-                        f"{name:<24}  {max(ratios):>7.4f}         {hits}/{seeds}    "
-                        f"{np.median(errors):>8.5f}  {np.median(cpu):>6.1f}  {max(cpu):>6.1f}   "
-                        f"{min(pairs)}-{max(pairs)}"
-                    )
-            out(f"{'all':<24}                  {total}/{4 * seeds}")
-            out()
+    for title, given in (("numbers of poles given", True), ("order from data", False)):
+        out(f"{title:<24}  residual/noise  global   validation    CPU ms")
+        out(f"{'modes, SNR':<24}  largest         optima   median    median    most   pairs")
+        out(f"{'reach':<24}  <= 1.02         all                         100")
+        total = 0
+        for n_modes in P3_MODES:
+            options = IdentOptions(n_real=2, n_pairs=n_modes) if given else IdentOptions()
+            for snr_db in (30, 50):
+                truths = [p3(n_modes, seed, snr_db) for seed in range(seeds)]
+                identify([truths[0].record], options)
+                ratios, errors, cpu, pairs = [], [], [], []
+                y = simulated(truths[0].system, fresh)
+                for truth in truths:
+                    begin = time.process_time()
+                    result = identify([truth.record], options)
+                    cpu.append(1e3 * (time.process_time() - begin))
+                    ratios.append(result.rss / (truth.clean.size * truth.noise_std**2))
+                    error = y - result.model.simulate(fresh)
+                    errors.append(float(np.linalg.norm(error) / np.linalg.norm(y - y.mean())))
+                    pairs.append(result.model.poles.pairs.size)
+                hits = int(np.sum(np.array(ratios) <= 1.02))
+                total += hits
+                name = f"{n_modes} modes, {snr_db} dB"
+                out(
+                    f"{name:<24}  {max(ratios):>7.4f}         {hits}/{seeds}    "
+                    f"{np.median(errors):>8.5f}  {np.median(cpu):>6.1f}  {max(cpu):>6.1f}   "
+                    f"{min(pairs)}-{max(pairs)}"
+                )
+        out(f"{'all':<24}                  {total}/{4 * seeds}")
+        out()
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

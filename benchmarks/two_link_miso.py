@@ -21,7 +21,6 @@ Nothing is asked for in numbers; the reach is to be better than the fits channel
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 
@@ -29,7 +28,7 @@ import control
 import numpy as np
 from scipy.signal import dlsim
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from examples.two_link_arm import AMPLITUDE_V, DT_S, ELBOW_ANGLE_RAD, NOISE_M
 from ident import IdentOptions, Record, identify
 from ident.several_inputs import identify_miso
@@ -73,12 +72,7 @@ METHODS: dict[str, tuple[bool, Callable[[list[Record]], Fitted]]] = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=20, help="seeds 0 .. SEEDS - 1")
-    seeds = parser.parse_args().seeds
+def run(out: Print, *, seeds: int = 20) -> None:
     continuous = two_link_operating_point(ELBOW_ANGLE_RAD)
     arm = control.c2d(continuous, DT_S)[["tip_m"], :]
     truth = arm(np.exp(1j * OMEGA * DT_S))[0].T
@@ -104,27 +98,26 @@ def main() -> None:
                     if np.min(np.abs(modes / w - 1)) < 0.05
                 }
                 found[name][channel, list(near)] += 1
-    with ResultsFile("two_link_miso", seeds=f"0 to {seeds - 1}", write=seeds >= 20) as out:
-        out("relative error of the response, %   1 to 200 rad/s       200 to 800 rad/s     modes found at")
+    out("relative error of the response, %   1 to 200 rad/s       200 to 800 rad/s     modes found at")
+    out(
+        f"{'experiment, poles':<18}  CPU s          shoulder   elbow     shoulder   elbow      "
+        + "   ".join(f"{mode:.0f}" for mode in modes)
+        + " rad/s"
+    )
+    for name in METHODS:
+        low, high = 100 * np.median(errors[name], axis=0)
+        counts = "  ".join(f"{a}/{b}" for a, b in found[name].T)
         out(
-            f"{'experiment, poles':<18}  CPU s          shoulder   elbow     shoulder   elbow      "
-            + "   ".join(f"{mode:.0f}" for mode in modes)
-            + " rad/s"
+            f"{name:<18}  {np.median(cpu[name]):>5.1f}          {low[0]:>8.3f} {low[1]:>7.3f}     "
+            f"{high[0]:>8.1f} {high[1]:>7.2f}      {counts}"
         )
-        for name in METHODS:
-            low, high = 100 * np.median(errors[name], axis=0)
-            counts = "  ".join(f"{a}/{b}" for a, b in found[name].T)
-            out(
-                f"{name:<18}  {np.median(cpu[name]):>5.1f}          {low[0]:>8.3f} {low[1]:>7.3f}     "
-                f"{high[0]:>8.1f} {high[1]:>7.2f}      {counts}"
-            )
-        out()
-        out("shared poles, both motors at once, against:        shoulder  elbow   (1 to 200 rad/s)")
-        out(f"{'reach: median ratio of the errors':<50} {'< 1':>7} {'< 1':>7}")
-        for name in list(METHODS)[1:]:
-            ratio = np.median(errors["both, shared"][:, 0] / errors[name][:, 0], axis=0)
-            out(f"{name:<50} {ratio[0]:>7.2f} {ratio[1]:>7.2f}")
+    out()
+    out("shared poles, both motors at once, against:        shoulder  elbow   (1 to 200 rad/s)")
+    out(f"{'reach: median ratio of the errors':<50} {'< 1':>7} {'< 1':>7}")
+    for name in list(METHODS)[1:]:
+        ratio = np.median(errors["both, shared"][:, 0] / errors[name][:, 0], axis=0)
+        out(f"{name:<50} {ratio[0]:>7.2f} {ratio[1]:>7.2f}")
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

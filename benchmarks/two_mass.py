@@ -1,6 +1,6 @@
 """Two masses and a spring (Wie and Bernstein): peaks of S and T over the stiffness range, at published gains.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.two_mass [--seeds 1 2 3] [--no-write]
+    OMP_NUM_THREADS=1 python -m benchmarks.two_mass [--seeds 1 2 3]
 
 P = k/(s^2 (s^2 + 2 k)), m1 = m2 = 1, k in [0.5, 2]; DC gain of K at least 0.032, high-frequency |s K| at most
 0.08, as for Chait's QFT design 0.032 (10 s + 1)/(4 s^2 + 2 s + 1). Direct search of the continuous-time
@@ -10,14 +10,13 @@ structured synthesis of this project is discrete-time and has no weight on T; it
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import differential_evolution, minimize
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 
 DC_GAIN, HIGH_GAIN = 0.032, 0.08
 STIFFNESS = np.geomspace(0.5, 2.0, 100)
@@ -184,32 +183,23 @@ def _responses(design: Design, k: float, omega: np.ndarray) -> tuple[np.ndarray,
     return open_part / (open_part + k * n), k * n / (open_part + k * n)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--no-write", action="store_true")
-    arguments = parser.parse_args()
-    with ResultsFile(
-        "two_mass", seeds=" ".join(map(str, arguments.seeds)), write=not arguments.no_write
-    ) as out:
-        s_peak, t_peak = dense_peaks(CHAIT)
-        out("Peaks over 100 log-spaced k in [0.5, 2]; DC gain >= 0.032, high-frequency |s K| <= 0.08.")
-        out(f"Chait: max|S| {s_peak:.3f} (published 2.191), max|T| {t_peak:.3f} (published 1.618)")
-        out("order  seed  max|S|  max|T|  larger  reach    DC gain  |s K|   CPU s  numerator / denominator")
-        for order, reach in ((2, 1.79), (3, 1.62)):
-            for seed in arguments.seeds:
-                begin = time.process_time()
-                design = optimised(order, seed)
-                spent = time.process_time() - begin
-                s_peak, t_peak = dense_peaks(design)
-                out(
-                    f"{order:>5}  {seed:>4}  {s_peak:>6.3f}  {t_peak:>6.3f}  {max(s_peak, t_peak):>6.4f}"
-                    f"  <= {reach:.2f}  {design.dc_gain:.5f}  {design.high_gain:.5f}  {spent:>5.1f}"
-                    f"  {np.round(design.numerator, 6).tolist()} / {np.round(design.denominator, 6).tolist()}"
-                )
+def run(out: Print, *, seeds: tuple[int, ...] = (1, 2, 3)) -> None:
+    s_peak, t_peak = dense_peaks(CHAIT)
+    out("Peaks over 100 log-spaced k in [0.5, 2]; DC gain >= 0.032, high-frequency |s K| <= 0.08.")
+    out(f"Chait: max|S| {s_peak:.3f} (published 2.191), max|T| {t_peak:.3f} (published 1.618)")
+    out("order  seed  max|S|  max|T|  larger  reach    DC gain  |s K|   CPU s  numerator / denominator")
+    for order, reach in ((2, 1.79), (3, 1.62)):
+        for seed in seeds:
+            begin = time.process_time()
+            design = optimised(order, seed)
+            spent = time.process_time() - begin
+            s_peak, t_peak = dense_peaks(design)
+            out(
+                f"{order:>5}  {seed:>4}  {s_peak:>6.3f}  {t_peak:>6.3f}  {max(s_peak, t_peak):>6.4f}"
+                f"  <= {reach:.2f}  {design.dc_gain:.5f}  {design.high_gain:.5f}  {spent:>5.1f}"
+                f"  {np.round(design.numerator, 6).tolist()} / {np.round(design.denominator, 6).tolist()}"
+            )
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

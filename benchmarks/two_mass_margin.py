@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 
 GAIN, ZERO, POLE, EXPONENT = 100.0, 1.0, 1000.0, 3
 SPREAD = 0.2
@@ -95,18 +95,16 @@ def largest_real_part(scaling: float, per_side: int) -> float:
     return float(max(np.max(closed_loop_poles(*plant).real) for plant in itertools.product(side, side, side)))
 
 
-def main() -> None:
-    """Write the results."""
+def run(out: Print) -> None:
     found = margin()
     low, high, omega = PUBLISHED
-    with ResultsFile("two_mass_margin", seeds="none") as out:
-        out(f"exact margin       {found.scaling:.6f} at {found.omega_rad_s:.4f} rad/s")
-        out("worst plant        m1 = {:.6f}, m2 = {:.6f}, k = {:.6f}".format(*found.plant))
-        out(f"published bounds   [{low}, {high}] at {omega} rad/s")
-        out("check by the roots of the closed-loop polynomial, 9^3 plants of the box, largest real part:")
-        for share in (0.99, 0.999, 1.0, 1.001):
-            out(f"  {share:5.3f} x margin    {largest_real_part(share * found.scaling, 9):+.3e}")
+    out(f"exact margin       {found.scaling:.6f} at {found.omega_rad_s:.4f} rad/s")
+    out("worst plant        m1 = {:.6f}, m2 = {:.6f}, k = {:.6f}".format(*found.plant))
+    out(f"published bounds   [{low}, {high}] at {omega} rad/s")
+    out("check by the roots of the closed-loop polynomial, 9^3 plants of the box, largest real part:")
+    for share in (0.99, 0.999, 1.0, 1.001):
+        out(f"  {share:5.3f} x margin    {largest_real_part(share * found.scaling, 9):+.3e}")
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -1,6 +1,6 @@
 """What any controller could reach on the flexible link with ellipses, beside the published bracket.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.youla_bracket [--scenarios A B C] [--fine] [--no-write]
+    OMP_NUM_THREADS=1 python -m benchmarks.youla_bracket [--scenarios A B C] [--fine]
 
 --fine adds a row with a larger basis and grid: how far the default ones are from their limits. No random
 numbers.
@@ -8,12 +8,11 @@ numbers.
 
 from __future__ import annotations
 
-import argparse
 import time
 
-from benchmarks.results_file import ResultsFile
+from benchmarks.harness import Print, main
 from control_design.convex.youla import BracketProblem, YoulaOptions, youla_bracket
-from validation.example_plants import flexible_link, flexible_link_specification
+from validation.example_plants import Scenario, flexible_link, flexible_link_specification
 
 PUBLISHED = {"A": (0.912, 0.931, 0.945), "B": (0.916, 1.065, 1.205), "C": (0.916, 1.268, 1.705)}
 OURS_BY_ORDER = {
@@ -23,57 +22,45 @@ OURS_BY_ORDER = {
 }  # benchmarks.ellipse_link
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenarios", nargs="+", choices=list(PUBLISHED), default=list(PUBLISHED))
-    parser.add_argument("--fine", action="store_true")
-    parser.add_argument("--no-write", action="store_true")
-    arguments = parser.parse_args()
+def run(out: Print, *, scenarios: tuple[Scenario, ...] = ("A", "B", "C"), fine: bool = False) -> None:
     settings = {"default": YoulaOptions(), "hull": YoulaOptions(hull=True)}
-    if arguments.fine:
+    if fine:
         settings["fine"] = YoulaOptions(
             real_poles=50, pairs_per_mode=20, grid_points=400, mode_points=250, dense_points=20_000
         )
-    with ResultsFile("youla_bracket", seeds="none", write=not arguments.no_write) as out:
-        out("Worst case of max(|W1 S|, |W3 K S|): none below 'inscribed', the others are reached.")
-        out("reach = published (smaller basis, larger values); excess = our order 5 / 6 over 'ellipse'.")
-        out(
-            "hull bound = lower bound from convex hulls at every frequency, tighter than the inscribed discs."
-        )
-        out(
-            "scenario  basis    functions  inscribed (reach)  ellipse (reach)  enclosing (reach)"
-            "  hull bound  excess 5 / 6 %  CPU s"
-        )
-        for scenario in arguments.scenarios:
-            plant, specification = flexible_link(scenario), flexible_link_specification(5)
-            for name, options in settings.items():
-                begin = time.process_time()
-                bracket = youla_bracket(plant, specification, options)
-                spent = time.process_time() - begin
-                one = bracket.plants[0]
-                values = (bracket.inscribed, bracket.ellipse, bracket.enclosing)
-                cells = "  ".join(
-                    f"{value:>9.4f} ({reach:.3f})"
-                    for value, reach in zip(values, PUBLISHED[scenario], strict=True)
-                )
-                excess = [100 * bracket.excess(gamma) for gamma in OURS_BY_ORDER[scenario]]
-                out(
-                    f"{scenario:>8}  {name:<7}  {one.functions:>9}  {cells}  "
-                    f"{'-' if one.hull is None else format(one.hull, '.4f'):>10}"
-                    f"  {excess[0]:>8.1f} / {excess[1]:.1f}  {spent:>7.1f}"
-                )
-        if arguments.fine:
-            out()
-            out("The ellipse problem is not convex: its value from five starts between the discs' answers.")
-            for scenario in arguments.scenarios:
-                problem = BracketProblem(
-                    flexible_link(scenario), flexible_link_specification(5), YoulaOptions()
-                )
-                values = problem.other_ellipse_values((0.0, 0.25, 0.5, 0.75, 1.0))
-                out(f"{scenario:>8}  " + "  ".join(f"{value:.4f}" for value in values))
+    out("Worst case of max(|W1 S|, |W3 K S|): none below 'inscribed', the others are reached.")
+    out("reach = published (smaller basis, larger values); excess = our order 5 / 6 over 'ellipse'.")
+    out("hull bound = lower bound from convex hulls at every frequency, tighter than the inscribed discs.")
+    out(
+        "scenario  basis    functions  inscribed (reach)  ellipse (reach)  enclosing (reach)"
+        "  hull bound  excess 5 / 6 %  CPU s"
+    )
+    for scenario in scenarios:
+        plant, specification = flexible_link(scenario), flexible_link_specification(5)
+        for name, options in settings.items():
+            begin = time.process_time()
+            bracket = youla_bracket(plant, specification, options)
+            spent = time.process_time() - begin
+            one = bracket.plants[0]
+            values = (bracket.inscribed, bracket.ellipse, bracket.enclosing)
+            cells = "  ".join(
+                f"{value:>9.4f} ({reach:.3f})"
+                for value, reach in zip(values, PUBLISHED[scenario], strict=True)
+            )
+            excess = [100 * bracket.excess(gamma) for gamma in OURS_BY_ORDER[scenario]]
+            out(
+                f"{scenario:>8}  {name:<7}  {one.functions:>9}  {cells}  "
+                f"{'-' if one.hull is None else format(one.hull, '.4f'):>10}"
+                f"  {excess[0]:>8.1f} / {excess[1]:.1f}  {spent:>7.1f}"
+            )
+    if fine:
+        out()
+        out("The ellipse problem is not convex: its value from five starts between the discs' answers.")
+        for scenario in scenarios:
+            problem = BracketProblem(flexible_link(scenario), flexible_link_specification(5), YoulaOptions())
+            values = problem.other_ellipse_values((0.0, 0.25, 0.5, 0.75, 1.0))
+            out(f"{scenario:>8}  " + "  ".join(f"{value:.4f}" for value in values))
 
 
 if __name__ == "__main__":
-    main()
+    main(run)

@@ -1,0 +1,163 @@
+"""What every benchmark shares: options, repetition, times taken in turns, and the results file.
+
+A benchmark is a module with a function `run(out, *, option=default, ...)` that tells its numbers line by line
+with `out(line)`, and ends with `main(run)`. Its options on the command line are the keywords of `run`. A run
+with all options as they are writes benchmarks/results/MODULE.txt; with --name NAME any run writes NAME.txt;
+everything else is only printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import inspect
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+
+R = TypeVar("R")
+C = TypeVar("C")
+
+
+class Print(Protocol):
+    """Tells a line."""
+
+    def __call__(self, line: str = "") -> None: ...
+
+
+class Results:
+    """Lines of one results file: printed as they come, written whole at the end, so never half of a run."""
+
+    def __init__(self, head: str) -> None:
+        self._lines: list[str] = []
+        self(head)
+
+    def __call__(self, line: str = "") -> None:
+        """Print and keep a line, or several."""
+        print(line, flush=True)
+        self._lines += [part.rstrip() for part in line.split("\n")]
+
+    def write(self, path: Path) -> None:
+        path.write_text("\n".join(self._lines) + "\n", encoding="utf-8")
+
+
+def main(
+    run: Callable[..., None], arguments: Sequence[str] | None = None, *, seeds: str | None = None
+) -> None:
+    """Call `run` with the options of the command line; the results file begins with command, seeds, commit
+    and date.
+
+    seeds: in words, where they are not the options `seeds` (0 to seeds - 1) or `seed`; may name options in
+    braces.
+    """
+    module = Path(inspect.getfile(run)).stem
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    defaults = {
+        name: parameter.default
+        for name, parameter in inspect.signature(run).parameters.items()
+        if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+    }
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{module}",
+        description=sys.modules[run.__module__].__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--name", help="write benchmarks/results/NAME.txt, whatever the options")
+    for name, default in defaults.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", **_kind(default))
+    options = vars(parser.parse_args(arguments))
+    target = options.pop("name") or (module if options == defaults else None)
+    command = shlex.join(["python", "-m", f"benchmarks.{module}", *arguments])
+    threads = os.environ.get("OMP_NUM_THREADS")
+    rests_on = seeds.format(**options) if seeds is not None else _seeds(options)
+    out = Results(
+        f"# {f'OMP_NUM_THREADS={threads} ' if threads else ''}{command}   (seeds {rests_on}; "
+        f"commit {_commit()}; {datetime.date.today().isoformat()})"
+    )
+    run(out, **options)
+    if target is not None:
+        out.write(RESULTS / f"{target}.txt")
+
+
+def _kind(default: Any) -> dict[str, Any]:
+    """How argparse reads an option with this default."""
+    if isinstance(default, bool):
+        return {"action": argparse.BooleanOptionalAction, "default": default}
+    if isinstance(default, tuple):
+        return {"nargs": "+", "action": _Tuple, "type": type(default[0]), "default": default}
+    return {"type": str if default is None else type(default), "default": default}
+
+
+class _Tuple(argparse.Action):
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        setattr(namespace, self.dest, tuple(values))
+
+
+def _seeds(options: Mapping[str, Any]) -> str:
+    if "seed" in options:
+        return str(options["seed"])
+    counted = options.get("seeds")
+    if isinstance(counted, tuple):
+        return " ".join(map(str, counted))
+    first = options.get("first_seed", 0)
+    return "none" if counted is None else f"{first} to {first + counted - 1}"
+
+
+def _commit() -> str:
+    """Short hash of the checkout, with a plus where files differ from it."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], cwd=RESULTS.parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def data_folder(*needed: str) -> Path:
+    """FLEXLINK_DATA; ends the program where it is not set or lacks one of these folders."""
+    folder = Path(os.environ.get("FLEXLINK_DATA") or "not set")
+    if not all((folder / name).is_dir() for name in needed):
+        sys.exit(f"set FLEXLINK_DATA to the folder that holds {', '.join(needed)}")
+    return folder
+
+
+def timed(call: Callable[[], R]) -> tuple[R, float]:
+    """What the call returns, and CPU seconds of this process."""
+    begin = time.process_time()
+    found = call()
+    return found, time.process_time() - begin
+
+
+def median_s(call: Callable[[], object], repeats: int, at_once: int = 1) -> float:
+    """Median CPU seconds of a call, after one to warm up; `at_once` calls between readings of the clock,
+    which takes a microsecond itself."""
+    call()
+    times = [timed(lambda: [call() for _ in range(at_once)])[1] / at_once for _ in range(repeats)]
+    return float(np.median(times))
+
+
+def taking_turns(methods: Mapping[str, Callable[[C], object]], cases: Iterable[C]) -> dict[str, list[float]]:
+    """CPU seconds of every method on every case, after one call each on the first case to warm up. The
+    methods take turns, so that what else the machine does falls on all alike."""
+    cases = list(cases)
+    for method in methods.values():
+        method(cases[0])
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    for case in cases:
+        for name, method in methods.items():
+            times[name].append(timed(partial(method, case))[1])
+    return times
