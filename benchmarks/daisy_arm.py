@@ -244,7 +244,7 @@ def lines(record: Record, say: Print) -> None:
 
 def run(say: Print) -> None:
     path = data_folder("daisy_robot_arm") / "daisy_robot_arm" / "robot_arm.csv"
-    record = Record.from_csv(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
+    record = Record.from_file(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
     y, u = record.output[:, 0], record.input[:, 0]
     first = record.slice(0, HALF)
     say("Fit in per cent, GOBF with order / 2 pairs and a direct term, fitted to samples 0-511")

@@ -63,7 +63,7 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
     """One channel of the Krauss arm: table over bands."""
     output, band, options = SLFR_CHANNELS[channel]
     records = [
-        Record.from_csv(
+        Record.from_file(
             folder / f"swept_sine_amp{amplitude}_rep{repeat}.csv",
             ["v_drive_counts"],
             [output],
@@ -170,7 +170,7 @@ def kyoto(path: Path, say: Print) -> None:
     )
     say(head)
     for date in long:
-        region = plant.only(date).next_run(KYOTO_DT_S, outlier_threshold=OUTLIER)
+        region = plant.only(date).mean(KYOTO_DT_S, outlier_threshold=OUTLIER, of="next run")
         for other in dates:
             if other != date:
                 inside = np.array([region.contains(run) for run in runs_of(plant.only(other), omega)])

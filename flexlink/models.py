@@ -47,7 +47,7 @@ _NOMINAL_POINTS = 400
 
 
 class Record(Shown, ident.Record):
-    """One uniformly sampled experiment, from arrays, pandas columns or (with `from_csv` and so on) a file.
+    """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
 
     Parameters
     ----------

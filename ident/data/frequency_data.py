@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pandas as pd
 from scipy.stats import f as f_distribution
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import chi2_radius
+from ident.data.record_files import Table, read_table
 
 FREQUENCY_COLUMNS = {"omega_rad_s": 1.0, "omega_rad_per_s": 1.0, "frequency_Hz": 2 * np.pi}
 """Names a frequency column may have, and the factor to rad/s."""
@@ -18,53 +19,38 @@ _COLUMNS = ("real", "imag", "variance_real", "variance_imag")
 _CROSS = "covariance_real_imag"
 
 
+def frequencies(table: Table) -> RealArray:
+    """omega (K,) in rad/s from the one column of `FREQUENCY_COLUMNS` that a table has; else ValueError."""
+    found = [name for name in FREQUENCY_COLUMNS if name in table.names]
+    if len(found) != 1:
+        raise ValueError(
+            f"{table.path}, line 1: need exactly one of the columns {', '.join(FREQUENCY_COLUMNS)}; found "
+            f"{list(table.names)}"
+        )
+    return table.columns(found)[found[0]] * FREQUENCY_COLUMNS[found[0]]
+
+
 def read_frequency_table(path: Path) -> tuple[RealArray, ComplexArray, RealArray]:
     """omega (F,), response (F,), covariance (F,2,2) from the columns of `FrequencyUncertainty.from_csv`."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: there is no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: cannot be read as text ({error})") from error
-    rows = csv.reader(text.splitlines())
-    header = [name.strip() for name in next(rows, [])]
-    frequency = [name for name in FREQUENCY_COLUMNS if name in header]
-    if len(frequency) != 1:
-        raise ValueError(
-            f"{path}, line 1: need exactly one of the columns {', '.join(FREQUENCY_COLUMNS)}; found {header}"
-        )
-    missing = [name for name in _COLUMNS if name not in header]
-    if missing:
-        raise ValueError(f"{path}, line 1: missing column {', '.join(missing)}; found {header}")
-    wanted = [frequency[0], *_COLUMNS, *([_CROSS] if _CROSS in header else [])]
-    values: list[list[float]] = []
-    for row in rows:
-        if not any(cell.strip() for cell in row):
-            continue
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}, line {rows.line_num}: {len(row)} cells where the header has {len(header)}"
-            )
-        values.append([number_of_cell(row[header.index(name)], path, rows.line_num, name) for name in wanted])
-        if values[-1][3] < 0 or values[-1][4] < 0:
-            raise ValueError(f"{path}, line {rows.line_num}: a variance is negative")
-    if not values:
-        raise ValueError(f"{path}: no rows under the header")
-    table = np.array(values)
-    cross = table[:, 5] if table.shape[1] > 5 else np.zeros(len(table))
-    covariance = np.stack([np.stack([table[:, 3], cross], -1), np.stack([cross, table[:, 4]], -1)], -2)
-    return table[:, 0] * FREQUENCY_COLUMNS[frequency[0]], table[:, 1] + 1j * table[:, 2], covariance
+    table = read_table(path)
+    omega = frequencies(table)
+    real, imag, variance_real, variance_imag = table.columns(_COLUMNS).values()
+    negative = np.flatnonzero((variance_real < 0) | (variance_imag < 0))
+    if negative.size:
+        raise ValueError(f"{path}, {table.place(int(negative[0]))}: a variance is negative")
+    cross = table.columns([_CROSS])[_CROSS] if _CROSS in table.names else np.zeros_like(omega)
+    covariance = np.stack([np.stack([variance_real, cross], -1), np.stack([cross, variance_imag], -1)], -2)
+    return omega, real + 1j * imag, covariance
 
 
 def write_frequency_table(
     path: Path, omega_rad_s: RealArray, centre: ComplexArray, covariance: RealArray
 ) -> None:
     """The columns `read_frequency_table` reads, every number with all its digits."""
-    lines = [",".join(("omega_rad_s", *_COLUMNS, _CROSS))]
-    for omega, g, c in zip(omega_rad_s, centre, covariance, strict=True):
-        numbers = (omega, g.real, g.imag, c[0, 0], c[1, 1], c[0, 1])
-        lines.append(",".join(repr(float(number)) for number in numbers))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    columns = (omega_rad_s, centre.real, centre.imag, covariance[:, 0, 0], covariance[:, 1, 1])
+    names = ("omega_rad_s", *_COLUMNS, _CROSS)
+    table = pd.DataFrame(dict(zip(names, (*columns, covariance[:, 0, 1]), strict=True)))
+    table.to_csv(path, index=False, lineterminator="\n")
 
 
 def mean_of_repeats(
@@ -116,18 +102,6 @@ def mean_of_repeats(
     widening = hotelling / chi2_radius(level) ** 2
     share = 1 / count if of == "mean" else 1 + 1 / count
     return grid, centre, scatter * (widening * share / freedom)[:, None, None]
-
-
-def number_of_cell(cell: str, path: Path, line: int, column: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError as error:
-        raise ValueError(
-            f"{path}, line {line}, column {column}: expected a number, found {cell!r}"
-        ) from error
-    if not np.isfinite(value):
-        raise ValueError(f"{path}, line {line}, column {column}: expected a finite number, found {cell!r}")
-    return value
 
 
 def _inliers(points: ComplexArray, threshold: float) -> ComplexArray:

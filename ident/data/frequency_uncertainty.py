@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -171,6 +171,7 @@ class FrequencyUncertainty:
         level: float = 0.95,
         pool_neighbours: int = 0,
         outlier_threshold: float | None = None,
+        of: Literal["mean", "next run"] = "mean",
     ) -> Self:
         """Mean and covariance of the mean from repeated measurements of a frequency response.
 
@@ -180,8 +181,9 @@ class FrequencyUncertainty:
         (variance x 1.7 with 10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative
         covariances over m frequencies on either side first, which suits a scatter that varies slowly with
         frequency and few repeats. outlier_threshold = t drops points farther than t robust standard
-        deviations from the median of their frequency. Raises ValueError where a frequency is left with too
-        few repeats.
+        deviations from the median of their frequency. of = "next run" gives the region of one more run
+        instead: scatter of a run plus error of the mean, widened to Hotelling's prediction region. Raises
+        ValueError where a frequency is left with too few repeats.
         """
         omega, centre, covariance = mean_of_repeats(
             np.asarray(omega_rad_s, dtype=np.float64),
@@ -189,8 +191,10 @@ class FrequencyUncertainty:
             level=level,
             pool_neighbours=pool_neighbours,
             outlier_threshold=outlier_threshold,
+            of=of,
         )
-        return cls(omega, centre, covariance, dt_s=dt_s, level=level, method="repeated measurements")
+        method = "repeated measurements" if of == "mean" else "one more run"
+        return cls(omega, centre, covariance, dt_s=dt_s, level=level, method=method)
 
     def _matching(self, response: npt.ArrayLike) -> ComplexArray:
         response = np.asarray(response, dtype=np.complex128)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
-from ident.data.frequency_data import FREQUENCY_COLUMNS, mean_of_repeats, number_of_cell
+from ident.data.frequency_data import frequencies
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record_files import read_table
 
 _PARTS = (("real", "imag"), ("gain", "phase_rad"))
 
@@ -49,43 +49,18 @@ class FrfRepeats:
 
         Raises ValueError in one line naming file, line and column.
         """
-        path = Path(path)
-        try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-        except FileNotFoundError as error:
-            raise ValueError(f"{path}: there is no such file") from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}: cannot be read as text ({error})") from error
-        rows = csv.reader(lines)
-        header = [name.strip() for name in next(rows, [])]
-        frequency = [name for name in FREQUENCY_COLUMNS if name in header]
-        parts = [pair for pair in _PARTS if set(pair) <= set(header)]
-        if len(frequency) != 1 or len(parts) != 1:
+        table = read_table(path)
+        parts = [pair for pair in _PARTS if set(pair) <= set(table.names)]
+        if len(parts) != 1:
             raise ValueError(
-                f"{path}, line 1: need one of {', '.join(FREQUENCY_COLUMNS)} and either real, imag or gain, "
-                f"phase_rad; found {header}"
+                f"{table.path}, line 1: need one of real, imag and gain, phase_rad; found {list(table.names)}"
             )
-        if label is not None and label not in header:
-            raise ValueError(f"{path}, line 1: missing column {label}; found {header}")
-        omega, response, labels = [], [], []
-        for row in rows:
-            if not any(cell.strip() for cell in row):
-                continue
-            if len(row) != len(header):
-                raise ValueError(
-                    f"{path}, line {rows.line_num}: {len(row)} cells where the header has {len(header)}"
-                )
-            numbers = [
-                number_of_cell(row[header.index(name)], path, rows.line_num, name)
-                for name in (frequency[0], *parts[0])
-            ]
-            omega.append(numbers[0] * FREQUENCY_COLUMNS[frequency[0]])
-            polar = parts[0] == _PARTS[1]
-            response.append(numbers[1] * np.exp(1j * numbers[2]) if polar else complex(*numbers[1:]))
-            labels.append("" if label is None else row[header.index(label)].strip())
-        if not omega:
-            raise ValueError(f"{path}: no rows under the header")
-        return cls(np.array(omega), np.array(response), tuple(labels))
+        if label is not None and label not in table.names:
+            raise ValueError(f"{table.path}, line 1: missing column {label}; found {list(table.names)}")
+        first, second = table.columns(parts[0]).values()
+        response = first + 1j * second if parts[0] == _PARTS[0] else first * np.exp(1j * second)
+        labels = [""] * response.size if label is None else [str(cell).strip() for cell in table.raw[label]]
+        return cls(frequencies(table), response, tuple(labels))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -123,8 +98,9 @@ class FrfRepeats:
         level: float = 0.95,
         pool_neighbours: int = 0,
         outlier_threshold: float | None = None,
+        of: Literal["mean", "next run"] = "mean",
     ) -> FrequencyUncertainty:
-        """Mean over all points of each frequency; as `FrequencyUncertainty.from_frf_repeats`."""
+        """Mean over all points of each frequency, as `FrequencyUncertainty.from_frf_repeats`."""
         return FrequencyUncertainty.from_frf_repeats(
             self.omega_rad_s,
             self.response,
@@ -132,27 +108,8 @@ class FrfRepeats:
             level=level,
             pool_neighbours=pool_neighbours,
             outlier_threshold=outlier_threshold,
+            of=of,
         )
-
-    def next_run(
-        self,
-        dt_s: float,
-        *,
-        level: float = 0.95,
-        pool_neighbours: int = 0,
-        outlier_threshold: float | None = None,
-    ) -> FrequencyUncertainty:
-        """The same centre with the region of one more run: scatter of a run plus error of the mean, widened
-        to Hotelling's prediction region at `level`."""
-        omega, centre, covariance = mean_of_repeats(
-            self.omega_rad_s,
-            self.response,
-            level=level,
-            pool_neighbours=pool_neighbours,
-            outlier_threshold=outlier_threshold,
-            of="next run",
-        )
-        return FrequencyUncertainty(omega, centre, covariance, dt_s, level, "one more run")
 
     def _chosen(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FrfRepeats:
         if not np.any(keep):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -184,7 +184,7 @@ class Record:
         )
 
     @classmethod
-    def from_csv(
+    def from_file(
         cls,
         path: str | PathLike[str],
         inputs: Sequence[str],
@@ -194,83 +194,45 @@ class Record:
         dt_s: float | None = None,
         references: Sequence[str] = (),
         name: str | None = None,
-        separator: str = ",",
-    ) -> Record:
-        """Read columns of a CSV file with one header line; see `ident.data.record_files` for the checks."""
-        from ident.data.record_files import read_csv
+        **reading: Any,
+    ) -> Self:
+        """Read columns of a CSV, npz or MATLAB file; readers and checks: `ident.data.record_files`.
 
-        return _assemble(cls, read_csv(path, separator), inputs, outputs, time, dt_s, references, name)
+        The sampling time comes from the column `time`, from dt_s, or from both if they agree. `reading` are
+        options of the reader (CSV: separator). Raises ValueError in one line naming file and place.
+        """
+        from ident.data.record_files import read_table
 
-    @classmethod
-    def from_npz(
-        cls,
-        path: str | PathLike[str],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        *,
-        time: str | None = None,
-        dt_s: float | None = None,
-        references: Sequence[str] = (),
-        name: str | None = None,
-    ) -> Record:
-        """Read vectors of a numpy .npz file (never unpickled); same arguments and checks as `from_csv`."""
-        from ident.data.record_files import read_npz
-
-        return _assemble(cls, read_npz(path), inputs, outputs, time, dt_s, references, name)
-
-    @classmethod
-    def from_mat(
-        cls,
-        path: str | PathLike[str],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        *,
-        time: str | None = None,
-        dt_s: float | None = None,
-        references: Sequence[str] = (),
-        name: str | None = None,
-    ) -> Record:
-        """Read vectors of a MATLAB .mat file (up to version 7.2); same arguments and checks as `from_csv`."""
-        from ident.data.record_files import read_mat
-
-        return _assemble(cls, read_mat(path), inputs, outputs, time, dt_s, references, name)
-
-
-def _assemble(
-    cls: type[Record],
-    table: Any,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    time: str | None,
-    dt_s: float | None,
-    references: Sequence[str],
-    name: str | None,
-) -> Record:
-    for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
-        if isinstance(names, str):
+        table = read_table(path, **reading)
+        for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
+            if isinstance(names, str):
+                raise ValueError(
+                    f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
+                )
+        wanted = [*inputs, *outputs, *references]
+        if time in wanted:
             raise ValueError(
-                f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
+                f"{table.path}: column {time!r} is asked for as time and as a signal; expected two"
             )
-    wanted = [*inputs, *outputs, *references]
-    if time in wanted:
-        raise ValueError(f"{table.path}: column {time!r} is asked for as time and as a signal; expected two")
-    both = [item for item in inputs if item in outputs]
-    if both:
-        raise ValueError(f"{table.path}: column {both[0]!r} is asked for as input and output; expected two")
-    columns = table.columns(wanted if time is None else [time, *wanted])
-    step = table.sampling_time(None if time is None else columns[time], time, dt_s)
+        both = [item for item in inputs if item in outputs]
+        if both:
+            raise ValueError(
+                f"{table.path}: column {both[0]!r} is asked for as input and output; expected two"
+            )
+        columns = table.columns(wanted if time is None else [time, *wanted])
+        step = table.sampling_time(None if time is None else columns[time], time, dt_s)
 
-    def stack(names: Sequence[str]) -> RealArray:
-        return np.column_stack([columns[item] for item in names]) if names else np.zeros((0, 0))
+        def stack(names: Sequence[str]) -> RealArray:
+            return np.column_stack([columns[item] for item in names]) if names else np.zeros((0, 0))
 
-    return cls(
-        name=table.path.stem if name is None else name,
-        input=stack(inputs),
-        output=stack(outputs),
-        dt_s=step,
-        input_names=tuple(inputs),
-        output_names=tuple(outputs),
-        reference=stack(references) if references else None,
-        reference_names=tuple(references),
-        source=str(table.path),
-    )
+        return cls(
+            name=table.path.stem if name is None else name,
+            input=stack(inputs),
+            output=stack(outputs),
+            dt_s=step,
+            input_names=tuple(inputs),
+            output_names=tuple(outputs),
+            reference=stack(references) if references else None,
+            reference_names=tuple(references),
+            source=str(table.path),
+        )

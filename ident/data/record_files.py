@@ -1,11 +1,13 @@
-"""Reading columns of numbers from log files; every complaint is one line that names file, place and
-expectation."""
+"""Reading columns of numbers from log files: one registered reader per format (`reads`).
+
+Every complaint is one line that names file, place and expectation.
+"""
 
 from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -43,14 +45,12 @@ class Table:
         ValueError
             If one is missing (lists those there are), not numeric, not finite or of another length.
         """
-        found: dict[str, RealArray] = {}
         for name in wanted:
             if name not in self.names:
                 raise ValueError(
                     f"{self.path}: no column '{name}'; the file has {_listed(self.names)}{self._hint()}"
                 )
-            if name not in found:
-                found[name] = self._numbers(name)
+        found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
         sizes = {name: column.size for name, column in found.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(f"{self.path}: columns must be equally long; got {sizes}")
@@ -71,7 +71,7 @@ class Table:
     def _numbers(self, name: str) -> RealArray:
         column = self.raw[name]
         if isinstance(column, pd.Series):
-            return self._text_to_numbers(name, column)
+            return self._finite(name, pd.to_numeric(column, errors="coerce").to_numpy(np.float64), column)
         values = np.asarray(column)
         if values.dtype.kind not in "fiub":
             raise ValueError(f"{self.path}: column '{name}' holds {values.dtype}; expected real numbers")
@@ -80,28 +80,21 @@ class Table:
             values = values.ravel()
         if values.ndim != 1:
             raise ValueError(f"{self.path}: column '{name}' has shape {values.shape}; expected a vector")
-        numbers = values.astype(np.float64)
-        self._require_finite(name, numbers)
-        return numbers
+        return self._finite(name, values.astype(np.float64), values)
 
-    def _text_to_numbers(self, name: str, column: pd.Series[Any]) -> RealArray:
-        numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64)
-        if np.all(np.isfinite(numbers)):
-            return numbers
-        row = int(np.flatnonzero(~np.isfinite(numbers))[0])
-        text = column.iloc[row]
-        shown = "empty" if not isinstance(text, str) or not text.strip() else f"'{text.strip()[:40]}'"
-        raise ValueError(
-            f"{self.path}, {self.place(row)}: column '{name}' is {shown}; expected a finite number"
-        )
-
-    def _require_finite(self, name: str, numbers: RealArray) -> None:
+    def _finite(self, name: str, numbers: RealArray, shown: Any) -> RealArray:
+        """The numbers if all are finite; else a complaint that quotes the first that is not."""
         bad = np.flatnonzero(~np.isfinite(numbers))
-        if bad.size:
-            raise ValueError(
-                f"{self.path}, {self.place(int(bad[0]))}: column '{name}' is {numbers[bad[0]]}; "
-                "expected a finite number"
-            )
+        if not bad.size:
+            return numbers
+        row = int(bad[0])
+        found = shown.iloc[row] if isinstance(shown, pd.Series) else shown[row]
+        if isinstance(shown, pd.Series):
+            text = found.strip()[:40] if isinstance(found, str) else ""
+            found = f"'{text}'" if text else "empty"
+        raise ValueError(
+            f"{self.path}, {self.place(row)}: column '{name}' is {found}; expected a finite number"
+        )
 
     def sampling_time(self, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
         """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both
@@ -159,9 +152,36 @@ class Table:
         return float(dt_s)
 
 
-def read_csv(path: str | PathLike[str], separator: str = ",") -> Table:
+Reader = Callable[..., Table]
+READERS: dict[str, Reader] = {}
+"""Readers by the ending of a file's name."""
+
+
+def reads(*endings: str) -> Callable[[Reader], Reader]:
+    """Registers a reader for these endings; it takes a path (and options of its own) and gives a `Table`."""
+
+    def register(reader: Reader) -> Reader:
+        READERS.update(dict.fromkeys(endings, reader))
+        return reader
+
+    return register
+
+
+def read_table(path: str | PathLike[str], **options: Any) -> Table:
+    """The columns of a log file; `options` are those of its reader. ValueError: one line."""
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"{file}: {'not a file' if file.exists() else 'no such file'}")
+    if file.suffix.lower() not in READERS:
+        raise ValueError(
+            f"{file}: unknown kind of file {file.suffix!r}; expected one of {', '.join(READERS)}"
+        )
+    return READERS[file.suffix.lower()](file, **options)
+
+
+@reads(".csv", ".txt")
+def _read_csv(file: Path, separator: str = ",") -> Table:
     """A text table with one header line. Numbers use a decimal point."""
-    file = _existing(path)
     try:
         # As text: only so can a complaint quote what stands at the place. Blank lines stay, to keep the
         # line numbers.
@@ -185,47 +205,42 @@ def read_csv(path: str | PathLike[str], separator: str = ",") -> Table:
             f"{file}: not a UTF-8 text file (byte {error.start}); expected CSV in UTF-8"
         ) from None
     names = tuple(str(item).strip() for item in frame.iloc[0])
-    frame = frame.iloc[1:].set_axis(list(names), axis="columns")
     if len(set(names)) != len(names):
         raise ValueError(f"{file}, line 1: column names repeat; got {_listed(names)}")
+    frame = frame.iloc[1:].set_axis(list(names), axis="columns")
     # Blank lines at the very end are no samples.
-    n_rows = len(frame)
-    while (
-        n_rows and not "".join(str(item) for item in frame.iloc[n_rows - 1] if isinstance(item, str)).strip()
-    ):
-        n_rows -= 1
-    if n_rows == 0:
+    filled = np.flatnonzero((frame.fillna("") != "").any(axis="columns"))
+    if filled.size == 0:
         raise ValueError(f"{file}: no rows under the header line; expected numbers")
-    frame = frame.iloc[:n_rows]
+    frame = frame.iloc[: filled[-1] + 1]
     return Table(file, names, {item: frame[item] for item in names}, first_line=2)
 
 
-def read_npz(path: str | PathLike[str]) -> Table:
+@reads(".npz")
+def _read_npz(file: Path) -> Table:
     """A numpy archive of named vectors; object arrays (pickles) are refused."""
-    file = _existing(path)
+    raw: dict[str, Any] = {}
     try:
         archive = np.load(file, allow_pickle=False)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile):
-        raise ValueError(f"{file}: not a numpy .npz archive") from None
+        archive = None
     if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise ValueError(f"{file}: a single .npy array without column names; expected a .npz archive")
+        raise ValueError(f"{file}: not a numpy .npz archive")
     with archive:
-        raw: dict[str, Any] = {}
         for name in archive.files:
             try:
                 raw[name] = archive[name]
             except ValueError:
-                raise ValueError(
-                    f"{file}: '{name}' holds Python objects; expected arrays of numbers"
-                ) from None
+                what = f"'{name}' holds Python objects; expected arrays of numbers"
+                raise ValueError(f"{file}: {what}") from None
             except (OSError, EOFError, zipfile.BadZipFile):
                 raise ValueError(f"{file}: '{name}' cannot be read, the archive is damaged") from None
     return Table(file, tuple(raw), raw, first_line=None)
 
 
-def read_mat(path: str | PathLike[str]) -> Table:
+@reads(".mat")
+def _read_mat(file: Path) -> Table:
     """A MATLAB file up to version 7.2 (version 7.3 is HDF5: save with '-v7')."""
-    file = _existing(path)
     raw = mat_variables(file, file)
     return Table(file, tuple(raw), raw, first_line=None)
 
@@ -248,15 +263,6 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _existing(path: str | PathLike[str]) -> Path:
-    file = Path(path)
-    if not file.exists():
-        raise ValueError(f"{file}: no such file")
-    if not file.is_file():
-        raise ValueError(f"{file}: not a file")
-    return file
 
 
 def _listed(names: Iterable[str], limit: int = 20) -> str:

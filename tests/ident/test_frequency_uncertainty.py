@@ -167,14 +167,14 @@ HEADER = "omega_rad_s,real,imag,variance_real,variance_imag,covariance_real_imag
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (HEADER + "1,1,0,1,1,0\n2,1,x,1,1,0\n", "line 3, column imag: expected a number, found 'x'"),
-        (HEADER + "1,1,nan,1,1,0\n", "line 2, column imag: expected a finite number"),
+        (HEADER + "1,1,0,1,1,0\n2,1,x,1,1,0\n", "line 3: column 'imag' is 'x'; expected a finite number"),
+        (HEADER + "1,1,nan,1,1,0\n", "line 2: column 'imag' is 'nan'; expected a finite number"),
         (HEADER + "1,1,0,-1,1,0\n", "line 2: a variance is negative"),
         (HEADER + "1,1,0,1,1,2\n", "not positive semidefinite"),
         (HEADER + "2,1,0,1,1,0\n1,1,0,1,1,0\n", "strictly increasing"),
-        (HEADER + "1,1,0\n", "line 2: 3 cells where the header has 6"),
+        (HEADER + "1,1,0\n", "line 2: column 'variance_real' is empty"),
         (HEADER, "no rows"),
-        ("omega_rad_s,real\n1,2\n", "missing column imag, variance_real"),
+        ("omega_rad_s,real\n1,2\n", "no column 'imag'; the file has omega_rad_s, real"),
         ("real,imag\n1,2\n", "exactly one of the columns"),
     ],
 )
@@ -193,7 +193,7 @@ def test_csv_in_hertz_and_without_cross_covariance(tmp_path):
     record = FrequencyUncertainty.from_csv(path, DT)
     assert record.omega_rad_s[0] == pytest.approx(2 * np.pi)
     np.testing.assert_array_equal(record.covariance[0], np.diag([4.0, 9.0]))
-    with pytest.raises(ValueError, match="there is no such file"):
+    with pytest.raises(ValueError, match="no such file"):
         FrequencyUncertainty.from_csv(tmp_path / "absent.csv", DT)
 
 

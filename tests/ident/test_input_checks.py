@@ -215,5 +215,5 @@ def test_warnings_name_the_file(tmp_path):
     path = tmp_path / "log 7.csv"
     y = saturated(filtered(binary()))
     np.savetxt(path, np.column_stack([binary(), y]), delimiter=",", header="u,y", comments="")
-    record = Record.from_csv(path, ["u"], ["y"], dt_s=DT_S)
+    record = Record.from_file(path, ["u"], ["y"], dt_s=DT_S)
     assert only(warnings_of(record, n_real=1, n_pairs=1), "clipped").startswith(str(path))

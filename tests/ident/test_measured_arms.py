@@ -27,7 +27,7 @@ def sweeps(folder, output):
         for repeat in (1, 2, 3):
             path = folder / "slfr_krauss_2009" / f"swept_sine_amp{amplitude}_rep{repeat}.csv"
             records.append(
-                Record.from_csv(
+                Record.from_file(
                     path, inputs=["v_drive_counts"], outputs=[output], time="t_s", references=["u_ref_rad"]
                 )
             )
@@ -99,7 +99,7 @@ def test_single_link_bounds_hold_the_record_left_out(flexlink_data, output):
 
 @pytest.mark.slow
 def test_robot_arm_fits_its_mirrored_half(flexlink_data):
-    whole = Record.from_csv(
+    whole = Record.from_file(
         flexlink_data / "daisy_robot_arm" / "robot_arm.csv",
         inputs=["u_reaction_torque"],
         outputs=["y_acceleration"],
@@ -125,7 +125,7 @@ def test_ellipses_of_a_published_frequency_response(flexlink_data):
     assert np.median(frf.enclosing_radius() / np.abs(frf.centre)) < 0.1
     # The runs of one date predict single runs of the other between 3 and 200 rad/s: 0.98-0.94 measured (0.95
     # promised if days are alike; below, friction changes from day to day; above, its own outliers count).
-    region = plant.only(first).next_run(0.002, outlier_threshold=6.0)
+    region = plant.only(first).mean(0.002, outlier_threshold=6.0, of="next run")
     omega = region.omega_rad_s
     middle = (omega > 3) & (omega < 200)
     points = plant.only(second)

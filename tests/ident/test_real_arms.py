@@ -23,7 +23,7 @@ def percent(y, residual):
 @pytest.fixture(scope="module")
 def robot_arm(flexlink_data):
     path = flexlink_data / "daisy_robot_arm" / "robot_arm.csv"
-    return Record.from_csv(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
+    return Record.from_file(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
 
 
 def robot_arm_options(n_pairs):
@@ -85,7 +85,7 @@ def test_robot_arm_needs_the_direct_term(robot_arm):
 def sweeps(flexlink_data):
     folder = flexlink_data / "slfr_krauss_2009"
     return [
-        Record.from_csv(
+        Record.from_file(
             folder / f"swept_sine_amp{amplitude}_rep{repeat}.csv",
             ["v_drive_counts"],
             ["theta_rad", "accel_counts"],
@@ -147,6 +147,8 @@ def test_krauss_arm_warns_of_the_band_that_was_not_excited(sweeps):
 
 
 def test_emps_time_stamps_jitter_within_the_tolerance(flexlink_data):
-    record = Record.from_csv(flexlink_data / "emps" / "emps_train.csv", ["force_N"], ["q_meas_m"], time="t_s")
+    record = Record.from_file(
+        flexlink_data / "emps" / "emps_train.csv", ["force_N"], ["q_meas_m"], time="t_s"
+    )
     assert record.dt_s == pytest.approx(1e-3, rel=1e-6)
     assert record.n_samples == 24841

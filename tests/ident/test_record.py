@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from ident.data import record_files
 from ident.data.record import Record
 
 T, U, Y = "t_s", "u_V", "y_rad"
@@ -26,7 +27,7 @@ def good(tmp_path):
 
 
 def read(path, **kwargs):
-    return Record.from_csv(path, [U], [Y], **({"time": T} | kwargs))
+    return Record.from_file(path, [U], [Y], **({"time": T} | kwargs))
 
 
 def complaint(path, **kwargs):
@@ -100,7 +101,7 @@ def test_bad_numbers_in_columns_nobody_asked_for_do_no_harm(tmp_path):
 
 def test_missing_column_lists_those_there(good):
     with pytest.raises(ValueError, match="no column 'w'; the file has t_s, u_V, y_rad"):
-        Record.from_csv(good, ["w"], [Y], time=T)
+        Record.from_file(good, ["w"], [Y], time=T)
 
 
 def test_a_blank_line_in_the_middle_is_named(tmp_path):
@@ -138,9 +139,9 @@ def test_decimal_commas_are_named_by_line(tmp_path):
 
 def test_one_column_is_not_two_things(good):
     with pytest.raises(ValueError, match="as input and output"):
-        Record.from_csv(good, [U], [U], time=T)
+        Record.from_file(good, [U], [U], time=T)
     with pytest.raises(ValueError, match="as time and as a signal"):
-        Record.from_csv(good, [T], [Y], time=T)
+        Record.from_file(good, [T], [Y], time=T)
 
 
 def test_time_running_backwards_or_standing_still(tmp_path):
@@ -198,7 +199,7 @@ def test_paths_that_are_not_there(tmp_path):
 
 def test_one_string_is_not_a_list_of_columns(good):
     with pytest.raises(ValueError, match="must be a list of column names"):
-        Record.from_csv(good, U, [Y], time=T)
+        Record.from_file(good, U, [Y], time=T)
 
 
 def arrays():
@@ -210,8 +211,8 @@ def test_npz_and_mat_are_read_like_csv(tmp_path, good):
     scipy.io.savemat(tmp_path / "log.mat", arrays())
     expected = read(good)
     for record in (
-        Record.from_npz(tmp_path / "log.npz", [U], [Y], time=T),
-        Record.from_mat(tmp_path / "log.mat", [U], [Y], time=T),
+        Record.from_file(tmp_path / "log.npz", [U], [Y], time=T),
+        Record.from_file(tmp_path / "log.mat", [U], [Y], time=T),
     ):
         np.testing.assert_array_equal(record.input, expected.input)
         np.testing.assert_array_equal(record.output, expected.output)
@@ -222,7 +223,7 @@ def test_npz_with_objects_is_refused_without_running_them(tmp_path):
     path = tmp_path / "log.npz"
     np.savez(path, **(arrays() | {U: np.array([object()] * 6)}))
     with pytest.raises(ValueError, match="'u_V' holds Python objects"):
-        Record.from_npz(path, [U], [Y], time=T)
+        Record.from_file(path, [U], [Y], time=T)
 
 
 @pytest.mark.parametrize(
@@ -239,17 +240,34 @@ def test_bad_npz_content(tmp_path, change, message):
     path = tmp_path / "log.npz"
     np.savez(path, **(arrays() | change))
     with pytest.raises(ValueError, match=message):
-        Record.from_npz(path, [U], [Y], time=T)
+        Record.from_file(path, [U], [Y], time=T)
 
 
 def test_files_of_another_kind(tmp_path, good):
-    with pytest.raises(ValueError, match=r"not a numpy .npz archive"):
-        Record.from_npz(good, [U], [Y], time=T)
-    with pytest.raises(ValueError, match=r"not a MATLAB .mat file"):
-        Record.from_mat(good, [U], [Y], time=T)
     np.save(tmp_path / "one.npy", np.arange(3.0))
-    with pytest.raises(ValueError, match="without column names"):
-        Record.from_npz(tmp_path / "one.npy", [U], [Y], time=T)
+    for source, name, message in (
+        (good, "csv.npz", "not a numpy .npz archive"),
+        (good, "csv.mat", "not a MATLAB .mat file"),
+        (tmp_path / "one.npy", "npy.npz", "not a numpy .npz archive"),
+        (good, "log.xlsx", "unknown kind of file '.xlsx'; expected one of .csv"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(source.read_bytes())
+        with pytest.raises(ValueError, match=message):
+            Record.from_file(path, [U], [Y], time=T)
+
+
+def test_a_format_of_ones_own_is_one_registered_reader(tmp_path, good, monkeypatch):
+    monkeypatch.setattr(record_files, "READERS", dict(record_files.READERS))
+
+    @record_files.reads(".rows")
+    def _read_rows(file):
+        return record_files.Table(
+            file, (T, U, Y), dict(zip((T, U, Y), np.loadtxt(file).T, strict=True)), None
+        )
+
+    path = write(tmp_path / "log.rows", [row.replace(",", " ") for row in rows()])
+    np.testing.assert_array_equal(read(path).output, read(good).output)
 
 
 def two_by_two(**change):

@@ -137,23 +137,13 @@ def read_log(
     references: Sequence[str] = (),
     name: str | None = None,
 ) -> Record:
-    """A csv, npz or mat file by its ending; constant inputs are refused. Raises InputError, one line."""
-    readers = {
-        ".csv": Record.from_csv,
-        ".txt": Record.from_csv,
-        ".npz": Record.from_npz,
-        ".mat": Record.from_mat,
-    }
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: unknown kind of file {path.suffix!r}; expected .csv, .npz or .mat")
+    """A log by its ending, in any format of `ident.data.record_files`. Raises InputError, one line."""
     try:
-        record = reader(path, inputs, outputs, time=time, dt_s=dt_s, references=references, name=name)
+        return Record.from_file(path, inputs, outputs, time=time, dt_s=dt_s, references=references, name=name)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except ValueError as error:
         raise InputError(error) from error
-    return record
 
 
 def refuse_constant_input(record: Record) -> None:
