@@ -19,44 +19,27 @@ import os
 import shutil
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from workflow.engine import storage
-from workflow.engine.errors import InputError
-from workflow.engine.storage import AnyArray
+from workflow.engine import codec, storage
+from workflow.engine.errors import InputError, naming
 
-LAYOUT_VERSION = 2  # 2: identifications with tests of priors
+LAYOUT_VERSION = 3  # 3: results by codec
+T = TypeVar("T")
 _INPUT_HASH = "_input_hash"
-_DOCUMENT = "_document"
+_RESULT = "result"
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")
 
 
 # The manifest goes first when a run is deleted: what is left by a kill in between is then no run any more.
 _OWN_ENTRIES = ("manifest.json", "config.toml", "config.json", "stages", "figures", "report.html", "lock")
-
-
-@dataclass(frozen=True, eq=False)
-class StageData:
-    """What a stage leaves behind: named arrays, and a JSON-able document for words and single numbers.
-
-    With arrays the stage is stored as npz (the document rides along as text), without as plain JSON.
-    """
-
-    arrays: Mapping[str, AnyArray] = field(default_factory=dict)
-    document: Mapping[str, Any] = field(default_factory=dict)
-
-    def under(self, prefix: str) -> dict[str, AnyArray]:
-        """The arrays whose name starts with `prefix`, with the prefix taken off."""
-        return {
-            name.removeprefix(prefix): value for name, value in self.arrays.items() if name.startswith(prefix)
-        }
 
 
 @dataclass(frozen=True)
@@ -237,37 +220,27 @@ class RunDirectory:
         path = self.stage_file(name)
         return path is not None and _recorded_hash(path) == input_hash
 
-    def save_stage(self, name: str, data: StageData, input_hash: str) -> Path:
-        """Write a stage atomically, replacing what was there under either suffix."""
-        text = json.dumps(_plain(data.document), ensure_ascii=False)
-        if data.arrays:
-            path, other = self.stages_path / f"{name}.npz", self.stages_path / f"{name}.json"
-            # The document travels as UTF-8 bytes: a unicode array would drop trailing NULs and take four
-            # bytes each.
-            own = {
-                _INPUT_HASH: np.array(input_hash),
-                _DOCUMENT: np.frombuffer(text.encode("utf-8"), dtype=np.uint8),
-            }
-            storage.write_npz(path, {**own, **data.arrays})
-        else:
-            path, other = self.stages_path / f"{name}.json", self.stages_path / f"{name}.npz"
-            storage.write_json(path, {_INPUT_HASH: input_hash, **data.document})
-        other.unlink(missing_ok=True)
+    def save_stage(self, name: str, result: Any, input_hash: str) -> Path:
+        """Write a stage's result atomically, replacing what was there under either suffix."""
+        return self.write_stage(name, *stage_bytes(result, input_hash))
+
+    def write_stage(self, name: str, content: bytes, suffix: str) -> Path:
+        """The same from the file's content, which another process made."""
+        path = self.stages_path / f"{name}{suffix}"
+        storage.write_bytes(path, content)
+        (self.stages_path / f"{name}{'.npz' if suffix == '.json' else '.json'}").unlink(missing_ok=True)
         return path
 
-    def load_stage(self, name: str) -> StageData:
-        """A finished stage. Raises InputError when it is not there or not readable."""
+    def load_stage(self, name: str, kind: type[T]) -> T:
+        """The result of a finished stage. Raises InputError when it is not there or not readable."""
         path = self.stage_file(name)
         if path is None:
             raise InputError(f"{self.path}: stage {name} is not there; run flexlink run --resume first")
-        if path.suffix == ".json":
-            document = storage.read_json(path)
-            document.pop(_INPUT_HASH, None)
-            return StageData({}, document)
-        arrays = storage.read_npz(path)
-        arrays.pop(_INPUT_HASH, None)
-        text = arrays.pop(_DOCUMENT).tobytes().decode("utf-8")
-        return StageData(arrays, json.loads(text, object_hook=storage.decode))
+        with naming(str(path)):
+            if path.suffix == ".npz":
+                return codec.from_arrays(kind, storage.read_npz(path))
+            document = json.loads(storage.read_text(path))
+            return codec.unpack(kind, document.get(_RESULT), {})
 
     # -- manifest --------------------------------------------------------------------------------------------
 
@@ -294,6 +267,16 @@ class RunDirectory:
         manifest["status"] = status
         manifest["updated"] = _now()
         storage.write_json(self.manifest_path, manifest)
+
+
+def stage_bytes(result: Any, input_hash: str) -> tuple[bytes, str]:
+    """Content and suffix of a stage's file: npz, or JSON for a result without arrays."""
+    document, arrays = codec.pack(result)
+    if arrays:
+        own = {_INPUT_HASH: np.array(input_hash), **codec.to_arrays(result)}
+        return storage.npz_bytes(own), ".npz"
+    text = json.dumps({_INPUT_HASH: input_hash, _RESULT: document}, indent=1, ensure_ascii=False)
+    return (text + "\n").encode("utf-8"), ".json"
 
 
 def package_versions() -> dict[str, str]:

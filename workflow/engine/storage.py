@@ -77,12 +77,22 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(encode(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def read_text(path: Path) -> str:
+    """UTF-8 text of a file. Raises InputError naming it."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """The document written by `write_json`. Raises InputError naming the file."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"), object_hook=decode)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
+        document = json.loads(read_text(path), object_hook=decode)
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{path}: not valid JSON: {error}") from error
     if not isinstance(document, dict):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from workflow.config.run_config import RunConfig
 from workflow.engine import storage
-from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import Picture, render
 from workflow.report.data import RunData, load
 from workflow.report.loop_sections import (
@@ -21,6 +20,7 @@ from workflow.report.page import Plot, Section, Table
 from workflow.report.pictures import pictures_of
 from workflow.report.rendering import page
 from workflow.report.verdict import reproducibility_section, verdict_of
+from workflow.tasks.results import RunResults
 from workflow.tasks.summary import summarise
 
 __all__ = ["write_report"]
@@ -33,14 +33,14 @@ OVERVIEW_CAPTION = (
 
 
 def write_report(
-    run: RunDirectory, config: RunConfig, progress: Callable[[float, str], None] | None = None
+    results: RunResults, config: RunConfig, progress: Callable[[float, str], None] | None = None
 ) -> Path:
     """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
 
     Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
     Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
     """
-    data = load(run, config)
+    run, data = results.run, load(results, config)
     drawers = pictures_of(data)
     pictures = {}
     for position, (name, draw) in enumerate(drawers.items()):
@@ -56,13 +56,13 @@ def write_report(
     for stale in sorted(run.figures_path.iterdir()):
         if stale.suffix in (".svg", ".png") and stale.name not in written:
             stale.unlink()
-    storage.write_text(run.report_path, page_of(run, data, pictures))
+    storage.write_text(run.report_path, page_of(results, data, pictures))
     return run.report_path
 
 
-def page_of(run: RunDirectory, data: RunData, pictures: Mapping[str, Picture]) -> str:
+def page_of(results: RunResults, data: RunData, pictures: Mapping[str, Picture]) -> str:
     """The page as HTML. Everything that comes from the user is escaped by the template engine."""
-    summary = summarise(run, data.config)
+    summary = summarise(results, data.config)
     sections = [
         records_section(data),
         identification_section(data),

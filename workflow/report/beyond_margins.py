@@ -8,9 +8,9 @@ from control_design.convex.reference_filter import Prefilter
 from workflow.report.data import RunData
 from workflow.report.formats import frequency, number, percent, sentence
 from workflow.report.page import Block, Code, Remarks, Table, Text, heading, maybe
-from workflow.tasks.achievable_performance import bracket_of, order_advice, yardstick_words
-from workflow.tasks.joint_coverage import joint_numbers, joint_of, joint_words
-from workflow.tasks.reference_filter import prefilter_of, prefilter_words
+from workflow.tasks.achievable_performance import achievable_words, order_advice
+from workflow.tasks.joint_coverage import joint_numbers, joint_words
+from workflow.tasks.reference_filter import filter_words
 
 
 def beyond_words(data: RunData) -> list[str]:
@@ -21,12 +21,12 @@ def beyond_words(data: RunData) -> list[str]:
     gamma, order = data.synthesis.gamma, data.config.specification.controller_order
     words = [_any_order(data, gamma, order), _whole(data), prefilter_sentence(data)]
     if gamma > 1:
-        words.append(order_advice(data.yardstick, gamma, order))
+        words.append(order_advice(data.achievable, gamma, order))
     return [text for text in words if text]
 
 
 def _any_order(data: RunData, gamma: float | None, order: int) -> str | None:
-    bracket = bracket_of(data.yardstick)
+    bracket = data.achievable.bracket
     if bracket is None or gamma is None:
         return None
     if not (math.isfinite(bracket.ellipse) and math.isfinite(gamma)):
@@ -41,10 +41,10 @@ def _any_order(data: RunData, gamma: float | None, order: int) -> str | None:
 
 
 def _whole(data: RunData) -> str | None:
-    joint = joint_of(data.whole)
+    joint = data.sampled.joint
     if joint is None:
         return None
-    numbers = joint_numbers(data.whole)
+    numbers = joint_numbers(data.sampled)
     stable = f"{percent(100 * joint.stable_share, 4)} give a stable loop"
     stable += f" (at least {percent(100 * numbers['stable_interval'][0], 4)} with 95 % confidence)"
     if not math.isfinite(joint.gamma_given):
@@ -59,18 +59,18 @@ def _whole(data: RunData) -> str | None:
 
 def prefilter_sentence(data: RunData) -> str | None:
     """The prefilter in one sentence; None where none was asked for."""
-    words = prefilter_words(data.prefilter)
+    words = filter_words(data.reference_filter)
     if words is None:
         return None
-    return words if prefilter_of(data.prefilter) is None else f"prefilter of {words}"
+    return words if data.reference_filter.filter is None else f"prefilter of {words}"
 
 
 def order_blocks(data: RunData) -> list[Block]:
     """How far the order chosen is from what any controller could reach."""
-    bracket = bracket_of(data.yardstick)
+    bracket = data.achievable.bracket
     gamma = data.synthesis.gamma if data.synthesis is not None and data.has_controller else None
     order = data.config.specification.controller_order
-    words = yardstick_words(data.yardstick, gamma, order)
+    words = achievable_words(data.achievable, gamma, order)
     if words is None:
         return []
     if bracket is None:
@@ -89,7 +89,7 @@ def order_blocks(data: RunData) -> list[Block]:
         "controllers (Youla). It knows the weights, but neither structure nor damping of the controller's "
         "own poles nor a delay margin, which may cost more.",
     )
-    advice = None if gamma is None or gamma <= 1 else order_advice(data.yardstick, gamma, order)
+    advice = None if gamma is None or gamma <= 1 else order_advice(data.achievable, gamma, order)
     return [
         heading("Against a controller of any order"),
         Text(sentence(_any_order(data, gamma, order) or words)),
@@ -100,13 +100,13 @@ def order_blocks(data: RunData) -> list[Block]:
 
 def whole_blocks(data: RunData) -> list[Block]:
     """For how many whole responses the worst case holds."""
-    words = joint_words(data.whole)
+    words = joint_words(data.sampled)
     if words is None:
         return []
-    joint = joint_of(data.whole)
+    joint = data.sampled.joint
     if joint is None:
         return [Text(sentence(words))]
-    numbers = joint_numbers(data.whole)
+    numbers = joint_numbers(data.sampled)
     low, high = (percent(100 * value, 4) for value in numbers["held_interval"])
     stable_low, stable_high = (percent(100 * value, 4) for value in numbers["stable_interval"])
     rows = (
@@ -134,7 +134,7 @@ def whole_blocks(data: RunData) -> list[Block]:
         "the closed loop. In brackets the 95 % interval of the share. A response may leave its ellipse where "
         "nothing is at stake.",
     )
-    short = joint.level > joint.given_level and not data.whole["calibrated"]
+    short = joint.level > joint.given_level and not data.sampled.calibrated
     return [
         heading("Whole responses"),
         *(maybe((sentence(words),), "warning") if short else (Text(sentence(_whole(data) or words)),)),
@@ -156,7 +156,7 @@ def prefilter_blocks(data: RunData) -> list[Block]:
     words = prefilter_sentence(data)
     if words is None:
         return []
-    found: Prefilter | None = prefilter_of(data.prefilter)
+    found: Prefilter | None = data.reference_filter.filter
     if found is None:
         return [heading("Prefilter"), Remarks((sentence(words),), "warning")]
     table = Table(

@@ -35,7 +35,6 @@ from workflow.report.model_blocks import (
 from workflow.report.page import Block, Plot, Section, Table, Text, maybe
 from workflow.report.rendering import page
 from workflow.tasks.log_identification import LogIdentification
-from workflow.tasks.stages.uncertainty import tests_by_name
 
 _LIGHT = 0.3
 
@@ -63,7 +62,7 @@ def identify_page(
     about = result.about
     return page(
         "identify.html.j2",
-        title=f"{about['input']} to {about['output']}",
+        title=f"{about.input} to {about.output}",
         sections=[
             _modes(result),
             _response(result),
@@ -88,8 +87,8 @@ def identify_page(
 
 
 def _headline(result: LogIdentification) -> str:
-    light = [mode for mode in result.about["modes"] if mode["damping"] < _LIGHT]
-    text = f"A model of order {result.about['order']} with {count(len(light), 'lightly damped mode')}"
+    light = [mode for mode in result.about.modes if mode.damping < _LIGHT]
+    text = f"A model of order {result.about.order} with {count(len(light), 'lightly damped mode')}"
     careful = len(result.careful)
     return text + (f"; {count(careful, 'thing')} to look at before trusting it" if careful else "")
 
@@ -98,26 +97,26 @@ def _found(result: LogIdentification) -> list[str]:
     about, options = result.about, result.options
     sentences = [sentence(structure_words(about))]
     fixed = options.fixed()
-    n_real = len(about["real_poles_z"]) - fixed.real.size
-    n_pairs = len(about["modes"]) - fixed.pairs.size
+    n_real = len(about.real_poles_z) - fixed.real.size
+    n_pairs = len(about.modes) - fixed.pairs.size
     sentences[0] = (
         f"{sentences[0][:-1]}: {count(n_real, 'real pole')} and {count(n_pairs, 'pole pair')} were found, "
         f"{_why_this_order(result)}."
     )
-    spread = result.spread["intervals"]
-    for index, mode in enumerate(about["modes"]):
-        if mode["damping"] >= _LIGHT:
+    spread = result.spread.intervals
+    for index, mode in enumerate(about.modes):
+        if mode.damping >= _LIGHT:
             continue
-        text = f"Mode at {frequency(mode['omega_rad_s'])}, damping {number(mode['damping'])}"
+        text = f"Mode at {frequency(mode.omega_rad_s)}, damping {number(mode.damping)}"
         if spread is not None:
-            low, high = spread["modes"][index]["frequency_Hz"]
+            low, high = spread.modes[index].frequency_Hz
             text += f", frequency known to {_plus_minus(low, high)}"
-            text += f", damping to {_plus_minus(*spread['modes'][index]['damping'])}"
+            text += f", damping to {_plus_minus(*spread.modes[index].damping)}"
         sentences.append(text + ".")
     if result.plot is not None:
         sentences.append(stabilisation_sentence(result.plot))
-    if about["band_rad_s"] is not None:
-        low, high = about["band_rad_s"]
+    if about.band_rad_s is not None:
+        low, high = about.band_rad_s
         sentences.append(
             f"Fitted inside the band from {number(low)} to {number(high)} rad/s; nothing is said about the "
             "rest."
@@ -128,7 +127,7 @@ def _found(result: LogIdentification) -> list[str]:
     if known:
         sentences.append(f"Given, not found: {listing(known)}.")
     # What speaks against the model stands among the things to be careful about.
-    return sentences + [sentence(text) for text in about["verdicts"] if text not in result.careful]
+    return sentences + [sentence(text) for text in about.verdicts if text not in result.careful]
 
 
 def _why_this_order(result: LogIdentification) -> str:
@@ -161,23 +160,21 @@ def _plus_minus(low: float, high: float) -> str:
 def _good(result: LogIdentification) -> list[str]:
     about, spread = result.about, result.spread
     sentences = []
-    fits = about["fit_validation_percent"]
+    fits = about.fit_validation_percent
     if fits:
         each = listing([f"{percent(fit)} ({name})" for name, fit in fits.items()])
-        inside = "" if about["band_rad_s"] is None else " inside the band"
+        inside = "" if about.band_rad_s is None else " inside the band"
         sentences.append(f"Run freely on fresh records, the model reproduces {each} of the output{inside}.")
-    used = listing([f"{percent(fit)} ({name})" for name, fit in about["fit_estimation_percent"].items()])
+    used = listing([f"{percent(fit)} ({name})" for name, fit in about.fit_estimation_percent.items()])
     sentences.append(f"On the records it was fitted to: {used}.")
-    level = percent(100 * spread["level"], 4)
-    sentences.append(f"The {level} ellipses of the response are {band_words(spread['bands'])}.")
-    tests = tests_by_name(spread["tests"])
-    passed = [test.name for test in tests.values() if test.passed]
-    if len(passed) == len(tests):
+    level = percent(100 * spread.level, 4)
+    sentences.append(f"The {level} ellipses of the response are {band_words(spread.bands)}.")
+    if all(test.passed for test in spread.tests):
         sentences.append(
             "The residuals pass both tests, white and independent of the input: nothing linear is left."
         )
-    if about["two_stage"]:
-        sentences.append(sentence(about["two_stage"]))
+    if about.two_stage:
+        sentences.append(sentence(about.two_stage))
     return sentences
 
 
@@ -195,7 +192,7 @@ def _careful(result: LogIdentification) -> list[str]:
         )
     return [
         *items,
-        *unknown_bands(result.spread["bands"]),
+        *unknown_bands(result.spread.bands),
         "the level of the ellipses holds at each frequency taken alone, and for the machine as it was in "
         "these records: same amplitude, payload and temperature",
     ]
@@ -205,7 +202,7 @@ def _careful(result: LogIdentification) -> list[str]:
 
 
 def _modes(result: LogIdentification) -> Section:
-    tables = pole_tables(result.about, result.found.model.dt_s, result.spread["intervals"])
+    tables = pole_tables(result.about, result.found.model.dt_s, result.spread.intervals)
     caption = "Intervals are those of the ellipses: noise, initial state and unmodelled rest included."
     blocks: list[Block] = [*tables, Text(caption)] if tables else [Text("The model has no pole.")]
     return Section("modes", "Modes and poles", "Modes", tuple(blocks))
@@ -213,7 +210,7 @@ def _modes(result: LogIdentification) -> Section:
 
 def _response(result: LogIdentification) -> Section:
     spread = result.spread
-    level = percent(100 * spread["level"], 4)
+    level = percent(100 * spread.level, 4)
     return Section(
         "response",
         "Frequency response",
@@ -224,7 +221,7 @@ def _response(result: LogIdentification) -> Section:
                 f"Identified response with the range of gain and phase over its {level} ellipses, the size "
                 "of the ellipses beside the gain, and what the records say without a model.",
             ),
-            band_table(spread["bands"]),
+            band_table(spread.bands),
         ),
     )
 
@@ -278,7 +275,7 @@ def _residuals(result: LogIdentification) -> Section:
         "residuals",
         "What the model leaves",
         "Residuals",
-        (Plot("residuals", residual_caption(result.spread)), *test_remarks(result.spread["tests"])),
+        (Plot("residuals", residual_caption(result.spread)), *test_remarks(result.spread.tests)),
     )
 
 
@@ -332,7 +329,7 @@ def _drawers(result: LogIdentification) -> dict[str, Callable[[], Figure]]:
     plot, steps = result.plot, result.found.order_table
     if plot is not None and steps:
         drawers["order"] = lambda: draw_order(
-            steps, (plot.n_real, plot.chosen), plot, name=result.about["name"], response=_empirical(result)
+            steps, (plot.n_real, plot.chosen), plot, name=result.about.name, response=_empirical(result)
         )
     return drawers
 
@@ -348,8 +345,8 @@ def _draw_bode(result: LogIdentification) -> Figure:
     return draw_bode(
         result.frequency,
         name="Response",
-        input_label=(about["input"], ""),
-        output_label=(about["output"], ""),
+        input_label=(about.input, ""),
+        output_label=(about.output, ""),
         model=result.found.model,
         empirical=_empirical(result),
     )
@@ -362,7 +359,7 @@ def _draw_poles(result: LogIdentification) -> Figure:
         identified=model.poles.values,
         integrators=model.integrators,
         zeros=model.zeros(),
-        name=result.about["name"],
+        name=result.about.name,
     )
 
 
@@ -378,8 +375,8 @@ def _draw_validation(result: LogIdentification) -> Figure:
 
 
 def _draw_residuals(result: LogIdentification) -> Figure:
-    tests = tests_by_name(result.spread["tests"])
-    return draw_residual_tests(tests["whiteness"], tests["independence"], name=result.about["name"])
+    white, independent = (result.spread.test(name) for name in ("whiteness", "independence"))
+    return draw_residual_tests(white, independent, name=result.about.name)
 
 
 def _shown(result: LogIdentification) -> list[ShownRecord]:
@@ -390,4 +387,4 @@ def _shown(result: LogIdentification) -> list[ShownRecord]:
 
 
 def _draw_records(result: LogIdentification) -> Figure:
-    return draw_records(_shown(result), [result.about["input"]], [result.about["output"]])
+    return draw_records(_shown(result), [result.about.input], [result.about.output])

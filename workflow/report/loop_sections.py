@@ -39,7 +39,7 @@ def design_section(data: RunData) -> Section:
         Table(("requirement", "asked for", "meaning"), tuple(rows)),
     ]
     if result is None:
-        reason = str(data.design.get("reason", "the design stage left no result"))
+        reason = data.design.reason
         blocks.append(Remarks((sentence(reason),), "warning", "No controller was sought"))
         return Section("design", "Controller design", "Design", tuple(blocks))
     stable = [start for start in result.starts if start.stable]
@@ -183,7 +183,7 @@ def margins_section(data: RunData) -> Section:
         *whole_blocks(data),
         Remarks(tuple(map(sentence, certificate.checked)), "good", "What was checked"),
         Remarks(
-            tuple(map(sentence, open_words(certificate.not_checked, data.whole))),
+            tuple(map(sentence, open_words(certificate.not_checked, data.sampled))),
             "warning",
             "What was not checked",
         ),
@@ -226,35 +226,35 @@ def closed_loop_section(data: RunData) -> Section:
         return Section(
             anchor, title, short, (Text("The closed loop was not run: there is no stable controller."),)
         )
-    document = data.closed_loop.document
+    document = data.closed_loop
     channel = data.config.control_channel
     output = data.unit(channel.output) or "as logged"
     command = data.unit(channel.input) or "as logged"
-    simulated = document["machine"] == "simulated"
-    draws, settled = document["draws"], document["settled_draws"]
+    simulated = document.machine == "simulated"
+    draws, settled = document.draws, document.settled_draws
     where = (
         f"{count(draws, 'run')} on the simulated nonlinear arm"
         if simulated
         else f"{count(draws, 'plant')} drawn from the identified uncertainty"
     )
     lead = (
-        f"A reference step of {si(document['reference_step'], data.unit(channel.output))} and a step "
+        f"A reference step of {si(document.reference_step, data.unit(channel.output))} and a step "
         "disturbance of "
-        f"{si(document['disturbance'], data.unit(channel.input))} at the plant's input, on the "
+        f"{si(document.disturbance_step, data.unit(channel.input))} at the plant's input, on the "
         "identified model and in "
         f"{where}"
     )
-    if document["quantisation"]:
-        lead += f", commands rounded to {si(document['quantisation'], data.unit(channel.input))}"
+    if document.quantisation:
+        lead += f", commands rounded to {si(document.quantisation, data.unit(channel.input))}"
     lead += f": {settled} of {draws} settled."
     blocks: list[Block] = [Text(lead)]
-    if document.get("prefiltered"):
+    if document.filtered:
         words = (
             "Every reference goes through the prefilter, which makes the loop follow its model (dotted in "
             "the picture); the errors below are against the reference itself."
         )
         blocks.append(Text(words))
-    if not document["tracking"]:
+    if not document.tracking:
         blocks.append(Text("The specification asks for no tracking; the step only shows what the loop does."))
     if simulated and data.config.closed_loop.effects:
         effects = listing([_effect(effect) for effect in data.config.closed_loop.effects])
@@ -277,16 +277,21 @@ def closed_loop_section(data: RunData) -> Section:
     if settled < draws:
         words = (
             f"{count(draws - settled, 'run')} of {draws} did not settle: still moving by more than a tenth "
-            f"of the step at the end of either half{', or not there' if document['tracking'] else ''}. "
+            f"of the step at the end of either half{', or not there' if document.tracking else ''}. "
             "Advice: look at friction (a steady error, a limit cycle) and at the disturbance's size first."
         )
         blocks.append(Remarks((words,), "warning"))
-    achieved: Sequence[Mapping[str, Any]] = document["achieved"]
     rows = []
-    for key, words, factor in _METRICS if document["tracking"] else _METRICS[_ONLY_TRACKING:]:
-        predicted = document["predicted"][key]
+    for key, words, factor in _METRICS if document.tracking else _METRICS[_ONLY_TRACKING:]:
+        predicted = getattr(document.predicted, key)
         label = words.format(output=output, input=command)
-        rows.append((label, _reached(predicted, factor), *_range([row[key] for row in achieved], factor)))
+        rows.append(
+            (
+                label,
+                _reached(predicted, factor),
+                *_range([getattr(row, key) for row in document.achieved], factor),
+            )
+        )
     first = "arm, first run" if simulated else "first plant"
     head = ("quantity", "predicted", first, f"smallest of {draws}", f"largest of {draws}")
     blocks.append(Table(head, tuple(rows)))
@@ -305,28 +310,28 @@ _FRICTION_WORDS = (
 def _sensitivity_blocks(data: RunData) -> list[Block]:
     """The peak of S: predicted, certified, measured on the arm, large and small."""
     assert data.closed_loop is not None
-    found = data.closed_loop.document.get("sensitivity")
+    found = data.closed_loop.sensitivity
     if not found:
         return []
     channel = data.config.control_channel
     unit = data.unit(channel.output)
-    nominal, certified, rows = found["nominal_peak"], found["certified_peak"], found["measured"]
+    nominal, certified, rows = found.nominal_peak, found.certified_peak, found.measured
     large, small = rows[0], rows[1]
-    agrees = abs(large["off_nominal_percent"]) <= _AGREES_PERCENT
+    agrees = abs(large.off_nominal_percent) <= _AGREES_PERCENT
     bound = f"certified at most {number(certified, 4)}" if math.isfinite(certified) else "no bound certified"
     words = [
-        f"Peak of |S| measured on the arm: {number(large['peak'], 4)} (standard deviation "
-        f"{number(large['peak_std'], 2)}) at {frequency(large['omega_rad_s'])}, predicted "
+        f"Peak of |S| measured on the arm: {number(large.peak, 4)} (standard deviation "
+        f"{number(large.peak_std, 2)}) at {frequency(large.peak_omega_rad_s)}, predicted "
         f"{number(nominal, 4)}, {bound}: measured and predicted are "
-        f"{percent(abs(large['off_nominal_percent']), 2)} apart."
+        f"{percent(abs(large.off_nominal_percent), 2)} apart."
     ]
     if not agrees:
         words.append(
             "The loop on the arm is not the predicted one: look at friction, at the voltage limit and at the "
             "validation of the model before trusting the margins."
         )
-    apart = small["off_nominal_percent"]
-    if abs(apart) > abs(large["off_nominal_percent"]) and small["peak_std"] < abs(apart) / 200 * nominal:
+    apart = small.off_nominal_percent
+    if abs(apart) > abs(large.off_nominal_percent) and small.peak_std < abs(apart) / 200 * nominal:
         words.append(
             f"With a tenth of the excitation the peak is {percent(abs(apart), 2)} "
             f"{'lower' if apart < 0 else 'higher'} than predicted"
@@ -344,13 +349,13 @@ def _sensitivity_blocks(data: RunData) -> list[Block]:
         ),
         tuple(
             (
-                row["name"],
-                si(row["reference_rms"], unit),
-                f"{number(row['peak'], 4)} ± {number(row['peak_std'], 2)}",
-                frequency(row["omega_rad_s"]),
-                f"{row['off_nominal_percent']:+.2f} %",
-                "–" if row["off_certified_percent"] is None else f"{row['off_certified_percent']:+.2f} %",
-                percent(100 * row["limited_fraction"], 2),
+                row.name,
+                si(row.reference_rms, unit),
+                f"{number(row.peak, 4)} ± {number(row.peak_std, 2)}",
+                frequency(row.peak_omega_rad_s),
+                f"{row.off_nominal_percent:+.2f} %",
+                "–" if row.off_certified_percent is None else f"{row.off_certified_percent:+.2f} %",
+                percent(100 * row.limited_fraction, 2),
             )
             for row in rows
         ),
@@ -367,7 +372,7 @@ def _sensitivity_blocks(data: RunData) -> list[Block]:
 def _condition_blocks(data: RunData) -> list[Block]:
     """What the loop does where the arm is not the one that was identified."""
     assert data.closed_loop is not None
-    rows = data.closed_loop.document.get("conditions")
+    rows = data.closed_loop.conditions
     if not rows:
         return []
     channel = data.config.control_channel
@@ -384,19 +389,19 @@ def _condition_blocks(data: RunData) -> list[Block]:
         ),
         tuple(
             (
-                row["name"],
-                row["words"],
-                percent(row["largest_difference_percent"], 3),
-                "–" if row["overshoot_percent"] is None else percent(row["overshoot_percent"], 2),
-                percent(row["error_left_percent"], 2),
-                number(row["peak_command"]),
-                "yes" if row["settled"] else "NO",
+                row.name,
+                row.words,
+                percent(row.largest_difference_percent, 3),
+                "–" if row.overshoot_percent is None else percent(row.overshoot_percent, 2),
+                percent(row.error_left_percent, 2),
+                number(row.peak_command),
+                "yes" if row.settled else "NO",
             )
             for row in rows
         ),
         "One run each, otherwise on the arm of the closed-loop check; percent of the move, for the push of "
         "its predicted swing. Difference: achieved from predicted, at its largest.",
-        tuple(bool(row["settled"]) for row in rows),
+        tuple(bool(row.settled) for row in rows),
     )
     picture = Plot(
         "closed-loop-conditions",
@@ -404,7 +409,7 @@ def _condition_blocks(data: RunData) -> list[Block]:
         "payload, delay, friction and converters it knows nothing, and of a push at the tip how it moves the "
         "free arm.",
     )
-    unsettled = [row["name"] for row in rows if not row["settled"]]
+    unsettled = [row.name for row in rows if not row.settled]
     words = (f"The loop does not settle with: {listing(unsettled)}.",) if unsettled else ()
     return [picture, table, *maybe(words, "warning")]
 
@@ -419,7 +424,7 @@ def _beyond_records(data: RunData) -> tuple[str, ...]:
         for item in data.records
         if item.role == "estimation"
     )
-    peak = float(data.closed_loop.document["predicted"]["peak_command"])
+    peak = float(data.closed_loop.predicted.peak_command)
     if not peak > 1.5 * seen:
         return ()
     unit = data.unit(channel.input)
@@ -433,10 +438,10 @@ def _beyond_records(data: RunData) -> tuple[str, ...]:
 
 def _lasting_error(data: RunData) -> tuple[str, ...]:
     """A remark where a constant disturbance leaves a large part of the reference step as error for good."""
-    if data.closed_loop is None or not data.closed_loop.document["tracking"]:
+    if data.closed_loop is None or not data.closed_loop.tracking:
         return ()
-    document = data.closed_loop.document
-    left, step = abs(document["predicted"]["disturbance_left"]), document["reference_step"]
+    document = data.closed_loop
+    left, step = abs(document.predicted.disturbance_left), document.reference_step
     if not left > 0.05 * step:
         return ()
     if data.config.specification.integrator:
@@ -445,7 +450,7 @@ def _lasting_error(data: RunData) -> tuple[str, ...]:
         until, advice = "for good", "integrator = true in [specification]"
     channel = data.config.control_channel
     return (
-        f"A constant disturbance of {si(document['disturbance'], data.unit(channel.input))} "
+        f"A constant disturbance of {si(document.disturbance_step, data.unit(channel.input))} "
         f"leaves {si(left, data.unit(channel.output))} of error {until}, "
         f"{percent(100 * left / step, 2)} of the reference step. The specification asks for nothing better; "
         f"where that matters: {advice}.",

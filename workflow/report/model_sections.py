@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
+from ident.checks.validation import ScatterRow
 from workflow.config.run_config import SimulatedSource
 from workflow.report.data import ChannelData, RunData
 from workflow.report.formats import count, frequency, listing, number, percent, sentence
@@ -23,17 +23,16 @@ from workflow.report.model_blocks import (
 )
 from workflow.report.page import Block, Plot, Remarks, Section, Table, Text, heading, maybe
 from workflow.report.pictures import channel_picture, fresh_index, shown_pair
-from workflow.tasks.stages.uncertainty import tests_by_name
 
 _ROLE = {"estimation": "estimation", "validation": "validation", "repeat": "repeat"}
 
 
 def records_section(data: RunData) -> Section:
     """What was measured."""
-    abouts = data.about_records
-    roles = [about["role"] for about in abouts]
+    abouts = data.records
+    roles = [about.role for about in abouts]
     where = "simulated" if isinstance(data.config.source, SimulatedSource) else "read from files"
-    duration = sum(about["duration_s"] for about in abouts)
+    duration = sum(about.duration_s for about in abouts)
     uses = (
         ("estimation", "to estimate from"),
         ("validation", "kept for validation"),
@@ -42,18 +41,18 @@ def records_section(data: RunData) -> Section:
     split = listing([f"{roles.count(role)} {words}" for role, words in uses if role in roles])
     lead = (
         f"{count(len(abouts), 'record')} ({number(duration)} s in all, sampled every "
-        f"{number(1e3 * abouts[0]['dt_s'])} ms) {'was' if len(abouts) == 1 else 'were'} {where}: {split}."
+        f"{number(1e3 * abouts[0].record.dt_s)} ms) {'was' if len(abouts) == 1 else 'were'} {where}: {split}."
     )
     rows = tuple(
         (
             str(index),
-            about["name"],
-            _ROLE[about["role"]],
-            about["kind"],
-            f"{about['samples']}",
-            number(about["duration_s"]),
-            "closed" if about["closed_loop"] else "open",
-            "; ".join(part for part in (about["condition"], about["remark"]) if part),
+            about.name,
+            _ROLE[about.role],
+            about.kind,
+            f"{about.record.n_samples}",
+            number(about.duration_s),
+            "closed" if about.record.reference is not None else "open",
+            "; ".join(part for part in (about.condition, about.remark) if part),
         )
         for index, about in enumerate(abouts, 1)
     )
@@ -104,16 +103,17 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     single = len(data.channels) == 1
     blocks: list[Block] = [] if single else [heading(f"Channel {channel.label}")]
     of = "Fit to"
-    if about["increments"]:
+    if about.increments:
         of = "Fitted to the differences from sample to sample, so that drift weighs less. Fit to those of"
-    fits = listing([f"{percent(fit)} ({name})" for name, fit in about["fit_estimation_percent"].items()])
+    fits = listing([f"{percent(fit)} ({name})" for name, fit in about.fit_estimation_percent.items()])
     blocks.append(
         Text(
-            f"{about['input']} to {about['output']}: {structure_words(about)}, found with "
-            f"{about['search_evaluations']} evaluations of the error. {of} the records used: {fits}."
+            f"{about.input} to {about.output}: {structure_words(about)}, found with "
+            f"{about.identification.search.evaluations} evaluations of the error. {of} the records used: "
+            f"{fits}."
         )
     )
-    blocks += pole_tables(about, model.dt_s, channel.uncertain.get("intervals"))
+    blocks += pole_tables(about, model.dt_s, channel.uncertain.intervals)
     pair = shown_pair(channel)
     if pair is not None:
         omega = float(model.poles.omega_rad_s(model.dt_s)[pair])
@@ -136,13 +136,13 @@ def _identified(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         )
     )
     blocks += [
-        *maybe(tuple(map(sentence, about["warnings"])), "warning", "To look at before trusting this model")
+        *maybe(tuple(map(sentence, about.warnings)), "warning", "To look at before trusting this model")
     ]
-    staged = about.get("two_stage")
+    staged = about.two_stage
     blocks += maybe((sentence(staged),) if staged else (), "note", "Records made in closed loop")
-    blocks += [*maybe(tuple(map(sentence, about["verdicts"])), "note", "What the data decided")]
+    blocks += [*maybe(tuple(map(sentence, about.verdicts)), "note", "What the data decided")]
     options = data.config.channels[index].identification
-    if channel.stabilisation is not None and about["order_table"]:
+    if channel.stabilisation is not None and about.order_table:
         blocks += [
             Text(stabilisation_sentence(channel.stabilisation)),
             Plot(channel_picture("order", index, channel.label), STABILISATION_CAPTION),
@@ -160,12 +160,12 @@ def uncertainty_section(data: RunData) -> Section:
 
 def _uncertain(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     about, label = channel.uncertain, channel.label
-    level = percent(100 * about["level"], 4)
-    bands: Sequence[Mapping[str, float]] = about["bands"]
+    level = percent(100 * about.level, 4)
+    bands = about.bands
     blocks: list[Block] = [] if len(data.channels) == 1 else [heading(f"Channel {label}")]
     blocks += [
         Text(
-            f"Method '{about['method']}'. The {level} ellipses are {band_words(bands)}. The level holds at "
+            f"Method '{about.method}'. The {level} ellipses are {band_words(bands)}. The level holds at "
             "each frequency taken alone."
         ),
         Plot(
@@ -176,13 +176,13 @@ def _uncertain(data: RunData, index: int, channel: ChannelData) -> list[Block]:
         ),
         band_table(bands),
     ]
-    nominal = about["nominal"]
+    nominal = about.agreement
     blocks.append(
         Text(
             "The nominal model of the design lies inside its ellipse at "
-            f"{percent(nominal['share_inside_percent'])} "
-            f"of these frequencies; farthest out at {frequency(nominal['at_rad_s'])}, "
-            f"{number(nominal['largest_distance'])} times the ellipse's own radius from its centre."
+            f"{percent(nominal.share_inside_percent)} "
+            f"of these frequencies; farthest out at {frequency(nominal.at_rad_s)}, "
+            f"{number(nominal.largest_distance)} times the ellipse's own radius from its centre."
         )
     )
     blocks += maybe(unknown_bands(bands), "warning")
@@ -194,24 +194,24 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     blocks: list[Block] = []
     fresh = fresh_index(data, channel)
     fits = [
-        *((name, fit, "validation") for name, fit in about["fit_validation_percent"].items()),
-        *((name, fit, "repeat") for name, fit in about["fit_repeat_percent"].items()),
+        *((name, fit, "validation") for name, fit in about.fit_validation_percent.items()),
+        *((name, fit, "repeat") for name, fit in about.fit_repeat_percent.items()),
     ]
-    what = "of the output's differences from sample to sample" if about["increments"] else "of the output"
+    what = "of the output's differences from sample to sample" if about.increments else "of the output"
     if fits:
         worst_name, worst, _ = min(fits, key=lambda entry: entry[1])
         unseen = f"On {count(len(fits), 'record')} that the fit has not seen"
         range_of = f"between {percent(worst)} ({worst_name}) and {percent(max(fit for _, fit, _ in fits))}"
         if len(fits) == 1:
             unseen, range_of = f"On the record {worst_name}, which the fit has not seen", percent(worst)
-        only_repeats = not about["fit_validation_percent"]
+        only_repeats = not about.fit_validation_percent
         if only_repeats:
             unseen = "On repeats of the fitted experiment" if len(fits) > 1 else f"On the repeat {worst_name}"
         text = f"{unseen}, the model run freely reproduces {range_of} {what}."
         if only_repeats:
             text += " Repeats show the noise; whether the model holds for another input is not tested."
         blocks.append(Text(text))
-        if worst < 50 and not about["increments"]:
+        if worst < 50 and not about.increments:
             blocks.append(
                 Remarks(
                     (
@@ -229,11 +229,11 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     if len(fits) > 1:
         rows = tuple((name, role, number(fit, 4)) for name, fit, role in fits)
         blocks.append(Table(("record", "kept as", "fit [%]"), rows))
-    tests = channel.uncertain["tests"]
-    if {"whiteness", "independence"} <= tests_by_name(tests).keys():
+    tests = channel.uncertain.tests
+    if tests:
         blocks.append(Plot(channel_picture("residuals", index, label), residual_caption(channel.uncertain)))
     blocks += test_remarks(tests)
-    scatter = channel.uncertain["repeat_scatter"]
+    scatter = channel.uncertain.repeat_scatter
     if scatter:
         blocks += [
             Plot(
@@ -246,8 +246,8 @@ def _validated(data: RunData, index: int, channel: ChannelData) -> list[Block]:
     return blocks
 
 
-def _scatter_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    between = any(not math.isnan(row["between"]) for row in rows)
+def _scatter_table(rows: Sequence[ScatterRow]) -> Table:
+    between = any(not math.isnan(row.between) for row in rows)
     head: tuple[str, ...] = (
         "from [rad/s]",
         "to [rad/s]",
@@ -257,10 +257,10 @@ def _scatter_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     )
     cells = []
     for row in rows:
-        cell = [number(row["omega_low_rad_s"]), number(row["omega_high_rad_s"])]
-        cell += [number(100 * row["predicted"]), number(100 * row["measured"]), number(row["ratio"])]
+        cell = [number(row.omega_low_rad_s), number(row.omega_high_rad_s)]
+        cell += [number(100 * row.predicted), number(100 * row.measured), number(row.ratio)]
         if between:
-            cell += [number(100 * row["between"]), number(row["between_ratio"])]
+            cell += [number(100 * row.between), number(row.between_ratio)]
         cells.append(tuple(cell))
     if between:
         head += ("between conditions / gain [%]", "over noise alone [1]")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 from control_design.analysis.stability import closed_loop_poles
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, modes_of
-from ident.checks.validation import ScatterRow, fit_on_fresh_data
+from ident.checks.validation import fit_on_fresh_data
 from ident.search.error_surface import error_surface
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
@@ -40,7 +39,7 @@ from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
 from workflow.report.data import ChannelData, RunData
-from workflow.tasks.stages.uncertainty import tests_by_name
+from workflow.tasks.results import LoopRuns
 
 Drawer = Callable[[], Figure]
 
@@ -57,9 +56,9 @@ def pictures_of(data: RunData) -> dict[str, Drawer]:
         drawers["sensitivities"] = lambda: _sensitivities(data)
     if data.closed_loop is not None:
         drawers["closed-loop"] = lambda: _closed_loop(data)
-        if data.closed_loop.document.get("sensitivity") and data.plant is not None:
+        if data.closed_loop.sensitivity and data.plant is not None:
             drawers["measured-sensitivity"] = lambda: _measured_sensitivity(data)
-        if data.closed_loop.document.get("conditions"):
+        if data.closed_loop.conditions:
             drawers["closed-loop-conditions"] = lambda: _conditions(data)
     if data.closed_loop is not None and data.plant is not None:
         drawers["overview"] = lambda: _overview(data)
@@ -87,14 +86,13 @@ def _of_channel(data: RunData, index: int, channel: ChannelData) -> dict[str, Dr
     plot, steps = channel.stabilisation, channel.result.identification.order_table
     if plot is not None and steps:
         add("order", lambda: _order(channel, plot))
-    tests = tests_by_name(channel.uncertain["tests"])
-    if {"whiteness", "independence"} <= tests.keys():
-        add(
-            "residuals",
-            lambda: draw_residual_tests(tests["whiteness"], tests["independence"], name=channel.label),
-        )
-    if channel.uncertain["repeat_scatter"]:
-        rows = [ScatterRow(**row) for row in channel.uncertain["repeat_scatter"]]
+    tests = channel.uncertain
+    add(
+        "residuals",
+        lambda: draw_residual_tests(tests.test("whiteness"), tests.test("independence"), name=channel.label),
+    )
+    rows = channel.uncertain.repeat_scatter
+    if rows:
         add("repeats", lambda: draw_repeat_scatter(rows, name=channel.label))
     return found
 
@@ -251,12 +249,9 @@ def _nyquist(data: RunData) -> Figure:
 def _overview(data: RunData) -> Figure:
     """Three panels of what matters; the step without the disturbance that follows it."""
     assert data.closed_loop is not None
-    time, reference = data.loop_array("time_s"), data.loop_array("reference")
-    predicted, achieved = data.loop_array("predicted/output"), data.loop_array("achieved/output")
-    assert time is not None
-    assert reference is not None
-    assert predicted is not None
-    assert achieved is not None
+    loop = data.closed_loop
+    time, reference = loop.time_s, loop.reference
+    predicted, achieved = loop.predicted_runs.output, loop.achieved_runs.output
     half = slice(0, time.size // 2)
     channel = data.config.control_channel
     step = StepView(
@@ -264,7 +259,7 @@ def _overview(data: RunData) -> Figure:
         reference=reference[half],
         predicted=predicted[0, half],
         achieved=achieved[:, half],
-        machine=MACHINE_WORDS[data.closed_loop.document["machine"]],
+        machine=MACHINE_WORDS[data.closed_loop.machine],
         output=(channel.output, data.unit(channel.output)),
     )
     return draw_overview(
@@ -292,8 +287,8 @@ def _sensitivities(data: RunData) -> Figure:
         if performance is None
         else data.unit(performance.result.identification.model.output_name),
     )
-    modes = [m for m in data.control.identified["modes"] if m["damping"] < 0.3]
-    marks = [(mode["omega_rad_s"], f"mode {number}") for number, mode in enumerate(modes[:4], 1)]
+    modes = [m for m in data.control.identified.modes if m.damping < 0.3]
+    marks = [(mode.omega_rad_s, f"mode {number}") for number, mode in enumerate(modes[:4], 1)]
     return draw_sensitivities(curves, level=data.plant.level, marks=marks)
 
 
@@ -301,74 +296,55 @@ def _measured_sensitivity(data: RunData) -> Figure:
     assert data.closed_loop is not None
     assert data.plant is not None
     assert data.synthesis is not None
-    arrays, found = data.closed_loop.arrays, data.closed_loop.document["sensitivity"]
-    low, high = found["band_rad_s"]
+    found = data.closed_loop.sensitivity
+    assert found is not None
+    low, high = found.band_rad_s
     omega = np.geomspace(0.9 * low, min(1.1 * high, data.plant.nyquist_rad_s), 900)
     curve = sensitivity_curves(data.plant, data.synthesis.controller, data.config.specification, omega)[0]
-    peaks = [
-        MeasuredPeak(
-            row["name"],
-            arrays[f"sensitivity/{number}/omega_rad_s"],
-            arrays[f"sensitivity/{number}/magnitude"],
-            arrays[f"sensitivity/{number}/std"],
-        )
-        for number, row in enumerate(found["measured"])
-    ]
+    peaks = [MeasuredPeak(row.name, row.omega_rad_s, row.magnitude, row.std) for row in found.measured]
     predicted = PredictedSensitivity(omega, curve.nominal, curve.worst)
     return draw_measured_sensitivity(predicted, peaks, level=data.level)
 
 
 def _conditions(data: RunData) -> Figure:
     assert data.closed_loop is not None
-    document = data.closed_loop.document
-    reference, predicted, achieved = (
-        data.loop_array(f"conditions/{name}") for name in ("reference", "predicted", "achieved")
-    )
-    time = data.loop_array("time_s")
-    assert reference is not None
-    assert predicted is not None
-    assert achieved is not None
-    assert time is not None
+    document = data.closed_loop
     rows = [
-        ConditionTraces(row["name"], row["words"], reference[k], predicted[k], achieved[k])
-        for k, row in enumerate(document["conditions"])
+        ConditionTraces(row.name, row.words, row.reference, row.predicted, row.achieved)
+        for row in document.conditions
     ]
     output = data.config.control_channel.output
-    machine = MACHINE_WORDS[document["machine"]]
-    return draw_conditions(time[: reference.shape[1]], rows, (output, data.unit(output)), machine=machine)
+    machine = MACHINE_WORDS[document.machine]
+    return draw_conditions(
+        document.time_s[: rows[0].reference.size], rows, (output, data.unit(output)), machine=machine
+    )
 
 
 def _closed_loop(data: RunData) -> Figure:
     assert data.closed_loop is not None
-    config, document = data.config, data.closed_loop.document
-    time, reference = data.loop_array("time_s"), data.loop_array("reference")
-    assert time is not None
-    assert reference is not None
+    config, document = data.config, data.closed_loop
     performance = data.performance
 
     def signal(name: str) -> tuple[str, str]:
         return name, data.unit(name)
 
     scene = LoopScene(
-        time_s=time,
-        reference=reference,
-        model=data.loop_array("model"),
-        disturbance=data.loop_array("disturbance"),
+        time_s=document.time_s,
+        reference=document.reference,
+        model=document.model_answer,
+        disturbance=document.disturbance,
         output=signal(config.control_channel.output),
         command=signal(config.control_channel.input),
         performance=None
         if performance is None
         else signal(performance.result.identification.model.output_name),
-        command_limit=document["input_limit"],
+        command_limit=document.input_limit,
     )
-    predicted, runs = _traces(data, "predicted"), _traces(data, "achieved")
-    if document["machine"] == "simulated":
+    predicted, runs = _traces(document.predicted_runs), _traces(document.achieved_runs)
+    if document.machine == "simulated":
         return draw_closed_loop(scene, predicted, runs, machine=MACHINE_WORDS["simulated"])
     return draw_closed_loop(scene, predicted, None, spread=runs)
 
 
-def _traces(data: RunData, prefix: str) -> LoopTraces:
-    def array(name: str) -> Any:
-        return data.loop_array(f"{prefix}/{name}")
-
-    return LoopTraces(output=array("output"), command=array("command"), performance=array("performance"))
+def _traces(runs: LoopRuns) -> LoopTraces:
+    return LoopTraces(output=runs.output, command=runs.command, performance=runs.performance)

@@ -43,9 +43,7 @@ def verdict_of(data: RunData, *, certified: bool) -> Verdict:
 def _certified(data: RunData) -> tuple[str, list[str]]:
     certificate = data.certificate
     if certificate is None or not data.has_controller:
-        return "Not certified: there is no controller", [
-            str(data.design.get("reason", "the run ended before design"))
-        ]
+        return "Not certified: there is no controller", [data.design.reason]
     level = percent(100 * data.certified_level, 4)
     if certificate.certified:
         worst = min(verdict.worst_margins.modulus for verdict in certificate.plants)
@@ -99,13 +97,9 @@ def _in_time(data: RunData) -> tuple[str, list[str]]:
     """Headline of a run whose certificate holds, by what the loop then did over time."""
     if data.closed_loop is None:
         return "Certificate holds, but the loop was not run", ["the closed loop was not simulated"]
-    document = data.closed_loop.document
-    draws, settled = document["draws"], document["settled_draws"]
-    on = (
-        "on the simulated arm"
-        if document["machine"] == "simulated"
-        else "of plants drawn from the uncertainty"
-    )
+    document = data.closed_loop
+    draws, settled = document.draws, document.settled_draws
+    on = "on the simulated arm" if document.machine == "simulated" else "of plants drawn from the uncertainty"
     if settled < draws:
         return "Certificate holds, but the loop does not settle", [
             f"{draws - settled} of {count(draws, 'run')} {on} did not settle; what the certificate covers "
@@ -121,34 +115,34 @@ def _found(data: RunData) -> list[str]:
 
 def _modes_sentence(channel: ChannelData) -> str:
     about = channel.identified
-    light = [mode for mode in about["modes"] if mode["damping"] < 0.3]
-    model = f"{channel.label}: a model of order {about['order']}"
-    if about["integrators"]:
-        model += f" with {count(about['integrators'], 'integrator')}"
+    light = [mode for mode in about.modes if mode.damping < 0.3]
+    model = f"{channel.label}: a model of order {about.order}"
+    if about.integrators:
+        model += f" with {count(about.integrators, 'integrator')}"
     if not light:
         return f"{model}; no pole pair with a damping ratio below 0.3."
-    words = [f"{number(mode['frequency_Hz'])} Hz (damping {number(mode['damping'], 2)})" for mode in light]
+    words = [f"{number(mode.frequency_Hz)} Hz (damping {number(mode.damping, 2)})" for mode in light]
     return f"{model}; {count(len(light), 'lightly damped pole pair')} at {listing(words)}."
 
 
 def _achieved(data: RunData) -> list[str]:
     if data.closed_loop is None:
         return []
-    document = data.closed_loop.document
-    predicted, first = document["predicted"], document["achieved"][0]
-    draws, settled = document["draws"], document["settled_draws"]
+    document = data.closed_loop
+    predicted, first = document.predicted, document.achieved[0]
+    draws, settled = document.draws, document.settled_draws
     on = (
         "runs on the simulated arm"
-        if document["machine"] == "simulated"
+        if document.machine == "simulated"
         else "plants drawn from the uncertainty"
     )
     text = f"In closed loop {settled} of {draws} {on} settled"
-    if document["tracking"] and predicted["rise_time_s"] is not None and first["rise_time_s"] is not None:
+    if document.tracking and predicted.rise_time_s is not None and first.rise_time_s is not None:
         text += (
-            f"; rise time {number(first['rise_time_s'])} s in the first (predicted "
-            f"{number(predicted['rise_time_s'])} s)"
-            f", overshoot {number(first['overshoot_percent'])} % (predicted "
-            f"{number(predicted['overshoot_percent'])} %)"
+            f"; rise time {number(first.rise_time_s)} s in the first (predicted "
+            f"{number(predicted.rise_time_s)} s)"
+            f", overshoot {number(first.overshoot_percent)} % (predicted "
+            f"{number(predicted.overshoot_percent)} %)"
         )
     return [text + "."]
 
@@ -156,41 +150,41 @@ def _achieved(data: RunData) -> list[str]:
 def _sure(data: RunData) -> list[str]:
     sentences = []
     for channel in data.channels:
-        bands = channel.uncertain["bands"]
-        narrow = min(bands, key=lambda band: band["median_radius_percent"])
-        wide = max(bands, key=lambda band: band["median_radius_percent"])
+        bands = channel.uncertain.bands
+        narrow = min(bands, key=lambda band: band.median_radius_percent)
+        wide = max(bands, key=lambda band: band.median_radius_percent)
         text = (
-            f"{channel.label}: {percent(100 * channel.uncertain['level'], 4)} ellipses with a median radius "
+            f"{channel.label}: {percent(100 * channel.uncertain.level, 4)} ellipses with a median radius "
             "from "
-            f"{percent(narrow['median_radius_percent'])} of the gain ({number(narrow['from_rad_s'])} to "
-            f"{number(narrow['to_rad_s'])} rad/s) to {percent(wide['median_radius_percent'])} "
-            f"({number(wide['from_rad_s'])} to {number(wide['to_rad_s'])} rad/s)"
+            f"{percent(narrow.median_radius_percent)} of the gain ({number(narrow.from_rad_s)} to "
+            f"{number(narrow.to_rad_s)} rad/s) to {percent(wide.median_radius_percent)} "
+            f"({number(wide.from_rad_s)} to {number(wide.to_rad_s)} rad/s)"
         )
-        fits = channel.identified["fit_validation_percent"]
+        fits = channel.identified.fit_validation_percent
         if fits:
             each = listing([f"{percent(fit)} ({name})" for name, fit in fits.items()])
-            text += f"; fit on fresh data{' (increments)' if channel.identified['increments'] else ''} {each}"
+            text += f"; fit on fresh data{' (increments)' if channel.identified.increments else ''} {each}"
         else:
             text += "; no validation record to test it on"
         sentences.append(text + ".")
-        inside = channel.uncertain["nominal"]["share_inside_percent"]
+        inside = channel.uncertain.agreement.share_inside_percent
         if inside < 90 and data.plant is not None:
             sentences.append(
                 f"{channel.label}: the nominal model of the design lies outside its ellipse at "
                 f"{percent(100 - inside)} of the frequencies; margins and worst cases are those of the "
                 "ellipses, the closed-loop poles those of the nominal."
             )
-        warnings = channel.identified["warnings"]
+        warnings = channel.identified.warnings
         if warnings:
             sentences.append(
                 f"{channel.label}: {count(len(warnings), 'warning')} about the model, first: "
                 f"{sentence(warnings[0])}"
             )
-        failed = [test for test in channel.uncertain["tests"] if not test["passed"]]
+        failed = [test for test in channel.uncertain.tests if not test.passed]
         if failed:
             sentences.append(
                 f"{channel.label}: {len(failed)} of "
-                f"{count(len(channel.uncertain['tests']), 'residual test')} "
+                f"{count(len(channel.uncertain.tests), 'residual test')} "
                 f"{'fails' if len(failed) == 1 else 'fail'}: the records hold something the model does not "
                 "explain."
             )
@@ -200,8 +194,8 @@ def _sure(data: RunData) -> list[str]:
 def _open(data: RunData) -> list[str]:
     if data.certificate is None:
         return ["without a controller, nothing about a closed loop was checked"]
-    items = open_words(data.certificate.not_checked, data.whole)
-    if data.closed_loop is not None and data.closed_loop.document["machine"] != "simulated":
+    items = open_words(data.certificate.not_checked, data.sampled)
+    if data.closed_loop is not None and data.closed_loop.machine != "simulated":
         items.append("the controller has not run on the real machine")
     return items
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
+from control_design.analysis.margins import Margins
 from workflow.tasks.achievable_performance import bracket_numbers
-from workflow.tasks.joint_coverage import joint_numbers
-from workflow.tasks.reference_filter import prefilter_of
-from workflow.tasks.summary import gamma_of
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    ClosedLoopResult,
+    DesignResult,
+    ReferenceFilterResult,
+)
 
 Number = float | int | None
 
@@ -64,44 +69,46 @@ COLUMNS: Mapping[str, Column] = {column.name: column for column in _ALL}
 
 
 def numbers_of(
-    documents: Mapping[str, Mapping[str, Any]],
+    design: DesignResult,
+    achievable: AchievablePerformance,
+    certify: CertifyResult,
+    reference_filter: ReferenceFilterResult,
+    loop: ClosedLoopResult,
     mode_band_rad_s: tuple[float, float] | None,
 ) -> dict[str, Number]:
-    """Numbers of a point from the documents of its stages by name; None where there is none.
+    """Numbers of a point from the results of its stages; None where there is none.
 
     Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
     loop, inside the band of the specification where it names one. The measured peak of S is that of the arm
     that was identified, at the larger of two sizes.
     """
-    design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
-    if design["synthesis"] is not None:
-        found["design_gamma"] = design["synthesis"]["gamma"]
-    bracket = bracket_numbers(documents["yardstick"], gamma_of(design))
+    found["design_gamma"] = _finite(design.gamma)
+    bracket = bracket_numbers(achievable, design.gamma)
     found["any_order_gamma"] = bracket["reached"]
     found["above_any_order_percent"] = bracket["above_percent"]
-    whole = joint_numbers(certify.get("whole", {}))
-    if "draws" in whole:
-        found["whole_held_percent"] = 100.0 * whole["coverage_given"]
-        found["whole_stable_percent"] = 100.0 * whole["stable_share"]
-    prefilter = prefilter_of(documents["prefilter"])
-    if prefilter is not None:
-        found["matching_error"] = prefilter.error_after
-        found["matching_error_unfiltered"] = prefilter.error_before
-    certificate = certify["certificate"]
+    joint = certify.sampled.joint
+    if joint is not None:
+        found["whole_held_percent"] = 100.0 * joint.coverage_given
+        found["whole_stable_percent"] = 100.0 * joint.stable_share
+    if reference_filter.filter is not None:
+        found["matching_error"] = reference_filter.filter.error_after
+        found["matching_error_unfiltered"] = reference_filter.filter.error_before
+    certificate = certify.certificate
     if certificate is not None:
-        verdict = certificate["plants"][0]
-        gamma = certificate["gamma_bound"]
-        found["worst_gamma"] = _finite(certificate["gamma"] if gamma is None else gamma)
-        found["bandwidth_rad_s"] = verdict["bandwidth_rad_s"]
-        found |= _margins("", verdict["worst_margins"]) | _margins("nominal_", verdict["nominal_margins"])
+        verdict = certificate.plants[0]
+        bound = certificate.gamma_bound
+        found["worst_gamma"] = _finite(certificate.gamma if bound is None else bound)
+        found["bandwidth_rad_s"] = verdict.bandwidth_rad_s
+        found |= _margins("", verdict.worst_margins) | _margins("nominal_", verdict.nominal_margins)
         low, high = mode_band_rad_s or (0.0, math.inf)
-        modes = [mode for mode in verdict["closed_loop_modes"] if low <= mode["omega_rad_s"] <= high]
+        modes = [mode for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
         if modes:
-            least = min(modes, key=lambda mode: float(mode["zeta"]))
-            found["mode_damping"], found["mode_omega_rad_s"] = least["zeta"], least["omega_rad_s"]
-    if loop["skipped"] is None:
-        found["settled_draws"], found["draws"] = loop["settled_draws"], loop["draws"]
+            least = min(modes, key=lambda mode: mode.zeta)
+            found["mode_damping"], found["mode_omega_rad_s"] = least.zeta, least.omega_rad_s
+    check = loop.check
+    if check is not None:
+        found["settled_draws"], found["draws"] = check.settled_draws, check.draws
         for name in (
             "settling_time_s",
             "rise_time_s",
@@ -109,29 +116,27 @@ def numbers_of(
             "peak_command",
             "disturbance_peak",
         ):
-            values = [row[name] for row in loop["achieved"]]
+            values = [getattr(row, name) for row in check.achieved]
             # A run that never gets there has no time: neither has the point.
             found[name] = None if None in values else max(values)
-        sensitivity = loop.get("sensitivity")
-        if sensitivity:
-            found["predicted_peak_sensitivity"] = sensitivity["nominal_peak"]
-            found["measured_peak_sensitivity"] = sensitivity["measured"][0]["peak"]
+        if check.sensitivity is not None:
+            found["predicted_peak_sensitivity"] = check.sensitivity.nominal_peak
+            found["measured_peak_sensitivity"] = check.sensitivity.measured[0].peak
     return found
 
 
-def _margins(prefix: str, margins: Mapping[str, Any]) -> dict[str, Number]:
-    """Margins of a certificate's document, where infinite ones are None."""
-    up, down = margins["gain_up"], margins["gain_down"]
-    sides = ([] if up is None else [float(up)]) + ([1.0 / down] if down else [])
-    phase, delay = margins["phase_rad"], margins["delay_s"]
+def _margins(prefix: str, margins: Margins) -> dict[str, Number]:
+    """Infinite ones are None."""
+    sides = [margins.gain_up] if math.isfinite(margins.gain_up) else []
+    sides += [1.0 / margins.gain_down] if margins.gain_down else []
+    phase, delay = margins.phase_rad, margins.delay_s
     return {
-        f"{prefix}modulus_margin": margins["modulus"],
+        f"{prefix}modulus_margin": margins.modulus,
         f"{prefix}gain_margin_dB": 20 * math.log10(min(sides)) if sides and min(sides) > 0 else None,
-        f"{prefix}phase_margin_deg": None if phase is None else math.degrees(phase),
-        f"{prefix}delay_margin_ms": None if delay is None else 1e3 * delay,
+        f"{prefix}phase_margin_deg": math.degrees(phase) if math.isfinite(phase) else None,
+        f"{prefix}delay_margin_ms": 1e3 * delay if math.isfinite(delay) else None,
     }
 
 
-def _finite(value: Any) -> float | None:
-    number = float(value)  # "inf" in the certificate's document
-    return number if math.isfinite(number) else None
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

@@ -29,6 +29,7 @@ from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point
 from workflow.study.task import Done
 from workflow.study.toml_text import toml_text
 from workflow.tasks.pipeline import stage_input_hash
+from workflow.tasks.results import RunResults
 from workflow.tasks.stages import Stage
 from workflow.tasks.summary import summarise
 
@@ -178,7 +179,7 @@ class StudyDirectory:
         run = self.point(point)
         _write(run, point, self.plant_files(point), done)
         assert point.config is not None
-        certified = summarise(run, point.config).certified
+        certified = summarise(RunResults(run), point.config).certified
         run.record_status("complete" if certified else "complete, not certified")
 
     def plant_files(self, point: Point) -> dict[str, bytes]:

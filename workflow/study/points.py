@@ -24,7 +24,9 @@ from workflow.tasks.stages import STAGES, Stage
 
 PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
 POINT_STAGES: tuple[Stage, ...] = tuple(
-    s for s in STAGES if s.name in ("design", "yardstick", "certify", "prefilter", "closed_loop")
+    s
+    for s in STAGES
+    if s.name in ("design", "achievable_performance", "certify", "reference_filter", "closed_loop")
 )
 
 

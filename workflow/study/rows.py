@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from workflow.engine.run_directory import RunDirectory
@@ -13,8 +13,8 @@ from workflow.study.columns import COLUMNS, Number, numbers_of
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot
 from workflow.tasks.achievable_performance import order_advice
-from workflow.tasks.stages.results import load_document
-from workflow.tasks.summary import gamma_of, verdict_of
+from workflow.tasks.results import RunResults
+from workflow.tasks.summary import verdict_of
 
 State = Literal["certified", "does not settle", "not certified", "impossible", "failed"]
 
@@ -50,27 +50,28 @@ class PointRow:
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
     assert point.config is not None
-    stages = ("design", "yardstick", "certify", "prefilter", "closed_loop")
-    documents = {name: load_document(run, name) for name in stages}
-    design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
+    results, specification = RunResults(run), point.config.specification
+    design, certify, loop = results.design, results.certify, results.closed_loop
+    achievable = results.achievable_performance
     state: State
-    if design["synthesis"] is None:
+    if design.synthesis is None:
         state = "impossible"
-    elif not certify["certified"]:
+    elif not certify.certified:
         state = "not certified"
-    elif loop["skipped"] is not None or loop["settled_draws"] != loop["draws"]:
+    elif loop.check is None or loop.check.settled_draws != loop.check.draws:
         state = "does not settle"
     else:
         state = "certified"
-    numbers = numbers_of(documents, point.config.specification.mode_band_rad_s)
+    numbers = numbers_of(
+        design, achievable, certify, results.reference_filter, loop, specification.mode_band_rad_s
+    )
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
-    why = certify["reason"]
-    gamma = gamma_of(design)
-    if gamma is not None and gamma > 1:
-        advice = order_advice(documents["yardstick"], gamma, point.config.specification.controller_order)
+    why = certify.reason
+    if design.gamma is not None and design.gamma > 1:
+        advice = order_advice(achievable, design.gamma, specification.controller_order)
         why = f"{why}; {advice}" if advice else why
-    if certify["certified"]:
-        why = verdict_of({**design, "met": True}, certify, loop)
+    if certify.certified:
+        why = verdict_of(replace(design, met=True), certify, loop)
     return PointRow(point.number, point.name, point.values, state, why, numbers)
 
 

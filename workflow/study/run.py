@@ -25,6 +25,7 @@ from workflow.study.search import Grid, ParzenSearch, Strategy
 from workflow.study.settings import StudyConfig, load_study
 from workflow.study.task import Done, Job, Task
 from workflow.tasks.pipeline import config_of
+from workflow.tasks.results import RunResults
 from workflow.tasks.summary import Row, RunSummary, Section
 
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
@@ -308,7 +309,7 @@ def _units(directory: StudyDirectory, rows: Sequence[PointRow]) -> dict[str, str
         run = RunDirectory(directory.points_path / row.name)
         if run.stage_file("records") is not None:
             control = config_of(run).control_channel
-            units = run.load_stage("records").document["records"][0]["units"]
+            units = RunResults(run).records.records[0].units
             return {
                 "peak_command": units.get(control.input, ""),
                 "disturbance_peak": units.get(control.output, ""),

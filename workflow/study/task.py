@@ -22,6 +22,7 @@ from workflow.engine.errors import InputError, StageError, one_line
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import stage_input_hash
+from workflow.tasks.results import RunResults
 from workflow.tasks.stages import STAGES, StageInput
 
 
@@ -102,15 +103,14 @@ def _fill(
     for name, content in task.given.items():
         storage.write_bytes(run.stages_path / name, content)
     config = RunConfig.from_document(job.config, source=job.name)
-    seconds, hashes = {}, {}
+    seconds, hashes, results = {}, {}, RunResults(run)
     for stage in STAGES:
         if stage.name not in task.stages:
             continue
         started = time.monotonic()
         wanted = stage_input_hash(stage, config, run, job.inputs)
         if not _take_over(run, stage.name, wanted, earlier):
-            data = stage.run(StageInput(config, run, Silence()))
-            run.save_stage(stage.name, data, wanted)
+            run.save_stage(stage.name, stage.run(StageInput(config, results, Silence())), wanted)
         seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
     return seconds, hashes
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from control_design.convex.youla import YoulaBracket, YoulaOptions, youla_bracket
+from control_design.convex.youla import YoulaOptions, youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from workflow.config.design_options import YardstickOptions
+from workflow.engine import codec
+from workflow.tasks.results import AchievablePerformance
 
 # Requirements that the bracket does not know: a bracket of other values of these is the same.
 UNKNOWN_TO_BRACKET = (
@@ -28,38 +30,25 @@ def find_bracket(
     specification: Specification,
     options: YardstickOptions,
     progress: Callable[[float, str], None] | None = None,
-) -> dict[str, Any]:
-    """{bracket: YoulaBracket.to_dict() or null, reason: null or why there is none}."""
+) -> AchievablePerformance:
+    """The bracket, or why there is none."""
     if not options.compute:
-        return {"bracket": None, "reason": "not asked for ([yardstick] compute = false)"}
+        return AchievablePerformance(reason="not asked for (compute = false)")
     youla = YoulaOptions(**options.model_dump(exclude={"compute"}))
     try:
         bracket = youla_bracket(plants, specification, youla, progress=progress)
     except SpecificationError as impossible:
-        return {"bracket": None, "reason": str(impossible)}
+        return AchievablePerformance(reason=str(impossible))
     except (ValueError, ArithmeticError) as unfit:
-        return {"bracket": None, "reason": f"the parametrisation does not take this plant: {unfit}"}
-    return {"bracket": bracket.to_dict(), "reason": None}
+        return AchievablePerformance(reason=f"the parametrisation does not take this plant: {unfit}")
+    return AchievablePerformance(bracket)
 
 
-def bracket_of(document: Mapping[str, Any]) -> YoulaBracket | None:
-    """The bracket of `find_bracket`'s answer; None also for an empty document (a run made before)."""
-    found = document.get("bracket")
-    if found is None:
-        return None
-    # In the document both "infinite" and "no hull sought" are null; the second is what a missing hull means.
-    plants = [
-        {key: value for key, value in plant.items() if key != "hull" or value is not None}
-        for plant in found["plants"]
-    ]
-    return YoulaBracket.from_dict({"plants": plants})
-
-
-def bracket_numbers(document: Mapping[str, Any], gamma: float | None) -> dict[str, Any]:
+def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[str, Any]:
     """Numbers for JSON and tables: what any order reaches, the floor, how far gamma is above in percent."""
-    bracket = bracket_of(document)
+    bracket = found.bracket
     if bracket is None:
-        return {"reached": None, "floor": None, "above_percent": None, "reason": document.get("reason")}
+        return {"reached": None, "floor": None, "above_percent": None, "reason": found.reason}
     reached, floor = _finite(bracket.ellipse), _finite(bracket.floor)
     known = gamma is not None and math.isfinite(gamma) and reached is not None
     return {
@@ -67,16 +56,15 @@ def bracket_numbers(document: Mapping[str, Any], gamma: float | None) -> dict[st
         "floor": floor,
         "above_percent": 100.0 * (gamma / reached - 1.0) if known and gamma and reached else None,
         "reason": None,
-        "bracket": bracket.to_dict(),
+        "bracket": codec.plain(bracket),
     }
 
 
-def yardstick_words(document: Mapping[str, Any], gamma: float | None, order: int) -> str | None:
+def achievable_words(found: AchievablePerformance, gamma: float | None, order: int) -> str | None:
     """One sentence on the order chosen; None where there is nothing to say."""
-    bracket = bracket_of(document)
+    bracket = found.bracket
     if bracket is None:
-        reason = document.get("reason")
-        return f"not compared with other orders: {reason}" if reason else None
+        return f"not compared with other orders: {found.reason}" if found.reason else None
     if gamma is None or not math.isfinite(gamma):
         if not math.isfinite(bracket.ellipse):
             return "no controller of any order is known to stabilise every member of the ellipses"
@@ -84,13 +72,13 @@ def yardstick_words(document: Mapping[str, Any], gamma: float | None, order: int
     return bracket.sentence(gamma, order)
 
 
-def order_advice(document: Mapping[str, Any], gamma: float, order: int) -> str | None:
+def order_advice(found: AchievablePerformance, gamma: float, order: int) -> str | None:
     """Whether a higher order could meet what was missed; None where the bracket says nothing.
 
     The bracket knows neither structure nor damping of the controller's poles, and with several plants it is
     what one controller per plant reaches: more than that no order gives.
     """
-    bracket = bracket_of(document)
+    bracket = found.bracket
     if bracket is None or not math.isfinite(bracket.ellipse):
         return None
     reached = bracket.ellipse

@@ -25,20 +25,19 @@ from control_design.plants.plant_set import UncertainPlant, count_integrators
 from control_design.plants.stated_uncertainty import StatedDiscs
 from control_design.specification import RationalWeight, Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
-from ident.basis.model import GobfModel
 from ident.basis.model_files import FORMAT, ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
-from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from ident.uncertainty import FrequencyUncertainty
 from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
 from workflow.config.run_config import RunConfig, Section
 from workflow.config.settings import InputPath, ModelT, check, read_toml
-from workflow.engine import storage
+from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import config_of
-from workflow.tasks.stages.results import load_plant
+from workflow.tasks.results import IdentifiedPlant, RunResults
 
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
 _STATE_SPACE_FILES = (".json", ".mat", ".npz")
@@ -226,7 +225,7 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
     if path.is_dir():
         run = RunDirectory.open(path)
         config = config_of(run)
-        return DesignSource(load_plant(run, config), "run directory", config=config)
+        return DesignSource(RunResults(run).uncertainty.plant(config), "run directory", config=config)
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _measured(path, design)
@@ -234,7 +233,7 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         known = ", ".join((*_STATE_SPACE_FILES, ".csv"))
         raise InputError(f"{path}: not a run directory, and the ending is none of {known}")
     document = _read_document(path, suffix)
-    if "posterior/mean" in document or "model/coefficients" in document:
+    if codec.DOCUMENT in document:
         return DesignSource(_with_posterior(path, document), "model and posterior of flexlink identify")
     if document.get("format") == FORMAT:
         return _exported(path, suffix, design)
@@ -274,21 +273,12 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _with_posterior(path: Path, arrays: Mapping[str, Any]) -> UncertainPlant:
-    """Inverse of `workflow.tasks.log_identification.plant_arrays`."""
-
-    def under(prefix: str) -> dict[str, Any]:
-        return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
-
-    try:
-        model = GobfModel.from_arrays(under("model/"))
-        posterior = ResponsePosterior.from_arrays(under("posterior/"))
-        level = float(arrays["level"])
-    except KeyError as error:
-        raise InputError(
-            f"{path}: not written by flexlink identify --out: {error.args[0]!r} is missing"
-        ) from error
+    """The plant in a file of `flexlink identify --out`."""
     with naming(str(path)):
-        return UncertainPlant(model.output_name, model.to_control(), posterior, level=level)
+        found = codec.from_arrays(IdentifiedPlant, arrays)
+        return UncertainPlant(
+            found.model.output_name, found.model.to_control(), found.posterior, level=found.level
+        )
 
 
 def _exported(path: Path, suffix: str, design: DesignFile) -> DesignSource:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,39 +16,44 @@ from control_design.analysis.certificate import Certificate
 from control_design.controllers.c_code import c_source
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
-from control_design.specification import Specification, SpecificationError
+from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
-from control_design.synthesis.synthesis_result import Outcome
 from ident.data.record import Record
 from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
 from workflow.config.run_config import RunConfig, SimulatedSource, load_config
-from workflow.engine import storage
+from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.engine.run_directory import RunDirectory, default_directory
 from workflow.tasks.achievable_performance import bracket_numbers, find_bracket, order_advice
 from workflow.tasks.design_source import DesignFile, DesignSource, load_sources, read_design_file
-from workflow.tasks.joint_coverage import certify_whole, joint_numbers, open_words, synthesise_asked
+from workflow.tasks.joint_coverage import certify_asked, joint_numbers, open_words
 from workflow.tasks.pipeline import config_of, run_pipeline
 from workflow.tasks.reference_filter import (
     check_prefilter,
     find_prefilter,
     prefilter_bytes,
     prefilter_file,
-    prefilter_of,
+)
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    DesignResult,
+    ReferenceFilterResult,
+    SampledResponses,
 )
 from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
+from workflow.tasks.stages.design import find_design
 from workflow.tasks.summary import (
     Row,
     RunSummary,
     Section,
+    achievable_rows,
     certificate_rows,
     design_rows,
-    gamma_of,
-    prefilter_sections,
-    whole_rows,
-    yardstick_rows,
+    filter_sections,
+    sampled_rows,
 )
 
 BetweenPoints = Literal["nothing", "linear"]
@@ -199,46 +204,45 @@ class _Asked:
 
 @dataclass(frozen=True)
 class _Designed:
-    """Documents of a design, as the stages of a run leave them, and the controller itself."""
+    """Results of a design, of the same types as a run's stages."""
 
-    design: dict[str, Any]
-    yardstick: dict[str, Any]
-    certificate: Certificate | None = None
-    controller: Controller | None = None
-    whole: Mapping[str, Any] = field(default_factory=dict)
-    prefilter: Mapping[str, Any] = field(default_factory=dict)
+    design: DesignResult
+    achievable: AchievablePerformance = field(default_factory=AchievablePerformance)
+    certify: CertifyResult | None = None
+    reference_filter: ReferenceFilterResult = field(default_factory=ReferenceFilterResult)
+
+    @property
+    def certificate(self) -> Certificate | None:
+        return None if self.certify is None else self.certify.certificate
+
+    @property
+    def controller(self) -> Controller | None:
+        """The controller, where there is one that means something."""
+        return self.design.synthesis.controller if self.design.synthesis and self.certify else None
 
 
 def _design(
     plants: Sequence[UncertainPlant], asked: _Asked, between_own_points: BetweenPoints, seed: int
 ) -> _Designed:
     with naming("design"):
-        try:
-            result, jointly = synthesise_asked(
-                plants, asked.specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
-            )
-        except SpecificationError as impossible:
-            reason = f"specification not met: {impossible}"
-            return _Designed({"synthesis": None, "met": False, "reason": reason}, {})
-        design = {
-            "synthesis": result.to_dict(),
-            "met": result.gamma <= 1.0,
-            "reason": result.explain(),
-            "jointly": jointly,
-        }
-        yardstick = find_bracket(plants, asked.specification, asked.yardstick)
-        if result.outcome is Outcome.NOT_CONVERGED:
-            return _Designed(design, yardstick)
-        certificate, whole = certify_whole(
-            result.controller,
+        design = find_design(
+            plants, asked.specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
+        )
+        if design.synthesis is None:
+            return _Designed(replace(design, reason=f"specification not met: {design.reason}"))
+        achievable = find_bracket(plants, asked.specification, asked.yardstick)
+        if not design.has_controller:
+            return _Designed(design, achievable)
+        controller = design.synthesis.controller
+        certified = certify_asked(
+            controller,
             plants,
             asked.specification,
             asked.certificate,
             stage_rng(seed, "certify"),
             between_own_points=between_own_points,
         )
-        prefilter = find_prefilter(result.controller, plants, asked.prefilter)
-        return _Designed(design, yardstick, certificate, result.controller, whole, prefilter)
+        return _Designed(design, achievable, certified, find_prefilter(controller, plants, asked.prefilter))
 
 
 def design_controller(
@@ -272,15 +276,12 @@ def design_controller(
     certificate, order = done.certificate, asked.specification.controller_order
     certified = certificate is not None and certificate.certified
     files = _write_controller(done, out) if out is not None and done.controller is not None else []
-    gamma, advice = gamma_of(done.design), None
+    gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
-        advice = order_advice(done.yardstick, gamma, order)
+        advice = order_advice(done.achievable, gamma, order)
     reason = _reason(done, advice)
-    verdict = {
-        "certificate": None if certificate is None else certificate.to_dict(),
-        "certified": certified,
-        "reason": reason,
-    }
+    verdict = CertifyResult(certificate, certified, reason)
+    sampled = SampledResponses() if done.certify is None else done.certify.sampled
     names = [plant.name for plant in plants]
     about = [
         {"file": str(path), "plant": source.plant.name, "origin": source.origin, "remarks": source.remarks}
@@ -294,26 +295,28 @@ def design_controller(
                 "design",
                 (
                     *design_rows(done.design),
-                    *yardstick_rows(done.yardstick, done.design, order),
+                    *achievable_rows(done.achievable, done.design, order),
                     *([Row("order", advice)] if advice else []),
                 ),
             ),
             Section(
                 "certificate",
-                (*certificate_rows(verdict), *whole_rows(done.whole), *_not_checked_rows(done)),
+                (*certificate_rows(verdict), *sampled_rows(sampled), *_not_checked_rows(done)),
             ),
-            *prefilter_sections(done.prefilter),
+            *filter_sections(done.reference_filter),
             *([Section("written", tuple(Row("", str(path)) for path in files))] if files else []),
         ),
         numbers={
             "plants": about,
-            "design": {**done.design, "order_advice": advice},
-            "yardstick": bracket_numbers(done.yardstick, gamma),
-            **verdict,
-            "whole_responses": joint_numbers(done.whole),
-            "prefilter": done.prefilter.get("prefilter"),
+            "design": {**codec.plain(done.design), "order_advice": advice},
+            "achievable_performance": bracket_numbers(done.achievable, gamma),
+            "certificate": codec.plain(certificate),
+            "certified": certified,
+            "reason": reason,
+            "sampled_responses": joint_numbers(sampled),
+            "reference_filter": codec.plain(done.reference_filter.filter),
             "file": str(files[0]) if files else None,
-            "prefilter_file": str(files[1]) if len(files) > 1 else None,
+            "reference_filter_file": str(files[1]) if len(files) > 1 else None,
         },
         certified=certified,
         verdict=reason,
@@ -337,7 +340,7 @@ def _write_controller(done: _Designed, out: Path) -> list[Path]:
     if done.certificate is None or not done.certificate.certified:
         written = replace(written, name=f"{written.name} (NOT CERTIFIED)")
     content = {out: _CONTROLLER_FILES[suffix](written)}
-    prefilter = prefilter_of(done.prefilter)
+    prefilter = done.reference_filter.filter
     if prefilter is not None:
         content[prefilter_file(out)] = prefilter_bytes(prefilter, suffix)
     for path, data in content.items():
@@ -347,9 +350,9 @@ def _write_controller(done: _Designed, out: Path) -> list[Path]:
 
 def _reason(done: _Designed, advice: str | None) -> str:
     """How the design stands, in one line."""
-    certificate, reason = done.certificate, str(done.design["reason"])
+    certificate, reason = done.certificate, done.design.reason
     if certificate is None:
-        return reason if done.design["synthesis"] is None else f"{reason}; {_NO_CONTROLLER}"
+        return reason if done.design.synthesis is None else f"{reason}; {_NO_CONTROLLER}"
     if certificate.certified:
         return reason
     missed = [item.sentence() for item in certificate.items if not item.met]
@@ -358,7 +361,10 @@ def _reason(done: _Designed, advice: str | None) -> str:
 
 
 def _not_checked_rows(done: _Designed) -> list[Row]:
-    words = [] if done.certificate is None else open_words(done.certificate.not_checked, done.whole)
+    found = done.certify
+    if found is None or found.certificate is None:
+        return []
+    words = open_words(found.certificate.not_checked, found.sampled)
     return [Row("not checked" if number == 0 else "", text) for number, text in enumerate(words)]
 
 

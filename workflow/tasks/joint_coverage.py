@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from control_design.analysis.certificate import Certificate, certify
-from control_design.analysis.joint_coverage import JointCoverage, ResponseDraws, joint_coverage
+from control_design.analysis.joint_coverage import ResponseDraws, joint_coverage
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
@@ -19,7 +19,9 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import CertificateOptions
+from workflow.engine import codec
 from workflow.tasks.proportions import wilson_interval
+from workflow.tasks.results import CertifyResult, SampledResponses
 
 
 def synthesise_asked(
@@ -38,7 +40,7 @@ def synthesise_asked(
     return found.result, found.sentence()
 
 
-def certify_whole(
+def certify_asked(
     controller: Controller,
     plants: Sequence[UncertainPlant],
     specification: Specification,
@@ -46,8 +48,8 @@ def certify_whole(
     rng: np.random.Generator,
     *,
     between_own_points: Literal["nothing", "linear"] = "nothing",
-) -> tuple[Certificate, dict[str, Any]]:
-    """Certificate, and {joint: JointCoverage.to_dict() or null, calibrated, reason: null or why none}.
+) -> CertifyResult:
+    """The certificate, and for how many sampled responses its worst case holds.
 
     Without `calibrate` the certificate is that of the ellipses at their own level, whatever the draws say;
     with it the ellipses are of the calibrated level where that is higher, and the share of stable draws is an
@@ -65,10 +67,10 @@ def certify_whole(
             joint_draws=options.joint_draws,
         )
         assert certificate.joint is not None
-        return certificate, {"joint": certificate.joint.to_dict(), "calibrated": True, "reason": None}
+        return _result(certificate, SampledResponses(certificate.joint, calibrated=True))
     certificate = certify(controller, plants, specification, between_own_points=between_own_points)
     if reason is not None:
-        return certificate, {"joint": None, "calibrated": False, "reason": reason}
+        return _result(certificate, SampledResponses(reason=reason))
     joint = joint_coverage(
         controller,
         plants,
@@ -77,7 +79,19 @@ def certify_whole(
         coverage=options.joint_coverage,
         draws=options.joint_draws,
     )
-    return certificate, {"joint": joint.to_dict(), "calibrated": False, "reason": None}
+    return _result(certificate, SampledResponses(joint))
+
+
+def _result(certificate: Certificate, sampled: SampledResponses) -> CertifyResult:
+    missed = [item.sentence() for item in certificate.items if not item.met]
+    unstable = [verdict.plant for verdict in certificate.plants if not verdict.stable]
+    reason = "; ".join([*(f"{name}: nominal closed loop unstable" for name in unstable), *missed])
+    return CertifyResult(
+        certificate,
+        certificate.certified,
+        reason or ("every item is met" if certificate.certified else "an ellipse reaches -1"),
+        sampled,
+    )
 
 
 def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
@@ -99,28 +113,22 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
     return None if drawn else "no uncertainty is stated: there is nothing to draw from"
 
 
-def open_words(not_checked: Sequence[str], whole: Mapping[str, Any]) -> list[str]:
+def open_words(not_checked: Sequence[str], found: SampledResponses) -> list[str]:
     """What a certificate did not check, with what sampling said of it meanwhile."""
     sampled = "joint level: sampled, not certified; see the whole responses"
-    known = joint_of(whole) is not None
+    known = found.joint is not None
     return [sampled if known and words.startswith("joint level") else words for words in not_checked]
 
 
-def joint_of(document: Mapping[str, Any]) -> JointCoverage | None:
-    """The calibration in a document of `certify_whole`; None also where there is no such document."""
-    found = document.get("joint")
-    return None if found is None else JointCoverage.from_dict(found)
-
-
-def joint_numbers(document: Mapping[str, Any]) -> dict[str, Any]:
+def joint_numbers(found: SampledResponses) -> dict[str, Any]:
     """Numbers for JSON and tables; shares with Wilson intervals at 95 %."""
-    joint = joint_of(document)
+    joint = found.joint
     if joint is None:
-        return {"reason": document.get("reason")}
+        return {"reason": found.reason}
     held, stable = (_counted(share, joint.draws) for share in (joint.coverage_given, joint.stable_share))
     return {
-        **joint.to_dict(),
-        "calibrated": bool(document["calibrated"]),
+        **codec.plain(joint),
+        "calibrated": found.calibrated,
         "held_share": held[0],
         "held_interval": list(held[1]),
         "stable_interval": list(stable[1]),
@@ -128,12 +136,11 @@ def joint_numbers(document: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def joint_words(document: Mapping[str, Any]) -> str | None:
+def joint_words(found: SampledResponses) -> str | None:
     """One sentence on whole responses; None where there is nothing to say."""
-    joint = joint_of(document)
+    joint = found.joint
     if joint is None:
-        reason = document.get("reason")
-        return f"not sampled: {reason}" if reason else None
+        return f"not sampled: {found.reason}" if found.reason else None
     of = f"{joint.draws} whole responses drawn from the posterior"
     _, stable = _counted(joint.stable_share, joint.draws)
     loop = f"{_percent(joint.stable_share)} stable (95 % interval {_between(stable)})"
@@ -145,9 +152,9 @@ def joint_words(document: Mapping[str, Any]) -> str | None:
         f"holds for {_percent(joint.coverage_given)} (95 % interval {_between(held)}), {loop}"
     )
     wanted = _percent(joint.coverage)
-    if document["calibrated"] and joint.level <= joint.given_level:
+    if found.calibrated and joint.level <= joint.given_level:
         return f"{words}; the ellipses were certified as they are: {_percent(joint.level)} would do"
-    if document["calibrated"]:
+    if found.calibrated:
         return (
             f"{words}; certified over ellipses of {_percent(joint.level)}, whose worst case "
             f"{joint.gamma:.4g} holds for {wanted}"

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ident.basis.model import GobfModel
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.checks.residual_tests import residual_advice
-from ident.checks.validation import FreshFit, fit_on_fresh_data, whiteness_test
+from ident.checks.validation import FreshFit, ResidualTest, fit_on_fresh_data, whiteness_test
 from ident.closed_loop import TwoStage, two_stage
 from ident.data.arrays import RealArray
 from ident.data.record import Record
@@ -22,26 +20,27 @@ from ident.identify import Identification, identify
 from ident.stabilisation import Stabilisation, stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
-from workflow.engine import storage
+from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress, Silence
-from workflow.engine.storage import AnyArray
-from workflow.tasks.stages.identify import describe_model
+from workflow.tasks.results import IdentifiedChannel, IdentifiedPlant, UncertainChannel
+from workflow.tasks.stages.identify import settled
 from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.tasks.stages.uncertainty import (
     N_BANDS,
-    band_row,
-    bands_of,
     display_grid,
-    empirical_response,
-    intervals_of,
-    noise_order,
-    nominal_of,
-    nominal_row,
     residual_tests,
-    tests_by_name,
+    uncertain_channel,
 )
-from workflow.tasks.summary import Row, RunSummary, Section, channel_rows, uncertainty_rows
+from workflow.tasks.summary import (
+    Row,
+    RunSummary,
+    Section,
+    channel_rows,
+    model_numbers,
+    uncertainty_numbers,
+    uncertainty_rows,
+)
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
@@ -57,25 +56,41 @@ class LogIdentification:
     """Everything that was found in a set of logs.
 
     `measured` are the records as read, `used` the same as the fit saw them (inside the band; with the input
-    that the reference explains, where the logs come from a closed loop). `about` and `spread` are plain
-    documents like those of a run's stages; `careful` says what to look at, one sentence each. `plot` is None
-    where nobody asked for it.
+    that the reference explains, where the logs come from a closed loop). `about` and `spread` are results as
+    of a run's stages; `careful` says what to look at, one sentence each. The stabilisation plot is None where
+    nobody asked for it.
     """
 
     measured: tuple[Record, ...]
-    used: tuple[Record, ...]
     fresh_records: tuple[Record, ...]
     options: IdentOptions
-    found: Identification
-    posterior: ResponsePosterior
-    nominal: GobfModel
-    frequency: FrequencyUncertainty
-    empirical: FrequencyUncertainty | None
-    fresh: tuple[FreshFit, ...]
-    plot: Stabilisation | None
-    about: Mapping[str, Any]
-    spread: Mapping[str, Any]
+    about: IdentifiedChannel
+    spread: UncertainChannel
     careful: tuple[str, ...]
+
+    @property
+    def found(self) -> Identification:
+        return self.about.identification
+
+    @property
+    def used(self) -> tuple[Record, ...]:
+        return self.about.used
+
+    @property
+    def fresh(self) -> tuple[FreshFit, ...]:
+        return self.about.fresh
+
+    @property
+    def plot(self) -> Stabilisation | None:
+        return self.about.stabilisation
+
+    @property
+    def frequency(self) -> FrequencyUncertainty:
+        return self.spread.frequency
+
+    @property
+    def empirical(self) -> FrequencyUncertainty | None:
+        return self.spread.empirical
 
 
 def identify_logs(
@@ -137,9 +152,10 @@ def identify_logs(
         storage.write_text(report, content)
         progress.finish("report", 0.0, taken_up=False)
     if out is not None:
-        storage.write_npz(out, plant_arrays(result.nominal, result.posterior, level))
+        plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, level)
+        storage.write_npz(out, codec.to_arrays(plant))
     if export is not None:
-        write_model(export, ModelFile(result.found.model, result.frequency))
+        write_model(export, ModelFile(result.about.model, result.spread.frequency))
     return _summary(result, out, report, export)
 
 
@@ -183,7 +199,9 @@ def identify_records(
             )
             used = list(opened.records)
         share = 0.6 if with_plot else 1.0
-        found = identify(used, options, progress=lambda f, m: progress.update("identify", share * f, m))
+        found = settled(
+            identify(used, options, progress=lambda f, m: progress.update("identify", share * f, m))
+        )
         plot = None
         if with_plot:
             plot = stabilisation(
@@ -192,7 +210,19 @@ def identify_records(
                 options,
                 progress=lambda f, m: progress.update("identify", share + (1 - share) * f, m),
             )
-        fresh = tuple(fit_on_fresh_data(found.model, record) for record in fresh_records)
+        about = IdentifiedChannel(
+            name=found.model.output_name,
+            input=found.model.input_name,
+            output=found.model.output_name,
+            identification=found,
+            used=tuple(used),
+            bounded=tuple(used),
+            fresh=tuple(fit_on_fresh_data(found.model, record) for record in fresh_records),
+            fresh_roles=tuple("validation" for _ in fresh_records),
+            stabilisation=plot,
+            band_rad_s=band_rad_s,
+            two_stage=None if opened is None else opened.verdict,
+        )
         progress.finish("identify", 0.0, taken_up=False)
         progress.start("uncertainty")
         posterior, tests = _posterior(used, found)
@@ -203,43 +233,22 @@ def identify_records(
                 raise ValueError(
                     f"the band {band_rad_s[0]:g} to {band_rad_s[1]:g} rad/s is too narrow to show"
                 )
-        nominal = nominal_of(posterior, found.model.poles, omega)
-        frequency = posterior.at(omega, level)
-        spread = {
-            "level": level,
-            "report": posterior.report.to_dict() if posterior.report is not None else None,
-            "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
-            "tests": tests,
-            "repeat_scatter": None,
-            "intervals": intervals_of(posterior, found.model.poles, level),
-            "nominal": nominal_row(frequency, nominal),
-        }
+        spread = uncertain_channel(
+            about.name,
+            "tangent",
+            level,
+            posterior,
+            about,
+            omega,
+            omega,
+            empirical_band_rad_s=band_rad_s,
+            tests=tests,
+        )
     progress.finish("uncertainty", 0.0, taken_up=False)
-    about = {
-        "name": found.model.output_name,
-        "input": found.model.input_name,
-        "output": found.model.output_name,
-        **describe_model(found),
-        "fit_estimation_percent": dict(zip(found.record_names, found.fit_percent.tolist(), strict=True)),
-        "fit_validation_percent": {fit.name: fit.fit_percent for fit in fresh},
-        "fit_repeat_percent": {},
-        "band_rad_s": band_rad_s,
-        "two_stage": None if opened is None else opened.verdict,
-    }
     return LogIdentification(
         measured=tuple(measured),
-        used=tuple(used),
         fresh_records=tuple(fresh_records),
         options=options,
-        found=found,
-        posterior=posterior,
-        nominal=nominal,
-        frequency=frequency,
-        empirical=empirical_response(
-            used, integrators=found.model.integrators, level=level, band_rad_s=band_rad_s
-        ),
-        fresh=fresh,
-        plot=plot,
         about=about,
         spread=spread,
         careful=(*_careful(found, spread), *_first_stage_error(opened, omega)),
@@ -248,7 +257,7 @@ def identify_records(
 
 def _posterior(
     used: Sequence[Record], found: Identification
-) -> tuple[ResponsePosterior, list[dict[str, Any]]]:
+) -> tuple[ResponsePosterior, tuple[ResidualTest, ...]]:
     """Tangent posterior and its residual tests, with as much of a noise model as the residuals ask for.
 
     White-noise bounds around coloured residuals are far too narrow, so the data decide.
@@ -256,11 +265,11 @@ def _posterior(
     if whiteness_test(found.residuals).passed:
         posterior = tangent(used, found.model)
         return posterior, residual_tests(posterior, used)
-    best: tuple[float, ResponsePosterior, list[dict[str, Any]]] | None = None
+    best: tuple[float, ResponsePosterior, tuple[ResidualTest, ...]] | None = None
     for order in _NOISE_ORDERS:
         posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=True, max_ar_order=order))
         tests = residual_tests(posterior, used)
-        whiteness = tests_by_name(tests)["whiteness"]
+        whiteness = next(test for test in tests if test.name == "whiteness")
         # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
         if best is None or whiteness.probability > best[0]:
             best = (whiteness.probability, posterior, tests)
@@ -270,10 +279,11 @@ def _posterior(
     return best[1], best[2]
 
 
-def _careful(found: Identification, spread: Mapping[str, Any]) -> list[str]:
+def _careful(found: Identification, spread: UncertainChannel) -> list[str]:
     """Warnings of the fit, and what to do about residual tests that fail."""
-    tests = tests_by_name(spread["tests"])
-    advice = residual_advice(tests["whiteness"], tests["independence"], noise_order=noise_order(spread))
+    advice = residual_advice(
+        spread.test("whiteness"), spread.test("independence"), noise_order=spread.noise_order
+    )
     return [*found.warnings, *advice]
 
 
@@ -301,19 +311,19 @@ def _summary(
     about, spread = result.about, result.spread
     careful = tuple(Row(f"{i}", text) for i, text in enumerate(result.careful, 1))
     sections = [
-        Section("model", channel_rows(about, spread["intervals"])),
+        Section("model", channel_rows(about, spread.intervals)),
         Section("uncertainty", uncertainty_rows(spread)),
     ]
     if careful:
         sections.append(Section("look at", careful))
     count = len(careful)
     return RunSummary(
-        title=f"{about['input']} to {about['output']}",
+        title=f"{about.input} to {about.output}",
         sections=tuple(sections),
         numbers={
-            **about,
+            **model_numbers(about),
             "warnings": list(result.careful),
-            "uncertainty": spread,
+            "uncertainty": uncertainty_numbers(spread),
             "file": None if out is None else str(out),
             "model_file": None if export is None else str(export),
         },
@@ -365,12 +375,3 @@ def read_model(path: Path) -> ModelFile:
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: not a UTF-8 text file (byte {error.start})") from error
         return ModelFile.from_json(text, str(path))
-
-
-def plant_arrays(model: GobfModel, posterior: ResponsePosterior, level: float) -> dict[str, AnyArray]:
-    """What `flexlink identify --out` writes and `flexlink design` reads."""
-    return {
-        **{f"model/{key}": value for key, value in model.to_arrays().items()},
-        **{f"posterior/{key}": value for key, value in posterior.to_arrays().items()},
-        "level": np.array(level),
-    }

@@ -8,7 +8,7 @@ enters the predicted loop as a disturbance of the output.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from ident.uncertainty import ResponsePosterior
 from plant import Rig, parse_effect
 from plant import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
+from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 from workflow.tasks.simulated_rig import EncodedArm
 
@@ -36,50 +37,37 @@ _PUSH_S = 0.1
 _SETTLED = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Condition:
-    """One run beside its prediction: reference, predicted and achieved (T,), the commands of both, and the
-    share of samples at a limit. `size` is what errors are measured by: the move, or the predicted swing."""
-
-    name: str
-    words: str
-    reference: Real
-    predicted: ClosedLoopTrajectory
-    achieved: ClosedLoopTrajectory
-    size: float
-
-    def row(self) -> dict[str, Any]:
-        """Numbers for tables, errors in percent of `size`."""
-        error = 100 * (self.reference - self.achieved.measured) / self.size
-        away = 100 * (self.achieved.measured - self.predicted.measured) / self.size
-        tail = error[-max(1, error.size // 10) :]
-        moves = bool(np.any(self.reference != 0))
-        passed = 100 * float(np.max(self.achieved.measured) - np.max(self.reference)) / self.size
-        return {
-            "name": self.name,
-            "words": self.words,
-            "size": self.size,
-            "largest_difference_percent": float(np.max(np.abs(away))),
-            "rms_difference_percent": float(np.sqrt(np.mean(away**2))),
-            "overshoot_percent": max(0.0, passed) if moves else None,
-            "error_left_percent": float(np.mean(tail)),
-            "peak_command": float(np.max(np.abs(self.achieved.command))),
-            "limited_fraction": float(np.mean(self.achieved.limited)),
-            "settled": bool(np.ptp(tail) <= 100 * _SETTLED),
-        }
-
-
-def condition_arrays(conditions: Sequence[Condition]) -> dict[str, npt.NDArray[Any]]:
-    """(C, T) arrays of all conditions for the stage file."""
-    if not conditions:
-        return {}
-    return {
-        "conditions/reference": np.stack([c.reference for c in conditions]),
-        "conditions/predicted": np.stack([c.predicted.measured for c in conditions]),
-        "conditions/achieved": np.stack([c.achieved.measured for c in conditions]),
-        "conditions/predicted_command": np.stack([c.predicted.command for c in conditions]),
-        "conditions/achieved_command": np.stack([c.achieved.command for c in conditions]),
-    }
+def condition_run(
+    name: str,
+    words: str,
+    reference: Real,
+    predicted: ClosedLoopTrajectory,
+    achieved: ClosedLoopTrajectory,
+    size: float,
+) -> ConditionRun:
+    """One run beside its prediction, errors in percent of `size`: the move, or the predicted swing."""
+    error = 100 * (reference - achieved.measured) / size
+    away = 100 * (achieved.measured - predicted.measured) / size
+    tail = error[-max(1, error.size // 10) :]
+    moves = bool(np.any(reference != 0))
+    passed = 100 * float(np.max(achieved.measured) - np.max(reference)) / size
+    return ConditionRun(
+        name=name,
+        words=words,
+        size=size,
+        largest_difference_percent=float(np.max(np.abs(away))),
+        rms_difference_percent=float(np.sqrt(np.mean(away**2))),
+        overshoot_percent=max(0.0, passed) if moves else None,
+        error_left_percent=float(np.mean(tail)),
+        peak_command=float(np.max(np.abs(achieved.command))),
+        limited_fraction=float(np.mean(achieved.limited)),
+        settled=bool(np.ptp(tail) <= 100 * _SETTLED),
+        reference=reference,
+        predicted=predicted.measured,
+        achieved=achieved.measured,
+        predicted_command=predicted.command,
+        achieved_command=achieved.command,
+    )
 
 
 class _Pushed:
@@ -129,7 +117,7 @@ class ConditionBench:
         """Effects of the arm the controller meets, by name."""
         return {str(e["name"]): dict(e) for e in (*self.source.effects, *self.options.effects)}
 
-    def run_all(self) -> list[Condition]:
+    def run_all(self) -> list[ConditionRun]:
         """Every condition that this arm and controller allow."""
         found = [self.slew(), self.push(), *self.payloads(), self.late(), *self.frictions(), self.coarse()]
         return [*found, *self.overdriven()]
@@ -189,7 +177,7 @@ class ConditionBench:
     def step(self) -> float:
         return float(self.reference[-1])
 
-    def slew(self) -> Condition:
+    def slew(self) -> ConditionRun:
         """A smooth move, as large as the voltage allows."""
         n = self.reference.size
         start, length = n // 20, max(2, round(0.4 * n))
@@ -201,7 +189,7 @@ class ConditionBench:
             size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
         reference = np.asarray(size * shape, dtype=np.float64)
         seconds = length * self.controller.dt_s
-        return Condition(
+        return condition_run(
             "slew",
             f"smooth move in {seconds:.3g} s",
             reference,
@@ -210,7 +198,7 @@ class ConditionBench:
             size,
         )
 
-    def push(self) -> Condition:
+    def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""
         dt, n = self.controller.dt_s, self.reference.size
         start, length = n // 20, max(2, round(_PUSH_S / dt))
@@ -224,7 +212,7 @@ class ConditionBench:
         scale = self.step / float(np.max(np.abs(answer)))
         nothing = np.zeros(n)
         predicted = self.predict(nothing, output_disturbance=scale * answer)
-        return Condition(
+        return condition_run(
             "push at the tip",
             f"{scale:.3g} N, half sine of {1e3 * length * dt:.3g} ms",
             nothing,
@@ -233,7 +221,7 @@ class ConditionBench:
             float(np.max(np.abs(predicted.measured))),
         )
 
-    def payloads(self) -> list[Condition]:
+    def payloads(self) -> list[ConditionRun]:
         """0, 100 and 200 % of the rated payload: that of the rig and its effects, or a tenth of the link."""
         link = self.rig.link
         tenth = 0.1 * link.density_kg_m3 * link.width_m * link.thickness_m * link.length_m
@@ -251,13 +239,13 @@ class ConditionBench:
             )
         return found
 
-    def late(self) -> Condition:
+    def late(self) -> ConditionRun:
         """One sample of delay more."""
         own = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
         late = {"input_delay": {"name": "input_delay", "delay_s": own + self.controller.dt_s}}
         return self._stepped("late", f"{1e3 * self.controller.dt_s:.3g} ms more delay", effects=late)
 
-    def frictions(self) -> list[Condition]:
+    def frictions(self) -> list[ConditionRun]:
         """None of the arm's joint friction effects, and twice as much of each."""
         own = {name: effect for name, effect in self.effects.items() if name in _FRICTION}
         if not own:
@@ -275,7 +263,7 @@ class ConditionBench:
             self._stepped("double friction", f"twice the {listed}", effects=scaled(2.0)),
         ]
 
-    def coarse(self) -> Condition:
+    def coarse(self) -> ConditionRun:
         """Converters of eight bits and an encoder four times as coarse."""
         limit = self.controller.input_limit or float(np.max(np.abs(self.predict(self.reference).command)))
         command = max(limit / 128, self.options.quantisation)
@@ -285,7 +273,7 @@ class ConditionBench:
         words = f"command in steps of {command:.3g}, measurement of {measurement:.3g}"
         return self._stepped("coarse", words, steps=(measurement, command))
 
-    def overdriven(self) -> list[Condition]:
+    def overdriven(self) -> list[ConditionRun]:
         """A step that needs twice the voltage there is, with anti-windup and without."""
         limit = self.controller.input_limit
         if limit is None:
@@ -294,7 +282,7 @@ class ConditionBench:
         peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
         reference = self.reference * (_OVERDRIVEN * limit / peak)
         words = f"a step that asks for {_OVERDRIVEN:g} times the limit"
-        aware = Condition(
+        aware = condition_run(
             "voltage limit",
             f"{words}, with anti-windup",
             reference,
@@ -302,7 +290,7 @@ class ConditionBench:
             self.achieve(reference),
             float(reference[-1]),
         )
-        unaware = Condition(
+        unaware = condition_run(
             "no anti-windup",
             f"{words}, the controller does not know of it",
             reference,
@@ -316,8 +304,8 @@ class ConditionBench:
     def _unlimited(self) -> Controller:
         return replace(self.controller, input_limit=None, rate_limit=None)
 
-    def _stepped(self, name: str, words: str, **changes: Any) -> Condition:
-        return Condition(
+    def _stepped(self, name: str, words: str, **changes: Any) -> ConditionRun:
+        return condition_run(
             name,
             words,
             self.reference,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +11,7 @@ from control_design.analysis.closed_loop import MeasuredSensitivity, SampledMach
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from ident.data.record import Record
+from workflow.tasks.results import MeasuredPeak
 
 Real = npt.NDArray[np.float64]
 
@@ -101,19 +101,22 @@ def measure_on(
     )
 
 
-def sensitivity_row(name: str, found: MeasuredSensitivity, plan: SensitivityPlan) -> dict[str, Any]:
-    """Numbers of one measurement for tables."""
+def measured_peak(name: str, found: MeasuredSensitivity, plan: SensitivityPlan) -> MeasuredPeak:
+    """One measurement beside the predicted and certified peaks."""
     peak, std, omega = found.peak
-    return {
-        "name": name,
-        "reference_rms": found.reference_rms,
-        "peak": peak,
-        "peak_std": std,
-        "omega_rad_s": omega,
-        "off_nominal_percent": 100 * (peak / plan.nominal_peak - 1),
-        "off_certified_percent": 100 * (peak / plan.certified_peak - 1)
+    return MeasuredPeak(
+        name=name,
+        reference_rms=found.reference_rms,
+        peak=peak,
+        peak_std=std,
+        peak_omega_rad_s=omega,
+        off_nominal_percent=100 * (peak / plan.nominal_peak - 1),
+        off_certified_percent=100 * (peak / plan.certified_peak - 1)
         if np.isfinite(plan.certified_peak)
         else None,
-        "peak_command": found.peak_command,
-        "limited_fraction": found.limited_fraction,
-    }
+        peak_command=found.peak_command,
+        limited_fraction=found.limited_fraction,
+        omega_rad_s=found.omega_rad_s,
+        magnitude=np.abs(found.response),
+        std=found.std,
+    )

@@ -11,7 +11,8 @@ from workflow.engine import storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, one_line
 from workflow.engine.progress import Progress, Silence
-from workflow.engine.run_directory import LAYOUT_VERSION, RunDirectory, StageData, hash_of
+from workflow.engine.run_directory import LAYOUT_VERSION, RunDirectory, hash_of
+from workflow.tasks.results import RecordsResult, RunResults
 from workflow.tasks.stages import STAGES, Stage, StageInput
 from workflow.tasks.summary import RunSummary, summarise
 
@@ -41,7 +42,7 @@ def run_pipeline(
     # Records are read before anything is written: a bad log leaves no directory behind.
     first = STAGES[0]
     started = time.monotonic()
-    ready: StageData | None = None
+    ready: RecordsResult | None = None
     if not (resume and out.exists()):
         ready = first.run(StageInput(config, None, progress))
     ready_s = time.monotonic() - started
@@ -59,9 +60,11 @@ def run_pipeline(
         run.record_status("running")
         progress.plan([(stage.name, stage.expected_s) for stage in STAGES])
         try:
+            results = RunResults(run)
             for stage in STAGES:
-                _perform(stage, config, run, progress, inputs, (ready, ready_s) if stage is first else None)
-            summary = summarise(run, config)
+                before = (ready, ready_s) if stage is first else None
+                _perform(stage, config, results, progress, inputs, before)
+            summary = summarise(results, config)
         except BaseException as error:
             _fail(run, error, created=not existed)
             raise
@@ -72,9 +75,10 @@ def run_pipeline(
 def rebuild_report(run: RunDirectory) -> RunSummary:
     """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing."""
     config = config_of(run)
+    results = RunResults(run)
     with run.locked():
-        _perform(STAGES[-1], config, run, Silence(), {}, None, always=True)
-    return summarise(run, config)
+        _perform(STAGES[-1], config, results, Silence(), {}, None, always=True)
+    return summarise(results, config)
 
 
 def config_of(run: RunDirectory) -> RunConfig:
@@ -85,13 +89,14 @@ def config_of(run: RunDirectory) -> RunConfig:
 def _perform(
     stage: Stage,
     config: RunConfig,
-    run: RunDirectory,
+    results: RunResults,
     progress: Progress,
     inputs: Mapping[str, str],
-    ready: tuple[StageData | None, float] | None,
+    ready: tuple[RecordsResult | None, float] | None,
     *,
     always: bool = False,
 ) -> None:
+    run = results.run
     input_hash = stage_input_hash(stage, config, run, inputs)
     progress.start(stage.name)
     if (
@@ -102,10 +107,12 @@ def _perform(
         progress.finish(stage.name, 0.0, taken_up=True)
         return
     started = time.monotonic()
-    data, before_s = ready if ready is not None else (None, 0.0)
-    if data is None:
-        data = stage.run(StageInput(config, run, progress))
-    run.save_stage(stage.name, data, input_hash)
+    result, before_s = ready if ready is not None else (None, 0.0)
+    if result is None:
+        result = stage.run(StageInput(config, results, progress))
+    run.save_stage(stage.name, result, input_hash)
+    # The stages after it see what is on the disk, as they would in a resumed run: to the last digit.
+    results.forget(stage.name)
     seconds = time.monotonic() - started + before_s
     run.record_stage(stage.name, seconds, input_hash)
     progress.finish(stage.name, seconds, taken_up=False)

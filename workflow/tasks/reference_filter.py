@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,19 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight
 from workflow.config.design_options import PrefilterSettings
 from workflow.engine.errors import InputError
+from workflow.tasks.results import ReferenceFilterResult
 
 
 def find_prefilter(
     controller: Controller, plants: Sequence[UncertainPlant], settings: PrefilterSettings | None
-) -> dict[str, Any]:
-    """{prefilter: Prefilter.to_dict() or null, reason: null or why there is none}.
+) -> ReferenceFilterResult:
+    """The filter, or why there is none.
 
     A loop that is not robustly stable has no worst-case error: a result, with the reason. Raises InputError:
     see `check_prefilter`.
     """
     if settings is None:
-        return {"prefilter": None, "reason": None}
+        return ReferenceFilterResult()
     check_prefilter(settings, controller.dt_s)
     own = {"corner_rad_s", "model_order", "model", "weight"}
     options = PrefilterOptions(**settings.model_dump(exclude=own))
@@ -39,8 +40,8 @@ def find_prefilter(
             controller, plants, settings.reference_model, options, weight=settings.error_weight
         )
     except ValueError as unfit:
-        return {"prefilter": None, "reason": f"no prefilter: {unfit}"}
-    return {"prefilter": found.to_dict(), "reason": None}
+        return ReferenceFilterResult(reason=f"no reference filter: {unfit}")
+    return ReferenceFilterResult(found)
 
 
 def check_prefilter(settings: PrefilterSettings | None, dt_s: float, source: str = "") -> None:
@@ -64,18 +65,11 @@ def check_prefilter(settings: PrefilterSettings | None, dt_s: float, source: str
         )
 
 
-def prefilter_of(document: Mapping[str, Any]) -> Prefilter | None:
-    """The prefilter of `find_prefilter`'s answer; None also for an empty document (a run made before)."""
-    found = document.get("prefilter")
-    return None if found is None else Prefilter.from_dict(found)
-
-
-def prefilter_words(document: Mapping[str, Any]) -> str | None:
-    """One sentence on what the prefilter buys; None where none was asked for."""
-    found = prefilter_of(document)
+def filter_words(result: ReferenceFilterResult) -> str | None:
+    """One sentence on what the reference filter buys; None where none was asked for."""
+    found = result.filter
     if found is None:
-        reason = document.get("reason")
-        return str(reason) if reason else None
+        return result.reason
     gain = found.error_before / found.error_after if found.error_after > 0 else np.inf
     verdict = f", {gain:.3g} times smaller" if gain >= 1.005 else ": it buys nothing here"
     return (

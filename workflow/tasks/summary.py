@@ -7,12 +7,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from workflow.config.run_config import RunConfig
-from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.achievable_performance import bracket_numbers, order_advice, yardstick_words
+from control_design.analysis.margins import Margins
+from workflow.config.run_config import Role, RunConfig
+from workflow.engine import codec
+from workflow.tasks.achievable_performance import achievable_words, bracket_numbers, order_advice
 from workflow.tasks.joint_coverage import joint_numbers, joint_words
-from workflow.tasks.reference_filter import prefilter_of, prefilter_words
-from workflow.tasks.stages.results import load_document
+from workflow.tasks.reference_filter import filter_words
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    ClosedLoopResult,
+    DesignResult,
+    IdentifiedChannel,
+    Intervals,
+    RecordsResult,
+    ReferenceFilterResult,
+    RunResults,
+    SampledResponses,
+    UncertainChannel,
+)
 
 
 @dataclass(frozen=True)
@@ -60,125 +73,114 @@ class RunSummary:
         }
 
 
-def summarise(run: RunDirectory, config: RunConfig) -> RunSummary:
+def summarise(results: RunResults, config: RunConfig) -> RunSummary:
     """The table of a run whose stages are all there."""
-    documents = {
-        name: run.load_stage(name).document
-        for name in ("records", "identify", "uncertainty", "design", "certify", "closed_loop")
-    }
-    channels = []
-    for found, spread in zip(
-        documents["identify"]["channels"], documents["uncertainty"]["channels"], strict=True
-    ):
-        channels.append(
-            Section(
-                f"channel {found['name']}",
-                (*channel_rows(found, spread["intervals"]), *uncertainty_rows(spread)),
-            )
-        )
-    design, certify, loop = (documents[name] for name in ("design", "certify", "closed_loop"))
-    yardstick, prefilter = (load_document(run, name) for name in ("yardstick", "prefilter"))
+    records, design, certify = results.records, results.design, results.certify
+    achievable, loop = results.achievable_performance, results.closed_loop
+    pairs = list(zip(results.identify.channels, results.uncertainty.channels, strict=True))
     order = config.specification.controller_order
-    unit = _unit(documents["records"], config.control_channel.output)
-    command_unit = _unit(documents["records"], config.control_channel.input)
+    unit = records.unit(config.control_channel.output)
+    command_unit = records.unit(config.control_channel.input)
     sections = (
-        Section("records", record_rows(documents["records"])),
-        *channels,
-        Section("design", (*design_rows(design), *yardstick_rows(yardstick, design, order))),
-        Section("certificate", (*certificate_rows(certify), *whole_rows(certify.get("whole", {})))),
-        *prefilter_sections(prefilter),
+        Section("records", record_rows(records)),
+        *(
+            Section(
+                f"channel {found.name}", (*channel_rows(found, spread.intervals), *uncertainty_rows(spread))
+            )
+            for found, spread in pairs
+        ),
+        Section("design", (*design_rows(design), *achievable_rows(achievable, design, order))),
+        Section("certificate", (*certificate_rows(certify), *sampled_rows(certify.sampled))),
+        *filter_sections(results.reference_filter),
         Section("closed loop", closed_loop_rows(loop, unit, command_unit)),
     )
-    certified = (
-        bool(certify["certified"]) and loop["skipped"] is None and loop["settled_draws"] == loop["draws"]
-    )
+    settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
     return RunSummary(
         title=config.run.title or config.run.name,
         sections=sections,
         numbers={
-            "channels": [
-                _numbers_of(f, s)
-                for f, s in zip(
-                    documents["identify"]["channels"], documents["uncertainty"]["channels"], strict=True
-                )
-            ],
-            "design": {"met": design["met"], "reason": design["reason"], **_gamma(design)},
-            "certificate": certify["certificate"],
-            "yardstick": bracket_numbers(yardstick, gamma_of(design)),
-            "whole_responses": joint_numbers(certify.get("whole", {})),
-            "prefilter": prefilter.get("prefilter"),
-            "closed_loop": loop,
+            "channels": [channel_numbers(found, spread) for found, spread in pairs],
+            "design": design_numbers(design),
+            "certificate": codec.plain(certify.certificate),
+            "achievable_performance": bracket_numbers(achievable, design.gamma),
+            "sampled_responses": joint_numbers(certify.sampled),
+            "reference_filter": codec.plain(results.reference_filter.filter),
+            "closed_loop": loop_numbers(loop),
         },
-        certified=certified,
-        verdict=verdict_of(design, certify, loop, yardstick, order),
-        report_path=str(run.report_path) if run.report_path.is_file() else None,
+        certified=certify.certified and settles,
+        verdict=verdict_of(design, certify, loop, achievable, order),
+        report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
 
 
 def verdict_of(
-    design: Mapping[str, Any],
-    certify: Mapping[str, Any],
-    loop: Mapping[str, Any],
-    yardstick: Mapping[str, Any] | None = None,
+    design: DesignResult,
+    certify: CertifyResult,
+    loop: ClosedLoopResult,
+    achievable: AchievablePerformance | None = None,
     order: int | None = None,
 ) -> str:
-    """One line: certified, or what is missed, by how much and at which frequency, and, where the yardstick is
-    given, whether a higher order would help."""
-    if not design["met"]:
-        gamma = gamma_of(design)
+    """One line: certified, or what is missed, by how much and at which frequency, and, where the achievable
+    performance is given, whether a higher order would help."""
+    if not design.met:
         advice = None
-        if yardstick is not None and order is not None and gamma is not None:
-            advice = order_advice(yardstick, gamma, order)
-        return f"specification not met: {design['reason']}" + (f"; {advice}" if advice else "")
-    if not certify["certified"]:
-        return f"not certified: {certify['reason']}"
-    if loop["skipped"] is not None:
-        return f"not checked in closed loop: {loop['skipped']}"
-    if loop["settled_draws"] != loop["draws"]:
-        return (
-            f"closed loop did not settle in {loop['draws'] - loop['settled_draws']} of {loop['draws']} runs"
-        )
-    return f"certified: every item is met, and all {loop['draws']} closed-loop runs settle"
+        if achievable is not None and order is not None and design.gamma is not None:
+            advice = order_advice(achievable, design.gamma, order)
+        return f"specification not met: {design.reason}" + (f"; {advice}" if advice else "")
+    if not certify.certified:
+        return f"not certified: {certify.reason}"
+    if loop.check is None:
+        return f"not checked in closed loop: {loop.skipped}"
+    draws, settled = loop.check.draws, loop.check.settled_draws
+    if settled != draws:
+        return f"closed loop did not settle in {draws - settled} of {draws} runs"
+    return f"certified: every item is met, and all {draws} closed-loop runs settle"
 
 
-def record_rows(document: Mapping[str, Any]) -> tuple[Row, ...]:
+_ROLES: tuple[Role, ...] = ("estimation", "validation", "repeat")
+
+
+def record_rows(result: RecordsResult) -> tuple[Row, ...]:
     """How many records of each role."""
     rows = []
-    for role in ("estimation", "validation", "repeat"):
-        chosen = [record for record in document["records"] if record["role"] == role]
+    for role in _ROLES:
+        chosen = result.of_role(role)
         if chosen:
-            seconds = sum(record["duration_s"] for record in chosen)
-            samples = sum(record["samples"] for record in chosen)
+            seconds = sum(item.duration_s for item in chosen)
+            samples = sum(item.record.n_samples for item in chosen)
             rows.append(Row(role, f"{_count(len(chosen), 'record')}, {samples} samples, {seconds:.4g} s"))
     return tuple(rows)
 
 
-def channel_rows(found: Mapping[str, Any], intervals: Mapping[str, Any] | None = None) -> tuple[Row, ...]:
+def channel_rows(found: IdentifiedChannel, intervals: Intervals | None = None) -> tuple[Row, ...]:
     """Structure, modes (with the intervals of the posterior, if given) and fits of one channel."""
-    extras = [_count(found["integrators"], "integrator")] if found["integrators"] else []
-    extras += [f"delay {found['input_delay_samples']}"] if found["input_delay_samples"] else []
-    extras += ["direct term"] if found["feedthrough"] else []
-    rows = [Row("order", ", ".join([str(found["order"]), *extras]))]
-    for index, mode in enumerate(found["modes"]):
-        text = f"{mode['frequency_Hz']:.4g} Hz, damping {mode['damping']:.3g}"
+    extras = [_count(found.integrators, "integrator")] if found.integrators else []
+    extras += [f"delay {found.input_delay_samples}"] if found.input_delay_samples else []
+    extras += ["direct term"] if found.feedthrough else []
+    rows = [Row("order", ", ".join([str(found.order), *extras]))]
+    for index, mode in enumerate(found.modes):
+        text = f"{mode.frequency_Hz:.4g} Hz, damping {mode.damping:.3g}"
         if intervals is not None:
-            known = intervals["modes"][index]
+            known = intervals.modes[index]
             text += (
-                f" ({100 * intervals['level']:g} %: {between(*known['frequency_Hz'])} Hz, "
-                f"{between(*known['damping'])})"
+                f" ({100 * intervals.level:g} %: {between(*known.frequency_Hz)} Hz, "
+                f"{between(*known.damping)})"
             )
         rows.append(Row("mode", text))
-    if found["real_poles_per_s"]:
-        rates = ", ".join(f"{rate:.4g}" for rate in found["real_poles_per_s"])
+    if found.real_poles_per_s:
+        rates = ", ".join(f"{rate:.4g}" for rate in found.real_poles_per_s)
         rows.append(Row("real poles", f"{rates} 1/s"))
-    no_rate = [value for value in found["real_poles_z"] if value <= 0]
+    no_rate = [value for value in found.real_poles_z if value <= 0]
     if no_rate:
         rows.append(Row("real poles, z plane", ", ".join(f"{value:.4g}" for value in no_rate)))
-    for role in ("estimation", "validation", "repeat"):
-        fits = list(found[f"fit_{role}_percent"].values())
+    of = " of increments" if found.increments else ""
+    for role, fits in (
+        ("estimation", found.fit_estimation_percent),
+        ("validation", found.fit_validation_percent),
+        ("repeat", found.fit_repeat_percent),
+    ):
         if fits:
-            of = " of increments" if found.get("increments") else ""
-            rows.append(Row(f"fit, {role}", _range(fits, f"%{of}")))
+            rows.append(Row(f"fit, {role}", _range(list(fits.values()), f"%{of}")))
     return tuple(rows)
 
 
@@ -192,131 +194,115 @@ def between(low: float, high: float) -> str:
     return f"{low:.{decimals}f} to {high:.{decimals}f}"
 
 
-def uncertainty_rows(spread: Mapping[str, Any]) -> tuple[Row, ...]:
+def uncertainty_rows(spread: UncertainChannel) -> tuple[Row, ...]:
     """Ellipse sizes by band, verdicts of the residual tests, repeat scatter."""
     rows = [
         Row(
-            f"{100 * spread['level']:g} % radius",
+            f"{100 * spread.level:g} % radius",
             ", ".join(
-                f"{_percent(band['median_radius_percent'])} % "
-                f"({band['from_rad_s']:.3g}-{band['to_rad_s']:.3g} rad/s)"
-                for band in spread["bands"]
+                f"{_percent(band.median_radius_percent)} % ({band.from_rad_s:.3g}-{band.to_rad_s:.3g} rad/s)"
+                for band in spread.bands
             ),
         )
     ]
-    for test in spread["tests"]:
-        if test["data"] == "estimation":
-            passed = "pass" if test["passed"] else "FAIL"
-            rows.append(Row(f"residuals, {test['name']}", f"{passed}: {test['verdict']}"))
-    if "nominal" in spread:
-        row = spread["nominal"]
-        rows.append(
-            Row(
-                "nominal model",
-                f"inside {row['share_inside_percent']:.3g} % of the ellipses, at most "
-                f"{row['largest_distance']:.3g} of one from the centre ({row['at_rad_s']:.4g} rad/s)",
-            )
+    for test in spread.tests:
+        passed = "pass" if test.passed else "FAIL"
+        rows.append(Row(f"residuals, {test.name}", f"{passed}: {test.verdict}"))
+    found = spread.agreement
+    rows.append(
+        Row(
+            "nominal model",
+            f"inside {found.share_inside_percent:.3g} % of the ellipses, at most "
+            f"{found.largest_distance:.3g} of one from the centre ({found.at_rad_s:.4g} rad/s)",
         )
-    if spread["repeat_scatter"]:
-        ratios = [row["ratio"] for row in spread["repeat_scatter"]]
+    )
+    if spread.repeat_scatter:
+        ratios = [row.ratio for row in spread.repeat_scatter]
         rows.append(Row("repeat scatter", f"{_range(ratios, '')} times the predicted (by band)"))
     return tuple(rows)
 
 
-def design_rows(design: Mapping[str, Any]) -> tuple[Row, ...]:
+def design_rows(design: DesignResult) -> tuple[Row, ...]:
     """Outcome and controller."""
-    synthesis = design["synthesis"]
-    rows = [Row("outcome", design["reason"])]
-    if synthesis is not None:
-        rows.insert(
-            0,
-            Row(
-                "controller", f"order {len(synthesis['controller']['A'])}, gamma {_text(synthesis['gamma'])}"
-            ),
-        )
-    if design.get("jointly"):
-        rows.append(Row("sampled", design["jointly"]))
+    rows = [Row("outcome", design.reason)]
+    if design.synthesis is not None:
+        order, gamma = design.synthesis.controller.order, design.synthesis.gamma
+        rows.insert(0, Row("controller", f"order {order}, gamma {_text(gamma)}"))
+    if design.jointly:
+        rows.append(Row("sampled", design.jointly))
     return tuple(rows)
 
 
-def certificate_rows(certify: Mapping[str, Any]) -> tuple[Row, ...]:
+def certificate_rows(certify: CertifyResult) -> tuple[Row, ...]:
     """Margins, nominal and worst over the ellipses, and the items."""
-    certificate = certify["certificate"]
+    certificate = certify.certificate
     if certificate is None:
-        return (Row("none", certify["reason"]),)
-    rows = [Row("verdict", "certified" if certify["certified"] else f"NOT certified: {certify['reason']}")]
-    for verdict in certificate["plants"]:
-        for label, key in (("margins, nominal", "nominal_margins"), ("margins, worst case", "worst_margins")):
-            rows.append(Row(label, margin_text(verdict[key])))
-        rows.append(
+        return (Row("none", certify.reason),)
+    rows = [Row("verdict", "certified" if certify.certified else f"NOT certified: {certify.reason}")]
+    for verdict in certificate.plants:
+        rows += [
+            Row("margins, nominal", margin_text(verdict.nominal_margins)),
+            Row("margins, worst case", margin_text(verdict.worst_margins)),
             Row(
                 "bandwidth",
-                f"{_text(verdict['bandwidth_rad_s'])} rad/s (|S| below -3 dB up to here, worst case)",
-            )
-        )
-        for mode in verdict["closed_loop_modes"]:
-            if mode["zeta"] < 0.4:
-                rows.append(
-                    Row(
-                        "closed-loop mode",
-                        f"{mode['omega_rad_s'] / (2 * math.pi):.4g} Hz, damping {mode['zeta']:.3g}",
-                    )
-                )
-    for item in certificate["items"]:
-        where = "" if item["omega_rad_s"] is None else f" at {_text(item['omega_rad_s'])} rad/s"
-        state = "met" if item["met"] else "NOT met"
-        value = f"{_text(item['achieved'])} against {_text(item['required'])} {item['unit']}".rstrip()
-        rows.append(Row(item["requirement"], f"{value}{where}: {state}"))
+                f"{_text(verdict.bandwidth_rad_s)} rad/s (|S| below -3 dB up to here, worst case)",
+            ),
+        ]
+        rows += [
+            Row("closed-loop mode", f"{m.omega_rad_s / (2 * math.pi):.4g} Hz, damping {m.zeta:.3g}")
+            for m in verdict.closed_loop_modes
+            if m.zeta < 0.4
+        ]
+    for item in certificate.items:
+        where = "" if item.omega_rad_s is None else f" at {_text(item.omega_rad_s)} rad/s"
+        state = "met" if item.met else "NOT met"
+        value = f"{_text(item.achieved)} against {_text(item.required)} {item.unit}".rstrip()
+        rows.append(Row(item.requirement, f"{value}{where}: {state}"))
     return tuple(rows)
 
 
-def gamma_of(design: Mapping[str, Any]) -> float | None:
-    """Weighted worst case of the design on its own grid; None without a controller, inf without a stable
-    one."""
-    synthesis = design["synthesis"]
-    if synthesis is None:
-        return None
-    return math.inf if synthesis["gamma"] is None else float(synthesis["gamma"])
-
-
-def yardstick_rows(yardstick: Mapping[str, Any], design: Mapping[str, Any], order: int) -> tuple[Row, ...]:
+def achievable_rows(found: AchievablePerformance, design: DesignResult, order: int) -> tuple[Row, ...]:
     """How far the order chosen is from what any order could reach."""
-    words = yardstick_words(yardstick, gamma_of(design), order)
+    words = achievable_words(found, design.gamma, order)
     return (Row("against any order", words),) if words else ()
 
 
-def whole_rows(whole: Mapping[str, Any]) -> tuple[Row, ...]:
-    """For how many whole responses the worst case holds."""
-    words = joint_words(whole)
-    return (Row("whole responses", words),) if words else ()
+def sampled_rows(found: SampledResponses) -> tuple[Row, ...]:
+    """For how many sampled responses the worst case holds."""
+    words = joint_words(found)
+    return (Row("sampled responses", words),) if words else ()
 
 
-def prefilter_sections(document: Mapping[str, Any]) -> tuple[Section, ...]:
-    """The prefilter, if one was asked for."""
-    words = prefilter_words(document)
+def filter_sections(result: ReferenceFilterResult) -> tuple[Section, ...]:
+    """The reference filter, if one was asked for."""
+    words = filter_words(result)
     if words is None:
         return ()
-    found = prefilter_of(document)
-    label = "none" if found is None else "model matching"
-    return (Section("prefilter", (Row(label, words),)),)
+    label = "none" if result.filter is None else "model matching"
+    return (Section("reference filter", (Row(label, words),)),)
 
 
-def margin_text(margins: Mapping[str, Any]) -> str:
-    """Gain, phase, modulus and delay margin in one line; None means unlimited."""
-    gain = "unlimited" if margins["gain_up"] is None else f"{20 * math.log10(margins['gain_up']):.2f} dB"
-    phase = "unlimited" if margins["phase_rad"] is None else f"{math.degrees(margins['phase_rad']):.1f} deg"
-    delay = "unlimited" if margins["delay_s"] is None else f"{1e3 * margins['delay_s']:.1f} ms"
-    return f"gain {gain}, phase {phase}, modulus {_text(margins['modulus'])}, delay {delay}"
+def margin_text(margins: Margins) -> str:
+    """Gain, phase, modulus and delay margin in one line; infinite ones are unlimited."""
+
+    def number(value: float, text: str) -> str:
+        return text if math.isfinite(value) else "unlimited"
+
+    gain = number(margins.gain_up, f"{20 * math.log10(margins.gain_up):.2f} dB")
+    phase = number(margins.phase_rad, f"{math.degrees(margins.phase_rad):.1f} deg")
+    delay = number(margins.delay_s, f"{1e3 * margins.delay_s:.1f} ms")
+    return f"gain {gain}, phase {phase}, modulus {_text(margins.modulus)}, delay {delay}"
 
 
-def closed_loop_rows(loop: Mapping[str, Any], unit: str, command_unit: str) -> tuple[Row, ...]:
+def closed_loop_rows(loop: ClosedLoopResult, unit: str, command_unit: str) -> tuple[Row, ...]:
     """Prediction beside what the machine did (median and range over the runs)."""
-    if loop["skipped"] is not None:
-        return (Row("not run", loop["skipped"]),)
+    check = loop.check
+    if check is None:
+        return (Row("not run", str(loop.skipped)),)
     machine = {"simulated": "simulated nonlinear arm", "identified": "plants drawn from the identified model"}
     rows = [
-        Row("machine", f"{machine[loop['machine']]}, {loop['draws']} runs, {loop['settled_draws']} settle"),
-        Row("reference step", f"{loop['reference_step']:.4g} {unit}".rstrip()),
+        Row("machine", f"{machine[check.machine]}, {check.draws} runs, {check.settled_draws} settle"),
+        Row("reference step", f"{check.reference_step:.4g} {unit}".rstrip()),
     ]
     tracking = (
         ("rise time", "rise_time_s", "s"),
@@ -325,27 +311,26 @@ def closed_loop_rows(loop: Mapping[str, Any], unit: str, command_unit: str) -> t
         ("steady error", "steady_error", unit),
     )
     always = (("peak command", "peak_command", command_unit), ("disturbance peak", "disturbance_peak", unit))
-    for label, key, suffix in (*(tracking if loop["tracking"] else ()), *always):
-        achieved = [row[key] for row in loop["achieved"] if row[key] is not None]
-        never = len(loop["achieved"]) - len(achieved)
+    for label, key, suffix in (*(tracking if check.tracking else ()), *always):
+        values = [getattr(row, key) for row in check.achieved]
+        achieved = [value for value in values if value is not None]
         text = _range(achieved, suffix) if achieved else "never"
-        if achieved and never:
-            text += f" ({never} never)"
-        rows.append(Row(label, f"predicted {_text(loop['predicted'][key], suffix)}, achieved {text}"))
-    found = loop.get("sensitivity")
-    if found:
-        large = found["measured"][0]
+        if achieved and len(achieved) < len(values):
+            text += f" ({len(values) - len(achieved)} never)"
+        rows.append(Row(label, f"predicted {_text(getattr(check.predicted, key), suffix)}, achieved {text}"))
+    found = check.sensitivity
+    if found is not None:
+        large = found.measured[0]
         rows.append(
             Row(
                 "peak of |S|",
-                f"predicted {_text(found['nominal_peak'])}, certified at most "
-                f"{_text(found['certified_peak'])}, measured {_text(large['peak'])} "
-                f"({large['off_nominal_percent']:+.2f} % of predicted)",
+                f"predicted {_text(found.nominal_peak)}, certified at most {_text(found.certified_peak)}, "
+                f"measured {_text(large.peak)} ({large.off_nominal_percent:+.2f} % of predicted)",
             )
         )
-    if loop.get("conditions"):
-        unsettled = [row["name"] for row in loop["conditions"] if not row["settled"]]
-        count = len(loop["conditions"])
+    if check.conditions:
+        unsettled = [row.name for row in check.conditions if not row.settled]
+        count = len(check.conditions)
         rows.append(
             Row(
                 "other conditions",
@@ -356,29 +341,61 @@ def closed_loop_rows(loop: Mapping[str, Any], unit: str, command_unit: str) -> t
     return tuple(rows)
 
 
-def _numbers_of(found: Mapping[str, Any], spread: Mapping[str, Any]) -> dict[str, Any]:
-    kept = ("name", "order", "modes", "real_poles_per_s", "noise_std", "tangent_optimality")
-    fits = ("fit_estimation_percent", "fit_validation_percent", "fit_repeat_percent")
-    tests = [
-        {key: test[key] for key in ("data", "name", "probability", "passed")} for test in spread["tests"]
-    ]
+def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
+    """What was found in one channel, for programs."""
+    names: tuple[str, ...] = (
+        "name",
+        "input",
+        "output",
+        "order",
+        "integrators",
+        "input_delay_samples",
+        "feedthrough",
+    )
+    names += ("real_poles_per_s", "real_poles_z", "warnings", "verdicts", "order_table", "band_rad_s")
+    names += ("fit_estimation_percent", "fit_validation_percent", "fit_repeat_percent", "two_stage")
     return {
-        **{key: found[key] for key in (*kept, *fits)},
-        "bands": spread["bands"],
-        "tests": tests,
-        "repeat_scatter": spread["repeat_scatter"],
+        **{name: codec.plain(getattr(found, name)) for name in names},
+        "modes": [{"frequency_Hz": mode.frequency_Hz, **codec.plain(mode)} for mode in found.modes],
+        "noise_std": found.identification.noise_std,
+        "tangent_optimality": found.identification.tangent_optimality,
+        "search_evaluations": found.identification.search.evaluations,
     }
 
 
-def _gamma(design: Mapping[str, Any]) -> dict[str, Any]:
-    synthesis = design["synthesis"]
-    if synthesis is None:
-        return {"gamma": None, "outcome": "IMPOSSIBLE", "blocking": []}
-    return {key: synthesis[key] for key in ("gamma", "outcome", "blocking")}
+def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
+    """The same of its ellipses, arrays left out."""
+    found: dict[str, Any] = codec.plain(spread, arrays=False)
+    for unwanted in ("posterior", "nominal", "frequency", "empirical"):
+        found.pop(unwanted)
+    return {**found, "report": codec.plain(spread.posterior.report)}
 
 
-def _unit(records: Mapping[str, Any], signal: str) -> str:
-    return str(records["records"][0]["units"].get(signal, ""))
+def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[str, Any]:
+    """The model of a channel and its ellipses together."""
+    said = uncertainty_numbers(spread)
+    return {**model_numbers(found), **{key: said[key] for key in ("bands", "tests", "repeat_scatter")}}
+
+
+def design_numbers(design: DesignResult) -> dict[str, Any]:
+    """Outcome of a design without its controller."""
+    found = design.synthesis
+    return {
+        "met": design.met,
+        "reason": design.reason,
+        "gamma": design.gamma,
+        "outcome": "IMPOSSIBLE" if found is None else found.outcome.name,
+        "blocking": [] if found is None else codec.plain(found.blocking),
+    }
+
+
+def loop_numbers(loop: ClosedLoopResult) -> dict[str, Any]:
+    """The check without its signals."""
+    if loop.check is None:
+        return {"skipped": loop.skipped}
+    draws, settled = loop.check.draws, loop.check.settled_draws
+    said: dict[str, Any] = codec.plain(loop.check, arrays=False)
+    return {"skipped": None, "draws": draws, "settled_draws": settled, **said}
 
 
 def _percent(value: float) -> str:

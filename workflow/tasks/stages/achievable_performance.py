@@ -1,4 +1,4 @@
-"""Yardstick: what a controller of any order could reach with this plant and specification."""
+"""Achievable performance: what a controller of any order could reach with this plant and specification."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 
 from workflow.config.run_config import RunConfig
 from workflow.engine.errors import naming
-from workflow.engine.run_directory import StageData
 from workflow.tasks.achievable_performance import UNKNOWN_TO_BRACKET, find_bracket
+from workflow.tasks.results import AchievablePerformance
 from workflow.tasks.stages.base import StageInput
-from workflow.tasks.stages.results import load_plant
 
 
 def settings(config: RunConfig) -> Mapping[str, Any]:
@@ -23,13 +22,13 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
     }
 
 
-def find_yardstick(stage: StageInput) -> StageData:
+def find_achievable(stage: StageInput) -> AchievablePerformance:
     """The bracket, or the reason why there is none."""
 
     def report(fraction: float, message: str) -> None:
-        stage.progress.update("yardstick", fraction, message)
+        stage.progress.update("achievable_performance", fraction, message)
 
-    with naming("yardstick"):
-        plant = load_plant(stage.results, stage.config)
-        found = find_bracket([plant], stage.config.specification, stage.config.yardstick, report)
-    return StageData(document=found)
+    config = stage.config
+    with naming("achievable performance"):
+        plant = stage.results.uncertainty.plant(config)
+        return find_bracket([plant], config.specification, config.yardstick, report)

@@ -12,13 +12,12 @@ from control_design.convex.reference_filter import Prefilter
 from control_design.plants.plant_set import UncertainPlant
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import SimulatedSource
-from workflow.engine.run_directory import StageData
-from workflow.tasks.loop_conditions import ConditionBench, condition_arrays
-from workflow.tasks.loop_sensitivity import measure_on, plan_sensitivity, sensitivity_row
+from workflow.tasks.loop_conditions import ConditionBench
+from workflow.tasks.loop_sensitivity import measure_on, measured_peak, plan_sensitivity
+from workflow.tasks.results import ConditionRun, SensitivityCheck
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
 from workflow.tasks.stages.base import StageInput
-from workflow.tasks.stages.results import fitted_records
 
 Real = npt.NDArray[np.float64]
 
@@ -30,23 +29,18 @@ def check_on_arm(
     plant: UncertainPlant,
     posterior: ResponsePosterior,
     reference: Real,
-) -> StageData:
+) -> tuple[SensitivityCheck | None, tuple[ConditionRun, ...]]:
     """S measured on the arm, and the loop under other conditions; nothing where the arm is not simulated.
 
     reference: (T,) step after a lead-in, long enough to settle.
     """
     source, options = stage.config.source, stage.config.closed_loop
-    document: dict[str, Any] = {"sensitivity": None, "conditions": []}
-    arrays: dict[str, npt.NDArray[Any]] = {}
+    sensitivity, conditions = None, []
     if not (isinstance(source, SimulatedSource) and stage.config.machine == "simulated"):
-        return StageData(document=document)
+        return None, ()
     if options.sensitivity:
         stage.progress.update("closed_loop", 0.8, "sensitivity")
-        certificate = stage.results.load_stage("certify").document["certificate"]
-        certified = float(certificate["plants"][0]["worst_peak_sensitivity"])
-        measured = _sensitivity(stage, source, controller, plant, certified, reference.size)
-        document["sensitivity"] = measured.document
-        arrays |= measured.arrays
+        sensitivity = _sensitivity(stage, source, controller, plant, reference.size)
     if options.conditions:
         stage.progress.update("closed_loop", 0.9, "conditions")
         conditions = ConditionBench(
@@ -60,9 +54,7 @@ def check_on_arm(
             measured=OUTPUT_NAMES.index(stage.config.control_channel.output),
             rng=stage.rng("closed_loop", "conditions"),
         ).run_all()
-        document["conditions"] = [condition.row() for condition in conditions]
-        arrays |= condition_arrays(conditions)
-    return StageData(arrays, document)
+    return sensitivity, tuple(conditions)
 
 
 def _sensitivity(
@@ -70,13 +62,14 @@ def _sensitivity(
     source: SimulatedSource,
     controller: Controller,
     plant: UncertainPlant,
-    certified: float,
     samples: int,
-) -> StageData:
+) -> SensitivityCheck:
     """The peak of S on the arm, large and small, beside prediction and certified bound."""
-    options = stage.config.closed_loop
+    options, certificate = stage.config.closed_loop, stage.results.certify.certificate
+    assert certificate is not None
     measured = OUTPUT_NAMES.index(stage.config.control_channel.output)
-    records = fitted_records(stage.results, stage.config)
+    records = stage.results.records.fitted(stage.config.control_channel)
+    certified = certificate.plants[0].worst_peak_sensitivity
     plan = plan_sensitivity(controller, plant, certified, records, samples)
     arms: list[tuple[str, tuple[dict[str, Any], ...], bool]] = [
         ("arm as identified", (), False),
@@ -84,7 +77,7 @@ def _sensitivity(
     ]
     if options.effects:
         arms.append(("arm of the closed-loop check", options.effects, False))
-    rows, arrays = [], {}
+    rows = []
     for number, (name, effects, small) in enumerate(arms):
         arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
         found = measure_on(
@@ -97,16 +90,7 @@ def _sensitivity(
             command_step=options.quantisation,
             small=small,
         )
-        rows.append(sensitivity_row(name, found, plan))
-        at = f"sensitivity/{number}"
-        arrays[f"{at}/omega_rad_s"] = found.omega_rad_s
-        arrays[f"{at}/magnitude"] = np.abs(found.response)
-        arrays[f"{at}/std"] = found.std
-    document = {
-        "nominal_peak": plan.nominal_peak,
-        "nominal_omega_rad_s": plan.nominal_omega_rad_s,
-        "certified_peak": plan.certified_peak,
-        "band_rad_s": list(plan.band_rad_s),
-        "measured": rows,
-    }
-    return StageData(arrays, document)
+        rows.append(measured_peak(name, found, plan))
+    return SensitivityCheck(
+        plan.nominal_peak, plan.nominal_omega_rad_s, plan.certified_peak, plan.band_rad_s, tuple(rows)
+    )

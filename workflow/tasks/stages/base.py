@@ -12,23 +12,24 @@ import numpy as np
 from workflow.config.run_config import RunConfig
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
-from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.results import RunResults
 
 
 @dataclass(frozen=True)
 class StageInput:
-    """What a stage may look at. `run` is None for the first stage only, which reads no earlier result."""
+    """What a stage may look at. `earlier` is None for the first stage only, which reads no earlier result."""
 
     config: RunConfig
-    run: RunDirectory | None
+    earlier: RunResults | None
     progress: Progress
 
     @property
-    def results(self) -> RunDirectory:
-        """The run whose earlier stages are read."""
-        if self.run is None:
+    def results(self) -> RunResults:
+        """What the stages before it found."""
+        if self.earlier is None:
             raise RuntimeError("the first stage has no earlier results")
-        return self.run
+        return self.earlier
 
     def rng(self, *names: str) -> np.random.Generator:
         """The random stream of these names: the same whatever else ran before."""
@@ -59,6 +60,6 @@ class Stage:
     name: str
     after: tuple[str, ...]
     settings: Callable[[RunConfig], Mapping[str, Any]]
-    run: Callable[[StageInput], StageData]
+    run: Callable[[StageInput], Any]
     expected_s: float
     also_writes: Callable[[RunDirectory], tuple[Path, ...]] = _nothing

@@ -16,19 +16,12 @@ from control_design.convex.reference_filter import Prefilter
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedSource
 from workflow.engine.errors import naming
-from workflow.engine.run_directory import StageData
-from workflow.tasks.reference_filter import model_answer, prefilter_of
+from workflow.tasks.reference_filter import model_answer
+from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
 from workflow.tasks.stages.arm_checks import check_on_arm
 from workflow.tasks.stages.base import StageInput
-from workflow.tasks.stages.results import (
-    fitted_records,
-    load_document,
-    load_plant,
-    load_posterior,
-    load_synthesis,
-)
 
 Real = npt.NDArray[np.float64]
 
@@ -63,45 +56,23 @@ class Trial:
     prefiltered: Real | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Runs:
-    """Several closed-loop runs: output, command and performance (R, T); limited (R, T) where a limit was
-    active."""
-
-    output: Real
-    command: Real
-    performance: Real | None
-    limited: npt.NDArray[np.bool_]
-
-    def arrays(self, prefix: str) -> dict[str, npt.NDArray[Any]]:
-        found: dict[str, npt.NDArray[Any]] = {
-            f"{prefix}/output": self.output,
-            f"{prefix}/command": self.command,
-            f"{prefix}/limited": self.limited,
-        }
-        return found if self.performance is None else {**found, f"{prefix}/performance": self.performance}
-
-
-def run_closed_loop(stage: StageInput) -> StageData:
+def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
     """Prediction and machine on the same trial; Monte Carlo over noise and rig, or over drawn plants."""
-    config = stage.config
-    result = load_synthesis(stage.results)
-    certificate = stage.results.load_stage("certify").document
-    if result is None or certificate["certificate"] is None:
-        return StageData(document={"skipped": certificate["reason"], "machine": config.machine})
-    controller = result.controller
+    config, results = stage.config, stage.results
+    synthesis = results.design.synthesis
+    if synthesis is None or results.certify.certificate is None:
+        return ClosedLoopResult(skipped=results.certify.reason)
+    controller = synthesis.controller
     with naming("closed loop"):
-        plant = load_plant(stage.results, config)
+        plant = results.uncertainty.plant(config)
         radius = float(np.max(np.abs(closed_loop_poles(controller, plant))))
         if not radius < 1:
-            return StageData(
-                document={"skipped": "the nominal closed loop is unstable", "machine": config.machine}
-            )
-        prefilter = prefilter_of(load_document(stage.results, "prefilter"))
+            return ClosedLoopResult(skipped="the nominal closed loop is unstable")
+        prefilter = results.reference_filter.filter
         trial = make_trial(stage, controller.dt_s, radius, prefilter)
-        posterior = load_posterior(stage.results, config.control_index)
-        performance = config.performance_index
-        tip = None if performance is None else load_posterior(stage.results, performance)
+        channels, performance = results.uncertainty.channels, config.performance_index
+        posterior = channels[config.control_index].posterior
+        tip = None if performance is None else channels[performance].posterior
         predicted = run_on_draws(controller, posterior, tip, [posterior.mean], _means(tip), trial, None)
         stage.progress.update("closed_loop", 0.1, "machine")
         achieved = (
@@ -109,36 +80,34 @@ def run_closed_loop(stage: StageInput) -> StageData:
             if config.machine == "simulated"
             else run_on_posterior(stage, controller, posterior, tip, trial)
         )
-        beyond = check_on_arm(stage, controller, prefilter, plant, posterior, trial.reference[: trial.half])
-    rows = describe(achieved, trial)
-    document = {
-        "skipped": None,
-        "machine": config.machine,
-        "tracking": trial.tracking,
-        "draws": len(rows),
-        "settled_draws": sum(row["settled"] for row in rows),
-        "reference_step": trial.step,
-        "disturbance": float(trial.disturbance[-1]),
-        "quantisation": config.closed_loop.quantisation,
-        "measurement_step": config.closed_loop.measurement_step,
-        "input_limit": controller.input_limit,
-        "prefiltered": prefilter is not None,
-        "predicted": describe(predicted, trial)[0],
-        "achieved": rows,
-        **beyond.document,
-    }
-    arrays = {
-        "time_s": trial.time_s,
-        "reference": trial.reference,
-        "disturbance": trial.disturbance,
-        **predicted.arrays("predicted"),
-        **achieved.arrays("achieved"),
-        **beyond.arrays,
-    }
+        sensitivity, conditions = check_on_arm(
+            stage, controller, prefilter, plant, posterior, trial.reference[: trial.half]
+        )
+    model = None
     if prefilter is not None and config.prefilter is not None:
-        model = config.prefilter.reference_model
-        arrays["model"] = model_answer(model, trial.reference, controller.dt_s)
-    return StageData(arrays, document)
+        model = model_answer(config.prefilter.reference_model, trial.reference, controller.dt_s)
+    return ClosedLoopResult(
+        check=LoopCheck(
+            machine=config.machine,
+            tracking=trial.tracking,
+            reference_step=trial.step,
+            disturbance_step=float(trial.disturbance[-1]),
+            quantisation=config.closed_loop.quantisation,
+            measurement_step=config.closed_loop.measurement_step,
+            input_limit=controller.input_limit,
+            filtered=prefilter is not None,
+            predicted=describe(predicted, trial)[0],
+            achieved=describe(achieved, trial),
+            time_s=trial.time_s,
+            reference=trial.reference,
+            disturbance=trial.disturbance,
+            model_answer=model,
+            predicted_runs=predicted,
+            achieved_runs=achieved,
+            sensitivity=sensitivity,
+            conditions=conditions,
+        )
+    )
 
 
 def make_trial(
@@ -147,7 +116,7 @@ def make_trial(
     """Half the record for the step, half for the disturbance, each long enough for the slowest closed-loop
     pole."""
     options, config = stage.config.closed_loop, stage.config
-    used = fitted_records(stage.results, config)
+    used = stage.results.records.fitted(config.control_channel)
     if options.duration_s is not None:
         samples = round(options.duration_s / dt_s)
     else:
@@ -173,7 +142,7 @@ def make_trial(
     )
 
 
-def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> Runs:
+def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopRuns:
     """The nonlinear arm of the source with its extra effects; every run has its own noise and rig draw."""
     config = stage.config
     source = config.source
@@ -192,7 +161,7 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> Runs:
         )
         runs.append(_loop(controller, ClippedMachine(arm, FINITE), trial, measured, config.closed_loop))
     outputs = np.stack([run.output for run in runs])
-    return Runs(
+    return LoopRuns(
         outputs[:, :, measured],
         np.stack([run.command for run in runs]),
         None if tip is None else outputs[:, :, tip],
@@ -206,7 +175,7 @@ def run_on_posterior(
     posterior: ResponsePosterior,
     tip: ResponsePosterior | None,
     trial: Trial,
-) -> Runs:
+) -> LoopRuns:
     """Plants drawn from the identified uncertainty; control and performance channel are drawn
     independently."""
     draws = stage.config.closed_loop.draws
@@ -223,7 +192,7 @@ def run_on_draws(
     tip_draws: Sequence[Real] | Real | None,
     trial: Trial,
     steps: ClosedLoopOptions | None,
-) -> Runs:
+) -> LoopRuns:
     """One closed loop per draw of coefficients; the performance output follows from the command that
     acted."""
     runs, shown = [], []
@@ -245,7 +214,7 @@ def run_on_draws(
         runs.append(run)
         if tip is not None and tip_draws is not None:
             shown.append(tip.simulate(run.command + trial.disturbance, np.asarray(tip_draws[number])))
-    return Runs(
+    return LoopRuns(
         np.stack([run.measured for run in runs]),
         np.stack([run.command for run in runs]),
         np.stack(shown) if shown else None,
@@ -274,7 +243,7 @@ def _loop(
     )
 
 
-def describe(runs: Runs, trial: Trial) -> list[dict[str, Any]]:
+def describe(runs: LoopRuns, trial: Trial) -> tuple[LoopMetrics, ...]:
     """Step and disturbance metrics of every run; `settled` says whether its motion dies out."""
     rows = []
     for output, command, limited in _each(runs):
@@ -292,14 +261,14 @@ def describe(runs: Runs, trial: Trial) -> list[dict[str, Any]]:
         steady = all(np.ptp(end) <= _SETTLED * abs(trial.step) for end in ends)
         arrived = abs(float(np.mean(ends[0]))) <= _SETTLED * abs(trial.step)
         rows.append(
-            {
-                **step_metrics(step).to_dict(),
-                "disturbance_peak": float(np.max(np.abs(error[trial.half :]))),
-                "disturbance_left": float(np.mean(ends[1])),
-                "settled": bool(steady and (arrived or not trial.tracking)),
-            }
+            LoopMetrics(
+                **vars(step_metrics(step)),
+                disturbance_peak=float(np.max(np.abs(error[trial.half :]))),
+                disturbance_left=float(np.mean(ends[1])),
+                settled=bool(steady and (arrived or not trial.tracking)),
+            )
         )
-    return rows
+    return tuple(rows)
 
 
 def _tail(signal: Real) -> Real:
@@ -307,7 +276,7 @@ def _tail(signal: Real) -> Real:
     return signal[-max(1, signal.size // 10) :]
 
 
-def _each(runs: Runs) -> Iterator[tuple[Real, Real, npt.NDArray[np.bool_]]]:
+def _each(runs: LoopRuns) -> Iterator[tuple[Real, Real, npt.NDArray[np.bool_]]]:
     return zip(runs.output, runs.command, runs.limited, strict=True)
 
 

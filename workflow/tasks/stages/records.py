@@ -15,13 +15,11 @@ from workflow.config.run_config import (
     FileRecord,
     FileSource,
     RunConfig,
-    SimulatedRecord,
     SimulatedSource,
     record_name,
 )
 from workflow.engine.errors import InputError, naming
-from workflow.engine.run_directory import StageData
-from workflow.engine.storage import AnyArray
+from workflow.tasks.results import RecordsResult, RunRecord
 from workflow.tasks.simulated_rig import simulate_record
 from workflow.tasks.stages.base import StageInput
 
@@ -34,59 +32,44 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
     }
 
 
-def make_records(stage: StageInput) -> StageData:
+def make_records(stage: StageInput) -> RecordsResult:
     """All records of the configuration, in its order."""
     source = stage.config.source
-    arrays: dict[str, AnyArray] = {}
     if isinstance(source, SimulatedSource):
-        records = []
-        for index, experiment in enumerate(source.records):
-            stage.progress.update("records", index / len(source.records), experiment.name)
-            with naming(f"source.records[{index}] ({experiment.name})"):
-                simulated = simulate_record(source, experiment, stage.config.run.seed)
-            records.append(simulated.record)
-            arrays[f"noise_free/{index}/output"] = simulated.noise_free_output
-        kinds: list[str] = [experiment.excitation.kind for experiment in source.records]
-        files: list[str | None] = [None] * len(records)
-        effects = [dict(effect) for effect in source.effects]
+        made = []
+        for index, entry in enumerate(source.records):
+            stage.progress.update("records", index / len(source.records), entry.name)
+            with naming(f"source.records[{index}] ({entry.name})"):
+                simulated = simulate_record(source, entry, stage.config.run.seed)
+            made.append(
+                RunRecord(
+                    simulated.record,
+                    entry.role,
+                    entry.condition,
+                    entry.remark,
+                    kind=entry.excitation.kind,
+                    noise_free=simulated.noise_free_output,
+                )
+            )
+        effects = tuple(dict(effect) for effect in source.effects)
     else:
-        records = [read_record(source, entry, stage.config.channels) for entry in source.records]
-        kinds, files = ["file"] * len(records), [str(entry.path) for entry in source.records]
-        effects = []
-    records = with_common_sampling_time(records)
-    about = []
-    entries: Sequence[SimulatedRecord | FileRecord] = source.records
-    for index, (record, entry) in enumerate(zip(records, entries, strict=True)):
-        if entry.role == "estimation":
-            refuse_constant_input(record)
-        arrays |= {f"record/{index}/{key}": value for key, value in record.to_arrays().items()}
-        about.append(
-            {
-                "name": record.name,
-                "role": entry.role,
-                "condition": entry.condition,
-                "remark": entry.remark,
-                "kind": kinds[index],
-                "file": files[index],
-                "samples": record.n_samples,
-                "dt_s": record.dt_s,
-                "duration_s": record.n_samples * record.dt_s,
-                "closed_loop": record.reference is not None,
-                "units": units_of(record),
-            }
-        )
-    return StageData(arrays, {"source": source.kind, "effects": effects, "records": about})
-
-
-def units_of(record: Record) -> dict[str, str]:
-    """Units of the signals a record knows the units of."""
-    known: dict[str, str] = {}
-    for names, units in (
-        (record.input_names, record.input_units),
-        (record.output_names, record.output_units),
-    ):
-        known |= dict(zip(names, units, strict=False))
-    return known
+        made = [
+            RunRecord(
+                read_record(source, entry, stage.config.channels),
+                entry.role,
+                entry.condition,
+                entry.remark,
+                file=str(entry.path),
+            )
+            for entry in source.records
+        ]
+        effects = ()
+    common = with_common_sampling_time([item.record for item in made])
+    records = tuple(replace(item, record=record) for item, record in zip(made, common, strict=True))
+    result = RecordsResult(source.kind, effects, records)
+    for item in result.of_role("estimation"):
+        refuse_constant_input(item.record)
+    return result
 
 
 def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel]) -> Record:

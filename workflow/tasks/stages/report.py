@@ -8,7 +8,8 @@ from typing import Any
 
 from workflow.config.run_config import RunConfig
 from workflow.engine import storage
-from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.results import ReportResult
 from workflow.tasks.stages.base import StageInput
 
 
@@ -21,7 +22,7 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
     }
 
 
-def write_page(stage: StageInput) -> StageData:
+def write_page(stage: StageInput) -> ReportResult:
     """report.html and the hash of its content."""
     # Imported here: matplotlib takes a second to load, and only this stage draws.
     from workflow.report import write_report
@@ -31,7 +32,7 @@ def write_page(stage: StageInput) -> StageData:
         stage.config,
         lambda fraction, name: stage.progress.update("report", fraction, name),
     )
-    return StageData(document={"report_sha256": storage.sha256_of_file(path)})
+    return ReportResult(storage.sha256_of_file(path))
 
 
 def page(run: RunDirectory) -> tuple[Path, ...]:

@@ -16,6 +16,7 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.checks.validation import (
     ResidualTest,
+    ScatterRow,
     fit_on_fresh_data,
     independence_test,
     repeat_scatter,
@@ -31,11 +32,20 @@ from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
 from workflow.config.run_config import Channel, RunConfig, UncertaintyOptions
 from workflow.engine.errors import naming
-from workflow.engine.run_directory import StageData
-from workflow.engine.storage import AnyArray
 from workflow.tasks.conditioning import as_bounded
+from workflow.tasks.results import (
+    Band,
+    IdentifiedChannel,
+    Intervals,
+    ModeInterval,
+    NominalAgreement,
+    RunRecord,
+    UncertainChannel,
+    UncertaintyResult,
+)
 from workflow.tasks.stages.base import StageInput
-from workflow.tasks.stages.results import ChannelResult, RunRecord, channel_result, load_records
+
+Real = npt.NDArray[np.float64]
 
 _FEWEST_FREQUENCIES = 100
 _SHARE_INSIDE = 0.9
@@ -49,62 +59,82 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
     return {"channels": [channel.uncertainty.model_dump(mode="json") for channel in config.channels]}
 
 
-def find_uncertainty(stage: StageInput) -> StageData:
+def find_uncertainty(stage: StageInput) -> UncertaintyResult:
     """Posterior, ellipses on a display grid, residual tests and repeat scatter of every channel."""
-    records = load_records(stage.results)
-    identified = stage.results.load_stage("identify")
-    arrays: dict[str, AnyArray] = {}
-    about = []
-    for k, channel in enumerate(stage.config.channels):
+    records, channels = stage.results.records.records, []
+    for k, (channel, result) in enumerate(
+        zip(stage.config.channels, stage.results.identify.channels, strict=True)
+    ):
         stage.progress.update("uncertainty", k / len(stage.config.channels), channel.label)
-        result = channel_result(identified, k)
-        model = result.identification.model
         with naming(f"channel {channel.label!r}"):
-            posterior = posterior_of(result, channel.uncertainty, records)
-            omega = display_grid(model, result.bounded)
-            frequency = posterior.at(omega, channel.uncertainty.level)
-            nominal = nominal_of(posterior, model.poles, nominal_grid(omega, channel))
-            empirical = empirical_response(
-                result.bounded,
-                integrators=0 if channel.increments else model.integrators,
-                level=channel.uncertainty.level,
-                band_rad_s=channel.bounds_band_rad_s or channel.band_rad_s,
+            posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
+            omega = display_grid(result.model, result.bounded)
+            channels.append(
+                uncertain_channel(
+                    channel.label,
+                    channel.uncertainty.method,
+                    channel.uncertainty.level,
+                    posterior,
+                    result,
+                    omega,
+                    nominal_grid(omega, channel),
+                    empirical_band_rad_s=channel.bounds_band_rad_s or channel.band_rad_s,
+                    repeat_scatter=scatter_of(channel, result, records, bands_of(omega)),
+                )
             )
-            scatter = scatter_of(channel, result, records, bands_of(omega))
-        at = f"channel/{k}/"
-        arrays |= {f"{at}posterior/{key}": value for key, value in posterior.to_arrays().items()}
-        arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
-        arrays |= {f"{at}nominal/{key}": value for key, value in nominal.to_arrays().items()}
-        if empirical is not None:
-            arrays |= {f"{at}empirical/{key}": value for key, value in empirical.to_arrays().items()}
-        about.append(
-            {
-                "name": channel.label,
-                "method": channel.uncertainty.method,
-                "level": channel.uncertainty.level,
-                "report": posterior.report.to_dict() if posterior.report is not None else None,
-                "bands": [band_row(frequency, low, high) for low, high in bands_of(omega)],
-                "tests": residual_tests(posterior, result.bounded),
-                "repeat_scatter": scatter,
-                "intervals": intervals_of(posterior, model.poles, channel.uncertainty.level),
-                "nominal": nominal_row(posterior.at(nominal_grid(omega, channel)), nominal),
-            }
-        )
-    return StageData(arrays, {"channels": about})
+    return UncertaintyResult(tuple(channels))
+
+
+def uncertain_channel(
+    name: str,
+    method: str,
+    level: float,
+    posterior: ResponsePosterior,
+    result: IdentifiedChannel,
+    omega: Real,
+    nominal_omega: Real,
+    *,
+    empirical_band_rad_s: tuple[float, float] | None,
+    repeat_scatter: tuple[ScatterRow, ...] | None = None,
+    tests: tuple[ResidualTest, ...] | None = None,
+) -> UncertainChannel:
+    """Everything said about a posterior. omega (F,): shown; nominal_omega (F,): where the nominal has to be
+    right; tests: of the residuals, where they are known already."""
+    model = result.model
+    frequency = posterior.at(omega, level)
+    nominal = nominal_of(posterior, model.poles, nominal_omega)
+    return UncertainChannel(
+        name=name,
+        method=method,
+        level=level,
+        posterior=posterior,
+        nominal=nominal,
+        frequency=frequency,
+        empirical=empirical_response(
+            result.bounded,
+            integrators=0 if result.increments else model.integrators,
+            level=level,
+            band_rad_s=empirical_band_rad_s,
+        ),
+        bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
+        tests=residual_tests(posterior, result.bounded) if tests is None else tests,
+        agreement=agreement_of(posterior.at(nominal_omega, level), nominal),
+        intervals=intervals_of(posterior, model.poles, level),
+        repeat_scatter=repeat_scatter,
+    )
 
 
 def posterior_of(
-    result: ChannelResult, options: UncertaintyOptions, records: Sequence[RunRecord]
+    model: GobfModel, bounded: Sequence[Record], options: UncertaintyOptions, records: Sequence[RunRecord]
 ) -> ResponsePosterior:
     """One library call, by method."""
-    model = result.identification.model
     if options.method == "classical":
-        return classical(result.bounded, model, options)
+        return classical(bounded, model, options)
     if options.method == "tangent":
-        return tangent(result.bounded, model, options)
+        return tangent(bounded, model, options)
     condition = {item.record.name: item.condition for item in records}
     groups: dict[str, list[Record]] = {}
-    for record in result.bounded:
+    for record in bounded:
         known = condition.get(record.name) if options.method == "conditions" else None
         groups.setdefault(known or record.name, []).append(record)
     if len(groups) < 4:
@@ -116,7 +146,7 @@ def posterior_of(
     return combine_posteriors(each, small_sample_level=options.level)
 
 
-def nominal_grid(omega: npt.NDArray[np.float64], channel: Channel) -> npt.NDArray[np.float64]:
+def nominal_grid(omega: Real, channel: Channel) -> Real:
     """Where the nominal model has to be right: the band of the data, everywhere without one."""
     band = channel.bounds_band_rad_s or channel.band_rad_s
     if band is None:
@@ -125,7 +155,7 @@ def nominal_grid(omega: npt.NDArray[np.float64], channel: Channel) -> npt.NDArra
     return inside if inside.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
 
 
-def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: npt.NDArray[np.float64]) -> GobfModel:
+def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real) -> GobfModel:
     """Nearest model on the identified poles; on every pole taken twice where only that one stays in its
     ellipses.
 
@@ -141,7 +171,7 @@ def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: npt.NDArray[np
     return double if inside[0] < _SHARE_INSIDE <= inside[1] else single
 
 
-def display_grid(model: GobfModel, records: Sequence[Record]) -> npt.NDArray[np.float64]:
+def display_grid(model: GobfModel, records: Sequence[Record]) -> Real:
     """Frequencies (F,) for pictures: from one period per longest record to Nyquist, denser around the
     modes."""
     longest_s = max(record.n_samples for record in records) * model.dt_s
@@ -155,36 +185,31 @@ def display_grid(model: GobfModel, records: Sequence[Record]) -> npt.NDArray[np.
     return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
 
 
-def bands_of(omega: npt.NDArray[np.float64]) -> list[tuple[float, float]]:
+def bands_of(omega: Real) -> list[tuple[float, float]]:
     """`N_BANDS` bands of equal ratio over the grid."""
     edges = np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist()
     return list(pairwise(edges))
 
 
-def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> dict[str, float]:
+def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> Band:
     """Size of the ellipses in a band: major semi-axis over |G|, in percent."""
     inside = (frequency.omega_rad_s >= low) & (frequency.omega_rad_s < high)
     relative = 100 * frequency.ellipse().semi_major[inside] / np.abs(frequency.centre[inside])
-    return {
-        "from_rad_s": low,
-        "to_rad_s": high,
-        "median_radius_percent": float(np.median(relative)),
-        "largest_radius_percent": float(np.max(relative)),
-    }
+    return Band(low, high, float(np.median(relative)), float(np.max(relative)))
 
 
-def nominal_row(frequency: FrequencyUncertainty, nominal: GobfModel) -> dict[str, float]:
+def agreement_of(frequency: FrequencyUncertainty, nominal: GobfModel) -> NominalAgreement:
     """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
     distance = frequency.normalised_distance(nominal.frequency_response(frequency.omega_rad_s))
     worst = int(np.argmax(distance))
-    return {
-        "share_inside_percent": 100 * float(np.mean(distance <= 1)),
-        "largest_distance": float(distance[worst]),
-        "at_rad_s": float(frequency.omega_rad_s[worst]),
-    }
+    return NominalAgreement(
+        share_inside_percent=100 * float(np.mean(distance <= 1)),
+        largest_distance=float(distance[worst]),
+        at_rad_s=float(frequency.omega_rad_s[worst]),
+    )
 
 
-def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> list[dict[str, Any]]:
+def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> tuple[ResidualTest, ...]:
     """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
 
     Where the bounds have a noise model, whiteness is that of the residuals behind it: they rest on those.
@@ -196,29 +221,10 @@ def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> l
     delay = posterior.input_delay_samples
     inputs = [record.input[: record.n_samples - delay, 0] for record in records]
     driven = [fit.residual[delay:] for fit in fits]
-    return [
-        {"data": "estimation", **whiteness_test(whitened).to_dict()},
-        {"data": "estimation", **independence_test(inputs, driven).to_dict()},
-    ]
+    return whiteness_test(whitened), independence_test(inputs, driven)
 
 
-def tests_by_name(documents: Sequence[Mapping[str, Any]]) -> dict[str, ResidualTest]:
-    """The tests on the estimation records by name, from the documents of `residual_tests`."""
-    found = {}
-    for document in documents:
-        if document["data"] == "estimation":
-            test = ResidualTest.from_dict({key: value for key, value in document.items() if key != "data"})
-            found[test.name] = test
-    return found
-
-
-def noise_order(spread: Mapping[str, Any]) -> int:
-    """Order of the noise model behind which the residuals were tested."""
-    report = spread["report"]
-    return len(report["ar_coefficients"]) if report else 0
-
-
-def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> dict[str, Any] | None:
+def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:
     """Intervals of modes (by frequency) and decay rates (slowest first), or None: only the tangent posterior
     has them."""
     try:
@@ -227,18 +233,15 @@ def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> di
         return None
     by_frequency = np.argsort(poles.omega_rad_s(posterior.dt_s), kind="stable")
     slowest_first = [i for i in np.argsort(-poles.real, kind="stable") if poles.real[i] > 0]
-    return {
-        "level": level,
-        "modes": [
-            {
-                "frequency_Hz": (found.omega_rad_s[i] / (2 * np.pi)).tolist(),
-                "omega_rad_s": found.omega_rad_s[i].tolist(),
-                "damping": found.zeta[i].tolist(),
-            }
-            for i in by_frequency
-        ],
-        "real_poles_per_s": [found.decay_per_s[i].tolist() for i in slowest_first],
-    }
+    return Intervals(
+        level,
+        tuple(ModeInterval(_interval(found.omega_rad_s[i]), _interval(found.zeta[i])) for i in by_frequency),
+        tuple(_interval(found.decay_per_s[i]) for i in slowest_first),
+    )
+
+
+def _interval(ends: Real) -> tuple[float, float]:
+    return float(ends[0]), float(ends[1])
 
 
 def empirical_response(
@@ -270,10 +273,10 @@ def empirical_response(
 
 def scatter_of(
     channel: Channel,
-    result: ChannelResult,
+    result: IdentifiedChannel,
     records: Sequence[RunRecord],
     bands: Sequence[tuple[float, float]],
-) -> list[dict[str, Any]] | None:
+) -> tuple[ScatterRow, ...] | None:
     """Predicted ellipses of single records against the scatter of repeats, or None without repeats."""
     bounded = {record.name: record for record in result.bounded}
     groups: dict[str, list[Record]] = {}
@@ -291,7 +294,4 @@ def scatter_of(
     )
     omega = np.geomspace(bands[0][0], bands[-1][1] * (1 - 1e-6), 20 * len(bands))
     estimates = iter([posterior.at(omega, channel.uncertainty.level) for posterior in flat])
-    return [
-        row.to_dict()
-        for row in repeat_scatter([[next(estimates) for _ in group] for group in repeated], bands)
-    ]
+    return tuple(repeat_scatter([[next(estimates) for _ in group] for group in repeated], bands))

@@ -1,0 +1,273 @@
+"""One codec for every result: frozen dataclasses to JSON and named arrays, and back by their annotations.
+
+A dataclass becomes an object of its fields, an enum its name, an array a reference into the archive beside
+the document; non-finite and complex numbers are tagged. What an annotation calls a function is no data: such
+a field is left out and comes back as its default. Nothing is guessed on reading: a field that is missing, one
+that nobody knows, and a value of another kind are refused with one line that names the place.
+"""
+
+from __future__ import annotations
+
+import collections.abc
+import dataclasses
+import json
+import math
+import types
+from collections.abc import Mapping
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+T = TypeVar("T")
+AnyArray = npt.NDArray[Any]
+
+DOCUMENT = "_document"
+_ARRAY, _FLOAT, _COMPLEX, _TYPE = "$array", "$float", "$complex", "$type"
+_UNIONS = (Union, types.UnionType)
+
+
+class CodecError(ValueError):
+    """The document is not that of the type asked for; one line."""
+
+
+def pack(value: Any) -> tuple[Any, dict[str, AnyArray]]:
+    """JSON-able document, and the arrays it refers to by name. Raises TypeError for what cannot be stored."""
+    arrays: dict[str, AnyArray] = {}
+    return _pack(value, "", arrays), arrays
+
+
+def unpack(kind: type[T], document: Any, arrays: Mapping[str, AnyArray]) -> T:
+    """Inverse of `pack`. Raises CodecError naming the place in the document."""
+    found: T = _unpack(kind, document, arrays, kind.__name__)
+    return found
+
+
+def to_arrays(value: Any) -> dict[str, AnyArray]:
+    """The same as arrays alone, for one npz file: the document travels as UTF-8 text."""
+    document, arrays = pack(value)
+    # As bytes: a unicode array would drop trailing NULs and take four bytes each.
+    text = json.dumps(document, ensure_ascii=False).encode("utf-8")
+    return {DOCUMENT: np.frombuffer(text, dtype=np.uint8), **arrays}
+
+
+def from_arrays(kind: type[T], arrays: Mapping[str, AnyArray]) -> T:
+    """Inverse of `to_arrays`. Raises CodecError."""
+    if DOCUMENT not in arrays:
+        raise CodecError(f"holds no {kind.__name__}: {DOCUMENT!r} is missing")
+    return unpack(kind, json.loads(arrays[DOCUMENT].tobytes().decode("utf-8")), arrays)
+
+
+def plain(value: Any, *, arrays: bool = True) -> Any:
+    """For programs that read our JSON: the same as nested lists and objects, arrays and tuples as lists,
+    complex numbers as [re, im], numbers that are not finite as null. arrays: False leaves out the fields of
+    dataclasses that are arrays."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        items = {name: getattr(value, name) for name in stored_fields(type(value))}
+        return {
+            name: plain(item, arrays=arrays)
+            for name, item in items.items()
+            if arrays or not isinstance(item, np.ndarray)
+        }
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, arrays=arrays) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item, arrays=arrays) for item in value]
+    if isinstance(value, complex):
+        return [plain(value.real), plain(value.imag)]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+@cache
+def stored_fields(kind: type) -> dict[str, Any]:
+    """Name and annotation of the fields of a dataclass that are data."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        f.name: hints[f.name] for f in dataclasses.fields(kind) if f.init and not _is_function(hints[f.name])
+    }
+
+
+def _is_function(kind: Any) -> bool:
+    return get_origin(kind) is collections.abc.Callable
+
+
+def _pack(value: Any, at: str, arrays: dict[str, AnyArray]) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | str):
+        return value.name if isinstance(value, Enum) else value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {_FLOAT: repr(value)}
+    if isinstance(value, complex):
+        return {_COMPLEX: [_pack(value.real, at, arrays), _pack(value.imag, at, arrays)]}
+    if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError(f"{at}: an array of objects would need pickle")
+        # Row by row: what is read back has the memory layout of what any other run reads back.
+        arrays[at] = np.ascontiguousarray(value).reshape(value.shape)
+        return {_ARRAY: at}
+    if dataclasses.is_dataclass(value):
+        kind: Any = type(value)
+        return {
+            _TYPE: kind.__name__,
+            **{n: _pack(getattr(value, n), _join(at, n), arrays) for n in stored_fields(kind)},
+        }
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        if any(not isinstance(key, str) or key.startswith("$") for key in value):
+            raise TypeError(
+                f"{at}: keys must be strings that do not begin with '$'; got {sorted(map(str, value))}"
+            )
+        return {key: _pack(item, _join(at, key), arrays) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_pack(item, _join(at, str(i)), arrays) for i, item in enumerate(value)]
+    raise TypeError(f"{at}: a {type(value).__name__} cannot be stored")
+
+
+def _join(at: str, name: str) -> str:
+    return f"{at}/{name}" if at else name
+
+
+def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    origin = get_origin(kind)
+    if origin is Annotated:
+        return _unpack(get_args(kind)[0], document, arrays, at)
+    if origin in _UNIONS:
+        return _unpack(_member(kind, document, at), document, arrays, at)
+    if kind is Any or kind is object:
+        return _unpack_plain(document, arrays, at)
+    if kind is None or kind is type(None):
+        _expect(document is None, document, at, "null")
+        return None
+    if origin is Literal:
+        _expect(document in get_args(kind), document, at, f"one of {', '.join(map(repr, get_args(kind)))}")
+        return document
+    if origin is np.ndarray or kind is np.ndarray:
+        return _unpack_array(document, arrays, at)
+    if isinstance(origin, type) and issubclass(origin, tuple):
+        return _unpack_tuple(get_args(kind), document, arrays, at)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        _expect(isinstance(document, dict), document, at, "an object")
+        return {
+            key: _unpack(get_args(kind)[1], item, arrays, f"{at}.{key}") for key, item in document.items()
+        }
+    if isinstance(origin, type) and issubclass(origin, collections.abc.Sequence):
+        _expect(isinstance(document, list), document, at, "a list")
+        return [_unpack(get_args(kind)[0], item, arrays, f"{at}[{i}]") for i, item in enumerate(document)]
+    if dataclasses.is_dataclass(kind):
+        return _unpack_dataclass(kind, document, arrays, at)
+    if isinstance(kind, type):
+        return _unpack_scalar(kind, document, at)
+    raise CodecError(f"{at}: {kind} cannot be read back")
+
+
+def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    _expect(isinstance(document, dict), document, at, f"an object with the fields of {kind.__name__}")
+    fields = stored_fields(kind)
+    strange = sorted(set(document) - set(fields) - {_TYPE})
+    missing = sorted(set(fields) - set(document))
+    if strange or missing or document.get(_TYPE, kind.__name__) != kind.__name__:
+        what = (
+            f"unknown field {strange[0]!r}"
+            if strange
+            else f"missing field {missing[0]!r}"
+            if missing
+            else "is"
+        )
+        raise CodecError(f"{at}: {what} ({document.get(_TYPE)}, expected {kind.__name__})")
+    values = {name: _unpack(hint, document[name], arrays, f"{at}.{name}") for name, hint in fields.items()}
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise CodecError(f"{at}: {error}") from error
+
+
+def _unpack_tuple(parts: tuple[Any, ...], document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    _expect(isinstance(document, list), document, at, "a list")
+    if len(parts) == 2 and parts[1] is Ellipsis:
+        parts = (parts[0],) * len(document)
+    _expect(len(parts) == len(document), document, at, f"{len(parts)} entries")
+    return tuple(
+        _unpack(part, item, arrays, f"{at}[{i}]")
+        for i, (part, item) in enumerate(zip(parts, document, strict=True))
+    )
+
+
+def _unpack_array(document: Any, arrays: Mapping[str, AnyArray], at: str) -> AnyArray:
+    name = document.get(_ARRAY) if isinstance(document, dict) else None
+    _expect(isinstance(name, str) and name in arrays, document, at, "an array that is in the archive")
+    return arrays[str(name)]
+
+
+def _unpack_scalar(kind: type, document: Any, at: str) -> Any:
+    if issubclass(kind, Enum):
+        _expect(document in kind.__members__, document, at, f"one of {', '.join(kind.__members__)}")
+        return kind[document]
+    if issubclass(kind, BaseModel):
+        return kind.model_validate(document)
+    if issubclass(kind, Path):
+        return kind(document)
+    if isinstance(document, dict):
+        document = _unpack_plain(document, {}, at)
+    if kind is float and isinstance(document, int) and not isinstance(document, bool):
+        return float(document)
+    _expect(
+        isinstance(document, kind) and (kind is bool) == isinstance(document, bool),
+        document,
+        at,
+        kind.__name__,
+    )
+    return document
+
+
+def _unpack_plain(document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    """A value without an annotation of its own."""
+    if isinstance(document, list):
+        return [_unpack_plain(item, arrays, f"{at}[{i}]") for i, item in enumerate(document)]
+    if not isinstance(document, dict):
+        return document
+    if document.keys() == {_FLOAT}:
+        return float(document[_FLOAT])
+    if document.keys() == {_COMPLEX}:
+        return complex(*(_unpack_plain(part, arrays, at) for part in document[_COMPLEX]))
+    if document.keys() == {_ARRAY}:
+        return _unpack_array(document, arrays, at)
+    return {key: _unpack_plain(item, arrays, f"{at}.{key}") for key, item in document.items()}
+
+
+def _member(union: Any, document: Any, at: str) -> Any:
+    """The member of a union that a document is of: by null, by its tag, else the only one left."""
+    members = get_args(union)
+    if document is None and type(None) in members:
+        return type(None)
+    rest = [member for member in members if member is not type(None)]
+    if isinstance(document, dict) and _TYPE in document:
+        rest = [member for member in rest if getattr(member, "__name__", None) == document[_TYPE]]
+    elif len(rest) > 1:
+        rest = [m for m in rest if isinstance(m, type) and isinstance(document, m)] or rest
+    if not rest:
+        raise CodecError(f"{at}: {document.get(_TYPE)} is none of {union}")
+    return rest[0]
+
+
+def _expect(fits: bool, document: Any, at: str, wanted: str) -> None:
+    if not fits:
+        text = repr(document)
+        raise CodecError(f"{at}: expected {wanted}, got {text if len(text) <= 60 else text[:57] + '...'}")

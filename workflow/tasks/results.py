@@ -1,0 +1,551 @@
+"""What every step of a run leaves behind: frozen values, stored by `workflow.engine.codec`.
+
+Channels and records stand in the order of the configuration. Signals are (T,) over samples, runs of the
+closed loop (R, T); responses (F,) over frequencies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.analysis.certificate import Certificate
+from control_design.analysis.closed_loop import StepMetrics
+from control_design.analysis.joint_coverage import JointCoverage
+from control_design.convex.reference_filter import Prefilter
+from control_design.convex.youla import YoulaBracket
+from control_design.plants.plant_set import Channel as PlantChannel
+from control_design.plants.plant_set import UncertainPlant
+from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
+from ident.basis.model import GobfModel
+from ident.checks.validation import FreshFit, ResidualTest, ScatterRow
+from ident.data.record import Record
+from ident.identification import Identification
+from ident.search.order_selection import OrderStep
+from ident.stabilisation import Stabilisation
+from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from workflow.config.run_config import Channel, Role, RunConfig
+from workflow.engine.run_directory import RunDirectory
+
+Real = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+Interval = tuple[float, float]
+T = TypeVar("T")
+
+
+# Records
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """A record of the run and what the configuration says about it.
+
+    kind: of the excitation, or "file"; noise_free: output (T, Y) before sensor effects and noise, simulated
+    records only.
+    """
+
+    record: Record
+    role: Role
+    condition: str | None
+    remark: str
+    kind: str = "file"
+    file: str | None = None
+    noise_free: Real | None = None
+
+    @property
+    def name(self) -> str:
+        return self.record.name
+
+    @property
+    def duration_s(self) -> float:
+        return self.record.n_samples * self.record.dt_s
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the signals that the record knows the units of."""
+        known = dict(zip(self.record.input_names, self.record.input_units, strict=False))
+        return known | dict(zip(self.record.output_names, self.record.output_units, strict=False))
+
+
+@dataclass(frozen=True, eq=False)
+class RecordsResult:
+    """All records; effects: those of the simulated arm, as in the configuration."""
+
+    source: Literal["simulated", "files"]
+    effects: tuple[Mapping[str, Any], ...]
+    records: tuple[RunRecord, ...]
+
+    def of_role(self, role: Role) -> list[RunRecord]:
+        return [item for item in self.records if item.role == role]
+
+    def fitted(self, channel: Channel) -> list[Record]:
+        """The estimation records of a channel, SISO, as measured."""
+        return [item.record.siso(channel.input, channel.output) for item in self.of_role("estimation")]
+
+    def unit(self, signal: str) -> str:
+        """Unit of a signal, empty where nobody stated it."""
+        return next((units[signal] for item in self.records if (units := item.units).get(signal)), "")
+
+
+# Model
+
+
+@dataclass(frozen=True)
+class ModelMode:
+    """A pole pair in an engineer's units."""
+
+    omega_rad_s: float
+    damping: float
+
+    @property
+    def frequency_Hz(self) -> float:
+        return self.omega_rad_s / (2 * np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedChannel:
+    """One channel: what was fitted to what, and free runs on the records that were not fitted.
+
+    used: SISO estimation records as the fit saw them; bounded: the same as the ellipses see them; fresh: free
+    runs, fresh_roles the role of each; two_stage: what the two-stage method did, None where it was not used.
+    """
+
+    name: str
+    input: str
+    output: str
+    identification: Identification
+    used: tuple[Record, ...]
+    bounded: tuple[Record, ...]
+    fresh: tuple[FreshFit, ...] = ()
+    fresh_roles: tuple[Role, ...] = ()
+    stabilisation: Stabilisation | None = None
+    increments: bool = False
+    band_rad_s: Interval | None = None
+    bounds_band_rad_s: Interval | None = None
+    two_stage: str | None = None
+
+    @property
+    def model(self) -> GobfModel:
+        return self.identification.model
+
+    @property
+    def order(self) -> int:
+        return self.model.order
+
+    @property
+    def integrators(self) -> int:
+        return self.model.integrators
+
+    @property
+    def input_delay_samples(self) -> int:
+        return self.model.input_delay_samples
+
+    @property
+    def feedthrough(self) -> bool:
+        return self.identification.structure.feedthrough
+
+    @property
+    def modes(self) -> tuple[ModelMode, ...]:
+        """Ascending in frequency."""
+        poles = self.model.poles
+        pairs = zip(poles.omega_rad_s(self.model.dt_s).tolist(), poles.zeta().tolist(), strict=True)
+        return tuple(ModelMode(omega, zeta) for omega, zeta in sorted(pairs))
+
+    @property
+    def real_poles_per_s(self) -> tuple[float, ...]:
+        """Decay rates, slowest first; a pole at or left of z = 0 has none."""
+        real = self.model.poles.real
+        return tuple(sorted((-np.log(real[real > 0]) / self.model.dt_s).tolist()))
+
+    @property
+    def real_poles_z(self) -> tuple[float, ...]:
+        return tuple(sorted(self.model.poles.real.tolist(), reverse=True))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.identification.warnings
+
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        return self.identification.verdicts
+
+    @property
+    def order_table(self) -> tuple[OrderStep, ...]:
+        return self.identification.order_table
+
+    @property
+    def fit_estimation_percent(self) -> dict[str, float]:
+        found = self.identification
+        return dict(zip(found.record_names, found.fit_percent.tolist(), strict=True))
+
+    @property
+    def fit_validation_percent(self) -> dict[str, float]:
+        return self._fresh_percent("validation")
+
+    @property
+    def fit_repeat_percent(self) -> dict[str, float]:
+        return self._fresh_percent("repeat")
+
+    def _fresh_percent(self, role: Role) -> dict[str, float]:
+        pairs = zip(self.fresh, self.fresh_roles, strict=True)
+        return {fit.name: fit.fit_percent for fit, of in pairs if of == role}
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifyResult:
+    channels: tuple[IdentifiedChannel, ...]
+
+
+# Ellipses
+
+
+@dataclass(frozen=True)
+class Band:
+    """Size of the ellipses in a band: major semi-axis over |G|."""
+
+    from_rad_s: float
+    to_rad_s: float
+    median_radius_percent: float
+    largest_radius_percent: float
+
+
+@dataclass(frozen=True)
+class ModeInterval:
+    """Confidence intervals of a mode."""
+
+    omega_rad_s: Interval
+    damping: Interval
+
+    @property
+    def frequency_Hz(self) -> Interval:
+        return self.omega_rad_s[0] / (2 * np.pi), self.omega_rad_s[1] / (2 * np.pi)
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Of the modes by frequency, of the decay rates slowest first."""
+
+    level: float
+    modes: tuple[ModeInterval, ...]
+    real_poles_per_s: tuple[Interval, ...]
+
+
+@dataclass(frozen=True)
+class NominalAgreement:
+    """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
+
+    share_inside_percent: float
+    largest_distance: float
+    at_rad_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainChannel:
+    """Ellipses of one channel and what the residuals say about them.
+
+    nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
+    display grid; empirical: response without a model, where the records allow one; tests: of the residuals on
+    the estimation records; repeat_scatter: None without repeats; intervals: None where the method has none.
+    """
+
+    name: str
+    method: str
+    level: float
+    posterior: ResponsePosterior
+    nominal: GobfModel
+    frequency: FrequencyUncertainty
+    empirical: FrequencyUncertainty | None
+    bands: tuple[Band, ...]
+    tests: tuple[ResidualTest, ...]
+    agreement: NominalAgreement
+    intervals: Intervals | None = None
+    repeat_scatter: tuple[ScatterRow, ...] | None = None
+
+    @property
+    def noise_order(self) -> int:
+        """Order of the noise model behind which the residuals were tested."""
+        report = self.posterior.report
+        return 0 if report is None else len(report.ar_coefficients)
+
+    def test(self, name: str) -> ResidualTest:
+        """The residual test of this name."""
+        return next(test for test in self.tests if test.name == name)
+
+
+@dataclass(frozen=True, eq=False)
+class UncertaintyResult:
+    channels: tuple[UncertainChannel, ...]
+
+    def plant(self, config: RunConfig) -> UncertainPlant:
+        """What the controller is designed for: control channel and first performance channel."""
+        return self._plants.setdefault((config.control_index, config.performance_index), self._plant(config))
+
+    @cached_property
+    def _plants(self) -> dict[tuple[int, int | None], UncertainPlant]:
+        return {}
+
+    def _plant(self, config: RunConfig) -> UncertainPlant:
+        def channel(index: int) -> PlantChannel:
+            found = self.channels[index]
+            return PlantChannel(found.nominal.to_control(), found.posterior, found.level)
+
+        control, performance = channel(config.control_index), config.performance_index
+        return UncertainPlant(
+            name=config.control_channel.label,
+            nominal=control.nominal,
+            uncertainty=control.uncertainty,
+            performance=None if performance is None else channel(performance),
+            level=control.level,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedPlant:
+    """What `flexlink identify --out` writes and `flexlink design` reads."""
+
+    model: GobfModel
+    posterior: ResponsePosterior
+    level: float
+
+
+# Controller
+
+
+@dataclass(frozen=True, eq=False)
+class DesignResult:
+    """synthesis: None where the specification is impossible from the start; reason: met, or how far and which
+    frequency and requirement block it; jointly: what became of designing for sampled responses."""
+
+    synthesis: SynthesisResult | None
+    met: bool
+    reason: str
+    jointly: str | None = None
+
+    @property
+    def gamma(self) -> float | None:
+        """Weighted worst case on the design's own grid; inf without a stable controller, None without any."""
+        return None if self.synthesis is None else self.synthesis.gamma
+
+    @property
+    def has_controller(self) -> bool:
+        """Whether there is a controller that means something."""
+        return self.synthesis is not None and self.synthesis.outcome is not Outcome.NOT_CONVERGED
+
+
+@dataclass(frozen=True, eq=False)
+class AchievablePerformance:
+    """What a controller of any order could reach; reason: why that is not known."""
+
+    bracket: YoulaBracket | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class SampledResponses:
+    """For how many sampled responses the worst case holds; reason: why none were drawn."""
+
+    joint: JointCoverage | None = None
+    calibrated: bool = False
+    reason: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CertifyResult:
+    """certificate: None with nothing to certify; reason: one line, in any case."""
+
+    certificate: Certificate | None
+    certified: bool
+    reason: str
+    sampled: SampledResponses = SampledResponses()
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceFilterResult:
+    """filter: None where none was asked for, or where none is possible (reason)."""
+
+    filter: Prefilter | None = None
+    reason: str | None = None
+
+
+# Closed loop
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRuns:
+    """Several closed-loop runs (R, T); limited: where a limit was active; performance: None without such a
+    channel."""
+
+    output: Real
+    command: Real
+    performance: Real | None
+    limited: Bool
+
+
+@dataclass(frozen=True)
+class LoopMetrics(StepMetrics):
+    """Step and disturbance of one run; settled: its motion dies out."""
+
+    disturbance_peak: float
+    disturbance_left: float
+    settled: bool
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPeak:
+    """S measured on the arm: response and standard deviation (F,), and its peak beside the predicted ones.
+
+    off_certified_percent: None where nothing was certified.
+    """
+
+    name: str
+    reference_rms: float
+    peak: float
+    peak_std: float
+    peak_omega_rad_s: float
+    off_nominal_percent: float
+    off_certified_percent: float | None
+    peak_command: float
+    limited_fraction: float
+    omega_rad_s: Real
+    magnitude: Real
+    std: Real
+
+
+@dataclass(frozen=True, eq=False)
+class SensitivityCheck:
+    """Peak of |S|: predicted for the nominal loop, certified over the ellipses, measured."""
+
+    nominal_peak: float
+    nominal_omega_rad_s: float
+    certified_peak: float
+    band_rad_s: Interval
+    measured: tuple[MeasuredPeak, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionRun:
+    """The loop under one other condition beside its prediction, (T,) each; percentages are of `size`, the
+    move or the predicted swing."""
+
+    name: str
+    words: str
+    size: float
+    largest_difference_percent: float
+    rms_difference_percent: float
+    overshoot_percent: float | None
+    error_left_percent: float
+    peak_command: float
+    limited_fraction: float
+    settled: bool
+    reference: Real
+    predicted: Real
+    achieved: Real
+    predicted_command: Real
+    achieved_command: Real
+
+
+@dataclass(frozen=True, eq=False)
+class LoopCheck:
+    """The loop on the identified model (predicted, on the posterior mean) and on the machine (achieved).
+
+    reference and disturbance (T,): the latter adds to the plant's input from T // 2 on; model_answer (T,): of
+    the model that the reference filter follows; tracking: whether the reference is to be followed.
+    """
+
+    machine: Literal["simulated", "identified"]
+    tracking: bool
+    reference_step: float
+    disturbance_step: float
+    quantisation: float
+    measurement_step: float
+    input_limit: float | None
+    filtered: bool
+    predicted: LoopMetrics
+    achieved: tuple[LoopMetrics, ...]
+    time_s: Real
+    reference: Real
+    disturbance: Real
+    model_answer: Real | None
+    predicted_runs: LoopRuns
+    achieved_runs: LoopRuns
+    sensitivity: SensitivityCheck | None = None
+    conditions: tuple[ConditionRun, ...] = ()
+
+    @property
+    def draws(self) -> int:
+        return len(self.achieved)
+
+    @property
+    def settled_draws(self) -> int:
+        return sum(row.settled for row in self.achieved)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopResult:
+    """check: None where there was nothing to run, and `skipped` says why."""
+
+    skipped: str | None = None
+    check: LoopCheck | None = None
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    report_sha256: str
+
+
+class RunResults:
+    """Results of a run directory, each read once."""
+
+    def __init__(self, run: RunDirectory) -> None:
+        self.run = run
+        self._read: dict[str, Any] = {}
+
+    def has(self, stage: str) -> bool:
+        return self.run.stage_file(stage) is not None
+
+    def forget(self, stage: str) -> None:
+        """Read the stage again when it is asked for: it was written anew."""
+        self._read.pop(stage, None)
+
+    def _load(self, stage: str, kind: type[T]) -> T:
+        if stage not in self._read:
+            self._read[stage] = self.run.load_stage(stage, kind)
+        found: T = self._read[stage]
+        return found
+
+    @property
+    def records(self) -> RecordsResult:
+        return self._load("records", RecordsResult)
+
+    @property
+    def identify(self) -> IdentifyResult:
+        return self._load("identify", IdentifyResult)
+
+    @property
+    def uncertainty(self) -> UncertaintyResult:
+        return self._load("uncertainty", UncertaintyResult)
+
+    @property
+    def design(self) -> DesignResult:
+        return self._load("design", DesignResult)
+
+    @property
+    def achievable_performance(self) -> AchievablePerformance:
+        return self._load("achievable_performance", AchievablePerformance)
+
+    @property
+    def certify(self) -> CertifyResult:
+        return self._load("certify", CertifyResult)
+
+    @property
+    def reference_filter(self) -> ReferenceFilterResult:
+        return self._load("reference_filter", ReferenceFilterResult)
+
+    @property
+    def closed_loop(self) -> ClosedLoopResult:
+        return self._load("closed_loop", ClosedLoopResult)
