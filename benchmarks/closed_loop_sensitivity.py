@@ -36,9 +36,9 @@ from workflow.config.run_config import RunConfig, SimulatedSource
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.entry import built_in_config
+from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
 from workflow.tasks.stages import STAGES, StageInput
-from workflow.tasks.stages.results import load_plant
 
 REACH_PERCENT = 5.0
 BAND_RAD_S = (0.5, 120.0)
@@ -78,9 +78,10 @@ def identified(config: RunConfig, folder: Path) -> UncertainPlant:
     run = RunDirectory.begin(
         folder, config_text="", config=config.to_document(), seed=config.run.seed, inputs={}
     )
+    results = RunResults(run)
     for stage in STAGES[:3]:
-        run.save_stage(stage.name, stage.run(StageInput(config, run, Silence())), "benchmark")
-    return load_plant(run, config)
+        run.save_stage(stage.name, stage.run(StageInput(config, results, Silence())), "benchmark")
+    return results.uncertainty.plant(config)
 
 
 def designed(plants: list[UncertainPlant], config: RunConfig) -> tuple[Controller, Certificate]:

@@ -17,7 +17,7 @@ from typing import Any
 from workflow.config.run_config import load_config
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import run_pipeline
-from workflow.tasks.stages.results import load_certificate
+from workflow.tasks.results import RunResults
 
 ROOT = Path(__file__).resolve().parents[2]
 GOLDEN = Path(__file__).with_name("margins.toml")
@@ -38,7 +38,7 @@ def measure(example: str, out: Path) -> dict[str, Any]:
     """Run an example and read its certificate: plain numbers in the units of their names."""
     config, text = load_config(ROOT / "examples" / f"{example}.toml")
     run_pipeline(config, out, config_text=text)
-    certificate = load_certificate(RunDirectory.open(out))
+    certificate = RunResults(RunDirectory.open(out)).certify.certificate
     assert certificate is not None, f"{example}: no controller to certify"
     verdict = certificate.plants[0]
     worst = verdict.worst_margins

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,13 +26,29 @@ from ident.search.search_trace import PolishedMinimum, SearchStage, SearchTrace
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig
-from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.conditioning import as_fitted
-from workflow.tasks.loop_conditions import Condition, condition_arrays
+from workflow.tasks.loop_conditions import condition_run
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    ClosedLoopResult,
+    ConditionRun,
+    DesignResult,
+    IdentifiedChannel,
+    IdentifyResult,
+    LoopCheck,
+    LoopRuns,
+    MeasuredPeak,
+    RecordsResult,
+    ReferenceFilterResult,
+    RunRecord,
+    SampledResponses,
+    SensitivityCheck,
+    UncertaintyResult,
+)
 from workflow.tasks.stages import closed_loop as closed_loop_stage
-from workflow.tasks.stages import identify as identify_stage
 from workflow.tasks.stages import uncertainty as uncertainty_stage
-from workflow.tasks.stages.results import ChannelResult, RunRecord
 
 DT_S = 0.01
 INPUT = "voltage_V"
@@ -228,11 +243,11 @@ def build_run(
     models = [model(channel.output, input_name=channel.input) for channel in settings.channels]
     names = settings.record_names
     roles = [entry.role for entry in settings.source.records]
-    records = [
-        RunRecord(record(models, name, seed, samples=900), role, "same", "a remark")
+    records = tuple(
+        RunRecord(record(models, name, seed, samples=900), role, "same", "a remark", kind="prbs")
         for seed, (name, role) in enumerate(zip(names, roles, strict=True), 1)
-    ]
-    _save_records(run, records)
+    )
+    run.save_stage("records", RecordsResult("simulated", (), records), "00")
     results = _save_identification(run, settings, models, records)
     _save_uncertainty(run, settings, results, scatter)
     _save_design(run, settings, gain, impossible, settled)
@@ -241,107 +256,61 @@ def build_run(
     return run
 
 
-def _save_records(run: RunDirectory, records: list[RunRecord]) -> None:
-    arrays: dict[str, Any] = {}
-    about = []
-    for i, item in enumerate(records):
-        arrays |= {f"record/{i}/{key}": value for key, value in item.record.to_arrays().items()}
-        names = (*item.record.input_names, *item.record.output_names)
-        units = (*item.record.input_units, *item.record.output_units)
-        about.append(
-            {
-                "name": item.record.name,
-                "role": item.role,
-                "condition": item.condition,
-                "remark": item.remark,
-                "kind": "prbs",
-                "file": None,
-                "samples": item.record.n_samples,
-                "dt_s": DT_S,
-                "duration_s": item.record.n_samples * DT_S,
-                "closed_loop": False,
-                "units": dict(zip(names, units, strict=True)),
-            }
-        )
-    run.save_stage(
-        "records", StageData(arrays, {"source": "simulated", "effects": [], "records": about}), "00"
-    )
-
-
 def _save_identification(
-    run: RunDirectory, settings: RunConfig, models: list[GobfModel], records: list[RunRecord]
-) -> list[ChannelResult]:
-    arrays: dict[str, Any] = {}
-    about, results = [], []
-    for k, (channel, of) in enumerate(zip(settings.channels, models, strict=True)):
+    run: RunDirectory, settings: RunConfig, models: list[GobfModel], records: tuple[RunRecord, ...]
+) -> tuple[IdentifiedChannel, ...]:
+    channels = []
+    for channel, of in zip(settings.channels, models, strict=True):
         used = [as_fitted(item.record, channel) for item in records if item.role == "estimation"]
-        found = identification(of, used)
-        fresh = [
-            fit_on_fresh_data(of, item.record.siso(channel.input, channel.output))
-            for item in records
-            if item.role != "estimation"
-        ]
-        at = f"channel/{k}/"
-        arrays |= {f"{at}identification/{key}": value for key, value in found.to_arrays().items()}
-        arrays |= {
-            f"{at}stabilisation/{key}": value for key, value in stabilisation_plot().to_arrays().items()
-        }
-        for i, one in enumerate(used):
-            arrays |= {f"{at}used/{i}/{key}": value for key, value in one.to_arrays().items()}
-        for i, fit in enumerate(fresh):
-            arrays |= {f"{at}fresh/{i}/{key}": value for key, value in fit.to_arrays().items()}
-        about.append(identify_stage.describe(settings, k, found, fresh, records))
-        results.append(ChannelResult(channel.label, found, tuple(used), tuple(used), tuple(fresh)))
-    run.save_stage("identify", StageData(arrays, {"channels": about}), "00")
-    return results
+        fresh = [item for item in records if item.role != "estimation"]
+        channels.append(
+            IdentifiedChannel(
+                name=channel.label,
+                input=channel.input,
+                output=channel.output,
+                identification=identification(of, used),
+                used=tuple(used),
+                bounded=tuple(used),
+                fresh=tuple(
+                    fit_on_fresh_data(of, item.record.siso(channel.input, channel.output)) for item in fresh
+                ),
+                fresh_roles=tuple(item.role for item in fresh),
+                stabilisation=stabilisation_plot(),
+            )
+        )
+    run.save_stage("identify", IdentifyResult(tuple(channels)), "00")
+    return tuple(channels)
 
 
 def _save_uncertainty(
-    run: RunDirectory, settings: RunConfig, results: list[ChannelResult], scatter: bool
+    run: RunDirectory, settings: RunConfig, results: tuple[IdentifiedChannel, ...], scatter: bool
 ) -> None:
-    arrays: dict[str, Any] = {}
-    about = []
-    for k, result in enumerate(results):
-        found = posterior(result.identification.model)
-        omega = uncertainty_stage.display_grid(result.identification.model, result.used)
-        frequency = found.at(omega, 0.95)
-        empirical = uncertainty_stage.empirical_response(
-            result.used, integrators=result.identification.model.integrators
+    channels = []
+    for channel, result in zip(settings.channels, results, strict=True):
+        omega = uncertainty_stage.display_grid(result.model, result.used)
+        found = uncertainty_stage.uncertain_channel(
+            channel.label,
+            "tangent",
+            0.95,
+            posterior(result.model),
+            result,
+            omega,
+            omega,
+            empirical_band_rad_s=None,
+            repeat_scatter=tuple(scatter_rows()) if scatter else None,
         )
-        at = f"channel/{k}/"
-        arrays |= {f"{at}posterior/{key}": value for key, value in found.to_arrays().items()}
-        arrays |= {f"{at}frequency/{key}": value for key, value in frequency.to_arrays().items()}
-        nominal = result.identification.model
-        arrays |= {f"{at}nominal/{key}": value for key, value in nominal.to_arrays().items()}
-        if empirical is not None:
-            arrays |= {f"{at}empirical/{key}": value for key, value in empirical.to_arrays().items()}
-        bands = uncertainty_stage.bands_of(omega)
-        about.append(
-            {
-                "name": settings.channels[k].label,
-                "method": "tangent",
-                "level": 0.95,
-                "report": None,
-                "bands": [uncertainty_stage.band_row(frequency, low, high) for low, high in bands],
-                "tests": uncertainty_stage.residual_tests(found, result.bounded),
-                "intervals": uncertainty_stage.intervals_of(found, nominal.poles, 0.95),
-                "nominal": uncertainty_stage.nominal_row(frequency, nominal),
-                "repeat_scatter": [row.to_dict() for row in scatter_rows()] if scatter else None,
-            }
-        )
-    run.save_stage("uncertainty", StageData(arrays, {"channels": about}), "00")
+        channels.append(replace(found, nominal=result.model))
+    run.save_stage("uncertainty", UncertaintyResult(tuple(channels)), "00")
 
 
 def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible: bool, settled: int) -> None:
     if impossible:
         reason = "plant 'hub': bandwidth_rad_s = 900 lies beyond the Nyquist frequency"
-        run.save_stage(
-            "design", StageData(document={"synthesis": None, "met": False, "reason": reason}), "00"
-        )
-        nothing = {"certificate": None, "certified": False, "reason": reason}
-        run.save_stage("certify", StageData(document=nothing), "00")
-        skipped = {"skipped": reason, "machine": settings.machine}
-        run.save_stage("closed_loop", StageData(document=skipped), "00")
+        run.save_stage("design", DesignResult(None, met=False, reason=reason), "00")
+        run.save_stage("achievable_performance", AchievablePerformance(), "00")
+        run.save_stage("certify", CertifyResult(None, certified=False, reason=reason), "00")
+        run.save_stage("reference_filter", ReferenceFilterResult(), "00")
+        run.save_stage("closed_loop", ClosedLoopResult(skipped=reason), "00")
         return
     law = controller(gain)
     certificate = certify(
@@ -357,37 +326,26 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         gamma_history=(certificate.gamma,),
         grid_points=200,
     )
-    document = {"synthesis": result.to_dict(), "met": met, "reason": result.explain()}
-    run.save_stage("design", StageData(document=document), "00")
-    run.save_stage("yardstick", StageData(document=bracket_document()), "00")
-    run.save_stage("prefilter", StageData(document={"prefilter": None, "reason": None}), "00")
-    run.save_stage(
-        "certify",
-        StageData(
-            document={
-                "whole": whole_document(certificate.gamma),
-                "certificate": certificate.to_dict(),
-                "certified": certificate.certified,
-                "reason": "; ".join(item.sentence() for item in certificate.items if not item.met) or "met",
-            }
-        ),
-        "00",
-    )
-    run.save_stage("closed_loop", closed_loop_data(settings, settled), "00")
+    run.save_stage("design", DesignResult(result, met, result.explain()), "00")
+    run.save_stage("achievable_performance", achievable(), "00")
+    run.save_stage("reference_filter", ReferenceFilterResult(), "00")
+    reason = "; ".join(item.sentence() for item in certificate.items if not item.met) or "met"
+    sampled = sampled_responses(certificate.gamma)
+    run.save_stage("certify", CertifyResult(certificate, certificate.certified, reason, sampled), "00")
+    run.save_stage("closed_loop", ClosedLoopResult(check=loop_check(settings, settled)), "00")
 
 
-def bracket_document(reached: float = 0.8) -> dict[str, Any]:
+def achievable(reached: float = 0.8) -> AchievablePerformance:
     """What a controller of any order reaches, made up."""
-    return {
-        "bracket": YoulaBracket(
+    return AchievablePerformance(
+        YoulaBracket(
             (PlantBracket("hub", reached - 0.002, reached, reached + 0.002, reached - 0.003, 0.81, 57, True),)
-        ).to_dict(),
-        "reason": None,
-    }
+        )
+    )
 
 
-def whole_document(gamma: float, *, level: float = 0.9, calibrated: bool = False) -> dict[str, Any]:
-    """Whole responses, made up: the worst case holds for 990 of 1000."""
+def sampled_responses(gamma: float, *, level: float = 0.9, calibrated: bool = False) -> SampledResponses:
+    """Sampled responses, made up: the worst case holds for 990 of 1000."""
     joint = JointCoverage(
         coverage=0.95,
         draws=1000,
@@ -400,10 +358,10 @@ def whole_document(gamma: float, *, level: float = 0.9, calibrated: bool = False
         simultaneous_level=0.998,
         stable_share=1.0,
     )
-    return {"joint": joint.to_dict(), "calibrated": calibrated, "reason": None}
+    return SampledResponses(joint, calibrated)
 
 
-def closed_loop_data(settings: RunConfig, settled: int, draws: int = 3) -> StageData:
+def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
     """A well-damped step response for the prediction, noisy copies for the machine."""
     time = np.arange(800) * DT_S
     reference = np.where(time >= 0.4, 0.5, 0.0)
@@ -412,73 +370,69 @@ def closed_loop_data(settings: RunConfig, settled: int, draws: int = 3) -> Stage
     output = np.where(time >= 0.4, 0.5 * shape, 0.0)
     rng = np.random.default_rng(5)
 
-    def runs(count: int, noise: float) -> closed_loop_stage.Runs:
+    def runs(count: int, noise: float) -> LoopRuns:
         y = output + noise * rng.standard_normal((count, time.size))
         y[:, time >= 4.0] += 0.05 * np.exp(-2 * (time[time >= 4.0] - 4))
         u = np.clip(4 * (reference - y), -24, 24)
-        return closed_loop_stage.Runs(y, u, 0.9 * y if len(settings.channels) > 1 else None, np.abs(u) >= 24)
+        return LoopRuns(y, u, 0.9 * y if len(settings.channels) > 1 else None, np.abs(u) >= 24)
 
     trial = closed_loop_stage.Trial(time, reference, disturbance, 0.5, 400, tracking=True)
     predicted, achieved = runs(1, 0.0), runs(draws, 0.002)
-    document = {
-        "skipped": None,
-        "tracking": True,
-        "machine": settings.machine,
-        "draws": draws,
-        "reference_step": 0.5,
-        "disturbance": 0.3,
-        "quantisation": 0.0,
-        "input_limit": 24.0,
-        "predicted": closed_loop_stage.describe(predicted, trial)[0],
-        "achieved": closed_loop_stage.describe(achieved, trial),
-        "settled_draws": settled,
-    }
-    arrays = {"time_s": time, "reference": reference, "disturbance": disturbance}
+    sensitivity, conditions = None, ()
     if settings.machine == "simulated":
-        more = beyond_the_trial(reference[:400], output[:400])
-        arrays |= more.arrays
-        document |= more.document
-    return StageData({**arrays, **predicted.arrays("predicted"), **achieved.arrays("achieved")}, document)
+        sensitivity, conditions = beyond_the_trial(reference[:400], output[:400])
+    rows = closed_loop_stage.describe(achieved, trial)
+    return LoopCheck(
+        machine=settings.machine,
+        tracking=True,
+        reference_step=0.5,
+        disturbance_step=0.3,
+        quantisation=0.0,
+        measurement_step=0.0,
+        input_limit=24.0,
+        filtered=False,
+        predicted=closed_loop_stage.describe(predicted, trial)[0],
+        achieved=tuple(replace(row, settled=number < settled) for number, row in enumerate(rows)),
+        time_s=time,
+        reference=reference,
+        disturbance=disturbance,
+        model_answer=None,
+        predicted_runs=predicted,
+        achieved_runs=achieved,
+        sensitivity=sensitivity,
+        conditions=conditions,
+    )
 
 
-def beyond_the_trial(reference, output, *, small_off_percent: float = -12.0) -> StageData:
-    """Two measurements of S and two conditions, as the closed-loop stage writes them."""
+def beyond_the_trial(
+    reference, output, *, small_off_percent: float = -12.0
+) -> tuple[SensitivityCheck, tuple[ConditionRun, ...]]:
+    """Two measurements of S and two conditions, as the closed-loop stage leaves them."""
     omega = np.linspace(1.0, 60.0, 40)
     loop = controller().response(omega) * plant().channel.nominal_response(omega)
     size = 1 / np.abs(1 + loop)
-    peak = float(size.max())
+    peak, at = float(size.max()), float(omega[np.argmax(size)])
     names = ("arm as identified", "arm as identified, a tenth of the size")
-    rows, arrays = [], {}
-    for number, (name, off) in enumerate(zip(names, (0.4, small_off_percent), strict=True)):
-        arrays[f"sensitivity/{number}/omega_rad_s"] = omega
-        arrays[f"sensitivity/{number}/magnitude"] = size * (1 + off / 100)
-        arrays[f"sensitivity/{number}/std"] = np.full(omega.size, 0.002)
-        rows.append(
-            {
-                "name": name,
-                "reference_rms": 0.2 / 10**number,
-                "peak": peak * (1 + off / 100),
-                "peak_std": 0.002,
-                "omega_rad_s": float(omega[np.argmax(size)]),
-                "off_nominal_percent": off,
-                "off_certified_percent": off - 0.1,
-                "peak_command": 12.0,
-                "limited_fraction": 0.0,
-            }
+    rows = [
+        MeasuredPeak(
+            name=name,
+            reference_rms=0.2 / 10**number,
+            peak=peak * (1 + off / 100),
+            peak_std=0.002,
+            peak_omega_rad_s=at,
+            off_nominal_percent=off,
+            off_certified_percent=off - 0.1,
+            peak_command=12.0,
+            limited_fraction=0.0,
+            omega_rad_s=omega,
+            magnitude=size * (1 + off / 100),
+            std=np.full(omega.size, 0.002),
         )
-    found = {
-        "nominal_peak": peak,
-        "nominal_omega_rad_s": rows[0]["omega_rad_s"],
-        "certified_peak": 1.001 * peak,
-        "band_rad_s": [1.0, 60.0],
-        "measured": rows,
-    }
+        for number, (name, off) in enumerate(zip(names, (0.4, small_off_percent), strict=True))
+    ]
     conditions = []
     for name, factor in (("payload 200 %", 0.9), ("push at the tip", 1.1)):
         law = LoopTrajectory(np.arange(400) * DT_S, reference, output[:, None], output, output > 9, DT_S)
         real = replace(law, output=factor * output[:, None])
-        conditions.append(Condition(name, "something <else>", reference, law, real, 0.5))
-    return StageData(
-        {**arrays, **condition_arrays(conditions)},
-        {"sensitivity": found, "conditions": [condition.row() for condition in conditions]},
-    )
+        conditions.append(condition_run(name, "something <else>", reference, law, real, 0.5))
+    return SensitivityCheck(peak, at, 1.001 * peak, (1.0, 60.0), tuple(rows)), tuple(conditions)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import shutil
 import subprocess
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,24 +23,23 @@ from control_design.specification import RationalWeight, Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from tests.workflow.report_examples import (
     DT_S,
-    bracket_document,
+    achievable,
     controller,
     model,
     plant,
     posterior,
-    whole_document,
+    sampled_responses,
 )
 from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
 from workflow.engine.errors import InputError
 from workflow.tasks.achievable_performance import (
+    achievable_words,
     bracket_numbers,
-    bracket_of,
     find_bracket,
     order_advice,
-    yardstick_words,
 )
 from workflow.tasks.joint_coverage import (
-    certify_whole,
+    certify_asked,
     joint_numbers,
     joint_words,
     open_words,
@@ -49,14 +48,21 @@ from workflow.tasks.joint_coverage import (
 )
 from workflow.tasks.proportions import wilson_interval
 from workflow.tasks.reference_filter import (
+    filter_words,
     find_prefilter,
     model_answer,
     prefilter_bytes,
     prefilter_file,
-    prefilter_of,
-    prefilter_words,
 )
-from workflow.tasks.summary import gamma_of, verdict_of
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    ClosedLoopResult,
+    DesignResult,
+    ReferenceFilterResult,
+    SampledResponses,
+)
+from workflow.tasks.summary import verdict_of
 
 _COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
@@ -90,54 +96,46 @@ def test_wilson_interval_refuses_more_than_all():
         wilson_interval(4, 3)
 
 
-def test_bracket_survives_its_document_without_a_hull():
-    document = json.loads(json.dumps(bracket_document(0.8)))
-    bracket = bracket_of(document)
-    assert bracket is not None
-    assert bracket.plants[0].hull is None
-    assert bracket.floor == pytest.approx(0.798)
-
-
-def test_words_of_the_yardstick():
-    document = bracket_document(0.8)
-    words = yardstick_words(document, 0.88, 4)
+def test_words_of_the_achievable_performance():
+    found = achievable(0.8)
+    words = achievable_words(found, 0.88, 4)
     assert words is not None
     assert "order 4: gamma 0.88, 10 % above" in words
     assert "0.8;" in words
-    assert bracket_numbers(document, 0.88)["above_percent"] == pytest.approx(10.0)
-    assert "known to reach gamma 0.8" in str(yardstick_words(document, float("inf"), 4))
-    assert yardstick_words({}, 0.88, 4) is None, "a run made before says nothing"
+    assert bracket_numbers(found, 0.88)["above_percent"] == pytest.approx(10.0)
+    assert "known to reach gamma 0.8" in str(achievable_words(found, float("inf"), 4))
+    assert achievable_words(AchievablePerformance(), 0.88, 4) is None
 
 
 def test_advice_on_the_order():
-    assert "controller_order = 3 is too low" in str(order_advice(bracket_document(0.8), 1.2, 3))
-    assert "a higher order does not help" in str(order_advice(bracket_document(1.1), 1.2, 3))
-    assert order_advice({}, 1.2, 3) is None
+    assert "controller_order = 3 is too low" in str(order_advice(achievable(0.8), 1.2, 3))
+    assert "a higher order does not help" in str(order_advice(achievable(1.1), 1.2, 3))
+    assert order_advice(AchievablePerformance(), 1.2, 3) is None
 
 
 def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
-    design = {"met": False, "reason": "gamma 1.2", "synthesis": {"gamma": 1.2}}
-    words = verdict_of(design, {}, {}, bracket_document(0.8), 3)
+    design = DesignResult(SimpleNamespace(gamma=1.2), met=False, reason="gamma 1.2")
+    rest = CertifyResult(None, certified=False, reason=""), ClosedLoopResult()
+    words = verdict_of(design, *rest, achievable(0.8), 3)
     assert words.startswith("specification not met: gamma 1.2; controller_order = 3 is too low")
-    assert verdict_of(design, {}, {}, {}, 3) == "specification not met: gamma 1.2"
-    lost = design | {"synthesis": {"gamma": None}}
-    assert gamma_of(lost) == float("inf")
-    assert "is too low" in verdict_of(lost, {}, {}, bracket_document(0.8), 3)
+    assert verdict_of(design, *rest, AchievablePerformance(), 3) == "specification not met: gamma 1.2"
+    lost = replace(design, synthesis=SimpleNamespace(gamma=float("inf")))
+    assert "is too low" in verdict_of(lost, *rest, achievable(0.8), 3)
 
 
-def test_yardstick_not_asked_for_or_impossible_says_why():
+def test_achievable_performance_not_asked_for_or_impossible_says_why():
     off = YardstickOptions.model_validate({"compute": False})
-    assert "compute = false" in find_bracket([plant()], spec(), off)["reason"]
+    assert "compute = false" in str(find_bracket([plant()], spec(), off).reason)
     on = YardstickOptions.model_validate({})
     impossible = find_bracket([plant()], spec(bandwidth_rad_s=1e4), on)
-    assert impossible["bracket"] is None
-    assert "Nyquist" in impossible["reason"]
+    assert impossible.bracket is None
+    assert "Nyquist" in str(impossible.reason)
 
 
 def test_whole_responses_agree_with_drawing_them_here():
     options = CertificateOptions.model_validate({"joint_draws": 400})
-    certificate, document = certify_whole(controller(), [plant()], spec(), options, np.random.default_rng(3))
-    numbers = joint_numbers(document)
+    found = certify_asked(controller(), [plant()], spec(), options, np.random.default_rng(3))
+    certificate, numbers = found.certificate, joint_numbers(found.sampled)
     # Here: the same posterior, drawn with other numbers; gamma on a grid of its own.
     uncertain, law = posterior(model()), controller()
     omega = np.geomspace(1e-3, np.pi / DT_S, 3000)
@@ -162,16 +160,17 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
     found = {}
     for wanted in (False, True):
         options = CertificateOptions.model_validate({"calibrate": wanted, "joint_draws": 100})
-        found[wanted] = certify_whole(controller(), [plant()], spec(), options, np.random.default_rng(1))
+        found[wanted] = certify_asked(controller(), [plant()], spec(), options, np.random.default_rng(1))
     kept, raised = found[False], found[True]
-    assert kept[0] == certify(controller(), [plant()], spec())
-    assert raised[0].gamma > kept[0].gamma, "ellipses of 99 % are larger"
-    assert not raised[0].certified, "99 % of the draws are stable, and 99.9 % are an item"
-    assert (kept[1]["calibrated"], raised[1]["calibrated"]) == (False, True)
-    assert "calibrate = true" in str(joint_words(kept[1]))
-    assert "certified over ellipses of 99 %" in str(joint_words(raised[1]))
-    assert any("joint level: sampled" in words for words in open_words(kept[0].not_checked, kept[1]))
-    assert open_words(kept[0].not_checked, {}) == list(kept[0].not_checked)
+    assert kept.certificate == certify(controller(), [plant()], spec())
+    assert raised.certificate.gamma > kept.certificate.gamma, "ellipses of 99 % are larger"
+    assert not raised.certified, "99 % of the draws are stable, and 99.9 % are an item"
+    assert (kept.sampled.calibrated, raised.sampled.calibrated) == (False, True)
+    assert "calibrate = true" in str(joint_words(kept.sampled))
+    assert "certified over ellipses of 99 %" in str(joint_words(raised.sampled))
+    left = kept.certificate.not_checked
+    assert any("joint level: sampled" in words for words in open_words(left, kept.sampled))
+    assert open_words(left, SampledResponses()) == list(left)
 
 
 def test_calibration_is_designed_for(monkeypatch):
@@ -198,13 +197,13 @@ def test_calibration_is_designed_for(monkeypatch):
 
 
 def test_words_of_whole_responses():
-    words = str(joint_words(whole_document(0.9)))
+    words = str(joint_words(sampled_responses(0.9)))
     assert "1000 whole responses" in words
     assert "holds for 99 % (95 % interval 98.17 to 99.46 %)" in words
     assert "100 % stable" in words
-    assert joint_words({}) is None
-    lost = whole_document(0.9)
-    lost["joint"] = {**lost["joint"], "gamma_given": "inf"}
+    assert joint_words(SampledResponses()) is None
+    lost = sampled_responses(0.9)
+    lost = replace(lost, joint=replace(lost.joint, gamma_given=float("inf")))
     assert "no worst case of the ellipses" in str(joint_words(lost))
 
 
@@ -216,11 +215,11 @@ def test_what_cannot_be_drawn_says_why():
     own = UncertainPlant("measured", model().to_control(), measured)
     assert "its own frequencies only" in str(undrawable([own]))
     assert undrawable([plant()]) is None
-    certificate, document = certify_whole(
+    found = certify_asked(
         controller(), [exact], spec(), CertificateOptions.model_validate({}), np.random.default_rng(1)
     )
-    assert certificate.joint is None
-    assert "not sampled: no uncertainty" in str(joint_words(document))
+    assert found.certificate.joint is None
+    assert "not sampled: no uncertainty" in str(joint_words(found.sampled))
 
 
 def test_options_that_contradict_themselves():
@@ -264,7 +263,7 @@ def test_answer_of_the_model_settles_as_it_should():
 
 
 @pytest.fixture(scope="module")
-def filtered() -> dict[str, object]:
+def filtered() -> ReferenceFilterResult:
     settings = PrefilterSettings.model_validate(
         {"corner_rad_s": 1.0, "grid_points": 60, "mode_points": 20, "dense_points": 1000}
     )
@@ -272,7 +271,7 @@ def filtered() -> dict[str, object]:
 
 
 def test_prefilter_follows_the_model_better_than_none(filtered):
-    found = prefilter_of(filtered)
+    found = filtered.filter
     assert found is not None
     assert found.error_after < 0.9 * found.error_before
     # The nominal plant is one member: its error, computed here, cannot be above the certified one.
@@ -281,15 +280,15 @@ def test_prefilter_follows_the_model_better_than_none(filtered):
     s = 2j / DT_S * np.tan(omega * DT_S / 2)
     error = np.abs(found.response(omega) * loop / (1 + loop) - 1 / (s + 1) ** 2)
     assert error.max() <= found.error_after * 1.001
-    assert "times smaller" in str(prefilter_words(filtered))
+    assert "times smaller" in str(filter_words(filtered))
 
 
 def test_prefilter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
     settings = PrefilterSettings.model_validate({"corner_rad_s": 1.0})
-    document = find_prefilter(controller(500.0), [plant()], settings)
-    assert document["prefilter"] is None
-    assert str(prefilter_words(document)).startswith("no prefilter: plant 'hub'")
-    assert find_prefilter(controller(), [plant()], None) == {"prefilter": None, "reason": None}
+    result = find_prefilter(controller(500.0), [plant()], settings)
+    assert result.filter is None
+    assert str(filter_words(result)).startswith("no reference filter: plant 'hub'")
+    assert find_prefilter(controller(), [plant()], None).reason is None
     with pytest.raises(InputError, match=r"prefilter\.corner_rad_s: 1000 lies beyond the Nyquist"):
         find_prefilter(controller(), [plant()], PrefilterSettings.model_validate({"corner_rad_s": 1e3}))
     late = PrefilterSettings.model_validate({"corner_rad_s": 1.0, "poles_rad_s": [900.0]})
@@ -298,7 +297,7 @@ def test_prefilter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
 
 
 def test_prefilter_files(filtered, tmp_path):
-    found = prefilter_of(filtered)
+    found = filtered.filter
     assert found is not None
     assert prefilter_file(Path("k.json")) == Path("k_prefilter.json")
     again = Prefilter.from_json(prefilter_bytes(found, ".JSON").decode())
@@ -310,7 +309,7 @@ def test_prefilter_files(filtered, tmp_path):
 
 @pytest.mark.skipif(_COMPILER is None, reason="no C compiler (cc, gcc or clang) on this machine")
 def test_prefilter_in_c_agrees_to_1e_12(filtered, tmp_path):
-    found = prefilter_of(filtered)
+    found = filtered.filter
     assert found is not None
     (tmp_path / "f.c").write_bytes(prefilter_bytes(found, ".c"))
     flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Werror", "-shared", "-fPIC"]

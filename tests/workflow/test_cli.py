@@ -269,7 +269,7 @@ def test_report_draws_the_page_anew(flexlink, fast_run, tmp_path):
 def test_report_of_an_unfinished_run_says_what_is_missing(refused, fast_run, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(fast_run[0], run)
-    (run / "stages" / "design.json").unlink()
+    (run / "stages" / "design.npz").unlink()
     assert "stage design is not there" in refused("report", run)
 
 

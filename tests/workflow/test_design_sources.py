@@ -131,14 +131,14 @@ def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexl
     out = tmp_path / "law.json"
     answer = flexlink("design", tmp_path / "arm.json", "--spec", wish(more), "--out", out, "--json")
     found = numbers(answer)
-    yardstick, gamma = found["yardstick"], found["design"]["synthesis"]["gamma"]
-    assert yardstick["floor"] <= yardstick["reached"] <= gamma
-    assert yardstick["above_percent"] == pytest.approx(100 * (gamma / yardstick["reached"] - 1))
-    assert "a bound, not a distribution" in found["whole_responses"]["reason"]
-    filtered = Prefilter.from_dict(found["prefilter"])
+    achievable, gamma = found["achievable_performance"], found["design"]["synthesis"]["gamma"]
+    assert achievable["floor"] <= achievable["reached"] <= gamma
+    assert achievable["above_percent"] == pytest.approx(100 * (gamma / achievable["reached"] - 1))
+    assert "a bound, not a distribution" in found["sampled_responses"]["reason"]
+    filtered = found["reference_filter"]
     assert filtered.error_after < filtered.error_before
-    assert found["prefilter_file"] == str(tmp_path / "law_prefilter.json")
-    assert np.array_equal(Prefilter.from_json((tmp_path / "law_prefilter.json").read_text()).A, filtered.A)
+    assert found["reference_filter_file"] == str(tmp_path / "law_prefilter.json")
+    assert np.array_equal(Prefilter.from_json((tmp_path / "law_prefilter.json").read_text()).A, filtered["A"])
     table = {row["label"]: row["value"] for row in json.loads(answer.out)["table"]}
     assert "what a controller of any order is known to reach" in table["against any order"]
     assert "times smaller" in table["model matching"]

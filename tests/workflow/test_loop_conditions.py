@@ -12,19 +12,19 @@ from workflow.config.run_config import ClosedLoopOptions
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.pipeline import config_of
+from workflow.tasks.results import RunResults
 from workflow.tasks.sampled_plant import realise
 from workflow.tasks.simulated_rig import rig_of
-from workflow.tasks.stages.results import load_posterior, load_synthesis
 
 
 @pytest.fixture(scope="module")
 def bench(fast_run) -> ConditionBench:
     """The fast arm with its controller: viscous friction only, so the loop is linear but for noise."""
     run = RunDirectory.open(fast_run[0])
-    config = config_of(run)
+    config, results = config_of(run), RunResults(run)
     return ConditionBench(
-        load_synthesis(run).controller,
-        load_posterior(run, 0),
+        results.design.synthesis.controller,
+        results.uncertainty.channels[0].posterior,
         config.source,
         config.closed_loop,
         rig_of(config.source),
@@ -48,14 +48,14 @@ def test_prediction_is_the_feedback_of_model_and_controller(bench):
 def test_push_is_predicted_by_the_free_arm_and_the_sensitivity(bench):
     """The arm is linear here, so prediction and achievement agree to noise (1 mrad) and the model's error."""
     push = bench.push()
-    away = push.achieved.measured - push.predicted.measured
+    away = push.achieved - push.predicted
     assert np.sqrt(np.mean(away**2)) < 0.03 * push.size
     assert not push.reference.any()
 
 
 def test_slew_uses_its_share_of_the_voltage(bench):
     slew = bench.slew()
-    peak = np.max(np.abs(slew.predicted.command))
+    peak = np.max(np.abs(slew.predicted_command))
     limit = bench.controller.input_limit
     assert peak == pytest.approx(0.6 * limit, rel=1e-6) or slew.size == pytest.approx(20 * bench.step)
     assert slew.reference[-1] == pytest.approx(slew.size)
@@ -71,7 +71,7 @@ def test_payloads_are_shares_of_the_rated_one(bench):
 
 
 def test_heavier_payload_moves_the_arm_away_from_the_prediction(bench):
-    differences = [found.row()["rms_difference_percent"] for found in bench.payloads()]
+    differences = [found.rms_difference_percent for found in bench.payloads()]
     assert differences[0] < differences[1] < differences[2]
 
 
@@ -84,17 +84,16 @@ def test_friction_conditions_need_friction(bench):
 def test_limit_is_kept_and_told_only_with_anti_windup(bench):
     aware, unaware = bench.overdriven()
     limit = bench.controller.input_limit
-    assert np.max(np.abs(aware.achieved.command)) <= limit
-    assert aware.achieved.limited.any()
-    assert not unaware.achieved.limited.any()
-    assert np.max(np.abs(unaware.achieved.command)) > 1.5 * limit
+    assert np.max(np.abs(aware.achieved_command)) <= limit
+    assert aware.limited_fraction > 0
+    assert unaware.limited_fraction == 0
+    assert np.max(np.abs(unaware.achieved_command)) > 1.5 * limit
     no_limit = replace(bench, controller=replace(bench.controller, input_limit=None))
     assert no_limit.overdriven() == []
 
 
 def test_row_measures_in_percent_of_the_move(bench):
     late = bench.late()
-    row = late.row()
-    away = late.achieved.measured - late.predicted.measured
-    assert row["largest_difference_percent"] == pytest.approx(100 * np.max(np.abs(away)) / 0.2)
-    assert row["words"] == "5 ms more delay"
+    away = late.achieved - late.predicted
+    assert late.largest_difference_percent == pytest.approx(100 * np.max(np.abs(away)) / 0.2)
+    assert late.words == "5 ms more delay"

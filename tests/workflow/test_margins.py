@@ -14,7 +14,7 @@ import pytest
 from tests.golden import margins
 from workflow.config.run_config import load_config
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.stages.results import load_plant
+from workflow.tasks.results import RunResults
 
 Example = Callable[[str], tuple[dict[str, Any], Path]]
 
@@ -62,7 +62,7 @@ def test_zeros_of_the_hub_are_the_modes_of_the_arm_with_the_hub_held(measured, f
     that."""
     _, out = measured("slfr_krauss_2009")
     config, _ = load_config(margins.ROOT / "examples" / "slfr_krauss_2009.toml")
-    plant = load_plant(RunDirectory.open(out), config)
+    plant = RunResults(RunDirectory.open(out)).uncertainty.plant(config)
     zeros = np.log(plant.zeros[np.abs(plant.zeros) > 0.5].astype(complex)) / plant.dt_s
     found_Hz = np.abs(zeros[zeros.imag > 1.0]) / (2 * np.pi)
     decay = pd.read_csv(flexlink_data / "slfr_krauss_2009" / "free_decay_hub_held_rep1.csv")

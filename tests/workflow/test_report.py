@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,10 +14,10 @@ import workflow.report
 from control_design.convex.reference_filter import Prefilter
 from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
-from workflow.engine.run_directory import RunDirectory, StageData
+from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import Picture
 from workflow.report import write_report
-from workflow.tasks.stages.results import load_records
+from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
 
 ATTACK = "<script>alert(1)</script>"
 
@@ -61,13 +62,13 @@ def undrawn(monkeypatch):
 def drawn(tmp_path_factory) -> RunDirectory:
     settings = example.config()
     run = example.build_run(tmp_path_factory.mktemp("report") / "run", settings)
-    write_report(run, settings)
+    write_report(RunResults(run), settings)
     return run
 
 
 def page_for(path: Path, settings, **how) -> Page:
     run = example.build_run(path / "run", settings, **how)
-    return Page(write_report(run, settings).read_text(encoding="utf-8"))
+    return Page(write_report(RunResults(run), settings).read_text(encoding="utf-8"))
 
 
 def test_page_and_pictures_are_written(drawn):
@@ -129,41 +130,41 @@ def test_pictures_of_an_earlier_report_go(drawn, undrawn, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
     (run.figures_path / "old-3-gone.svg").write_text("<svg/>")
-    write_report(run, settings)
+    write_report(RunResults(run), settings)
     assert not (run.figures_path / "old-3-gone.svg").exists()
 
 
 def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
-    identified = run.load_stage("identify").document["channels"]
-    for channel in identified:
-        for mode in channel["modes"]:
-            assert f"{mode['frequency_Hz']:.4g} {mode['omega_rad_s']:.4g} {mode['damping']:.3g}" in text
-        for name, fit in channel["fit_validation_percent"].items():
+    text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+    results = RunResults(run)
+    for channel in results.identify.channels:
+        for mode in channel.modes:
+            assert f"{mode.frequency_Hz:.4g} {mode.omega_rad_s:.4g} {mode.damping:.3g}" in text
+        for name, fit in channel.fit_validation_percent.items():
             assert f"{fit:.3g} % ({name})" in text
-    for channel in run.load_stage("uncertainty").document["channels"]:
-        for band in channel["bands"]:
-            assert f"{band['median_radius_percent']:.3g}" in text
-        for test in channel["tests"]:
-            assert test["verdict"] in text
-    certificate = run.load_stage("certify").document["certificate"]
-    worst = certificate["plants"][0]["worst_margins"]
-    assert f"{worst['modulus']:.3g}" in text
-    assert f"{np.degrees(worst['phase_rad']):.3g}" in text
-    assert f"{1e3 * worst['delay_s']:.3g}" in text
-    for item in certificate["items"]:
-        assert f"{item['achieved']:.4g}" in text
-    # Whole responses were sampled in a stage of their own, and the page says that instead.
+    for spread in results.uncertainty.channels:
+        for band in spread.bands:
+            assert f"{band.median_radius_percent:.3g}" in text
+        for test in spread.tests:
+            assert test.verdict in text
+    certificate = results.certify.certificate
+    worst = certificate.plants[0].worst_margins
+    assert f"{worst.modulus:.3g}" in text
+    assert f"{np.degrees(worst.phase_rad):.3g}" in text
+    assert f"{1e3 * worst.delay_s:.3g}" in text
+    for item in certificate.items:
+        assert f"{item.achieved:.4g}" in text
+    # Responses were sampled in a stage of their own, and the page says that instead.
     sampled = "joint level: sampled, not certified; see the whole responses"
-    opened = [sampled if line.startswith("joint level") else line for line in certificate["not_checked"]]
+    opened = [sampled if line.startswith("joint level") else line for line in certificate.not_checked]
     assert sampled in opened
-    for line in (*certificate["checked"], *opened):
+    for line in (*certificate.checked, *opened):
         assert line[1:] in text
-    loop = run.load_stage("closed_loop").document
-    assert f"{loop['predicted']['rise_time_s']:.3g}" in text
-    assert f"{loop['achieved'][0]['overshoot_percent']:.3g}" in text
+    loop = results.closed_loop.check
+    assert f"{loop.predicted.rise_time_s:.3g}" in text
+    assert f"{loop.achieved[0].overshoot_percent:.3g}" in text
     manifest = run.manifest()
     assert "ab" * 32 in text
     assert manifest["versions"]["numpy"] in text
@@ -226,29 +227,36 @@ def test_the_page_says_who_chose_the_order(undrawn, tmp_path, chosen, words):
     assert words in page_for(tmp_path, settings.model_copy(update={"channels": (channel,)})).text
 
 
+def change_loop(run, **changes):
+    """The closed-loop stage with some of its results exchanged."""
+    loop = RunResults(run).closed_loop.check
+    run.save_stage("closed_loop", ClosedLoopResult(check=replace(loop, **changes)), "x")
+
+
+def change_prediction(run, **changes):
+    """The same for numbers of the prediction."""
+    predicted = RunResults(run).closed_loop.check.predicted
+    change_loop(run, predicted=replace(predicted, **changes))
+
+
 def test_a_command_beyond_the_records_is_told(undrawn, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    loop = run.load_stage("closed_loop")
-    seen = max(
-        float(np.max(np.abs(item.record.input))) for item in load_records(run) if item.role == "estimation"
-    )
+    records = RunResults(run).records.of_role("estimation")
+    seen = max(float(np.max(np.abs(item.record.input))) for item in records)
     words = "times the largest input in the records of the fit"
     for factor, told in ((1.4, False), (7.0, True)):
-        predicted = {**loop.document["predicted"], "peak_command": factor * seen}
-        run.save_stage("closed_loop", StageData(loop.arrays, {**loop.document, "predicted": predicted}), "x")
-        text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+        change_prediction(run, peak_command=factor * seen)
+        text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
         assert (f"{factor:.2g} {words}" in text) == told
 
 
 def test_an_error_that_stays_is_told(undrawn, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    loop = run.load_stage("closed_loop")
     for left, told in ((0.01, False), (-0.2, True)):
-        predicted = {**loop.document["predicted"], "disturbance_left": left}
-        run.save_stage("closed_loop", StageData(loop.arrays, {**loop.document, "predicted": predicted}), "x")
-        text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+        change_prediction(run, disturbance_left=left)
+        text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
         assert ("of error for good, 40 % of the reference step" in text) == told
         assert ("integrator = true" in text) == told
 
@@ -278,7 +286,7 @@ def test_hostile_names_are_escaped(tmp_path):
         channels=1,
     )
     run = example.build_run(tmp_path / "run", settings, config_text=f"# {ATTACK}\n")
-    text = write_report(run, settings).read_text(encoding="utf-8")
+    text = write_report(RunResults(run), settings).read_text(encoding="utf-8")
     assert ATTACK not in text
     assert "<img src=x" not in text
     page = Page(text)
@@ -296,7 +304,7 @@ def test_missing_stage_is_one_line(tmp_path):
         tmp_path / "run", config_text="", config=settings.to_document(), seed=3, inputs={}
     )
     with pytest.raises(InputError, match="stage records is not there"):
-        write_report(run, settings)
+        write_report(RunResults(run), settings)
     assert not run.report_path.exists()
 
 
@@ -308,16 +316,13 @@ def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn
     assert "payload 200 %" in page.text
     assert "something <else>" in page.text
     run = RunDirectory.open(tmp_path / "run")
-    loop = run.load_stage("closed_loop")
-    found = dict(loop.document["sensitivity"])
-    rows = [dict(row) for row in found["measured"]]
-    rows[0] |= {"off_nominal_percent": 9.0}
-    rows[1] |= {"off_nominal_percent": 0.1}
-    document = {**loop.document, "sensitivity": {**found, "measured": rows}}
-    document["conditions"] = [{**row, "settled": False} for row in document["conditions"]]
-    with run.locked():
-        run.save_stage("closed_loop", StageData(loop.arrays, document), "x")
-    text = Page(write_report(run, example.config()).read_text(encoding="utf-8")).text
+    loop = RunResults(run).closed_loop.check
+    offs = zip(loop.sensitivity.measured, (9.0, 0.1), strict=True)
+    rows = tuple(replace(row, off_nominal_percent=off) for row, off in offs)
+    sensitivity = replace(loop.sensitivity, measured=rows)
+    conditions = tuple(replace(row, settled=False) for row in loop.conditions)
+    change_loop(run, sensitivity=sensitivity, conditions=conditions)
+    text = Page(write_report(RunResults(run), example.config()).read_text(encoding="utf-8")).text
     assert "The loop on the arm is not the predicted one" in text
     assert "dry friction takes" not in text
     assert "The loop does not settle with: payload 200 % and push at the tip." in text
@@ -332,8 +337,8 @@ def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, und
 def test_page_tells_of_any_order_whole_responses_and_prefilter(tmp_path, undrawn):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
-    gamma = run.load_stage("design").document["synthesis"]["gamma"]
+    text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+    gamma = RunResults(run).design.gamma
     # Made up: 0.8 reached by any order, and the worst case of the ellipses holds for 990 of 1000 draws.
     off = f"{100 * abs(gamma / 0.8 - 1):.2g}"
     assert f"{off} % {'above' if gamma > 0.8 else 'below'} the 0.8 that a controller of any order" in text
@@ -352,20 +357,6 @@ def test_page_tells_of_any_order_whole_responses_and_prefilter(tmp_path, undrawn
         worst_rad_s=3.0,
     )
     with run.locked():
-        run.save_stage("prefilter", StageData(document={"prefilter": filtered.to_dict()}), "x")
-    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
+        run.save_stage("reference_filter", ReferenceFilterResult(filtered), "x")
+    text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
     assert "0.19 with it, 0.95 without, 5 times smaller" in text
-
-
-def test_page_of_a_run_made_before_there_were_these_stages(tmp_path, undrawn):
-    settings = example.config()
-    run = example.build_run(tmp_path / "run", settings)
-    certify = dict(run.load_stage("certify").document)
-    del certify["whole"]
-    with run.locked():
-        run.save_stage("certify", StageData(document=certify), "x")
-        for name in ("yardstick", "prefilter"):
-            run.stage_file(name).unlink()
-    text = Page(write_report(run, settings).read_text(encoding="utf-8")).text
-    assert "Margins and certificate" in text
-    assert "controller of any order" not in text

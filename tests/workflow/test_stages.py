@@ -22,34 +22,20 @@ from workflow.config.settings import check
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.achievable_performance import bracket_of
 from workflow.tasks.conditioning import as_bounded, as_fitted
-from workflow.tasks.joint_coverage import joint_of
 from workflow.tasks.pipeline import config_of
-from workflow.tasks.reference_filter import prefilter_of
+from workflow.tasks.results import RunRecord, RunResults
 from workflow.tasks.simulated_rig import EncodedArm
 from workflow.tasks.stages import StageInput
 from workflow.tasks.stages.closed_loop import run_closed_loop
-from workflow.tasks.stages.prefilter import design_filter
 from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
-from workflow.tasks.stages.results import (
-    ChannelResult,
-    RunRecord,
-    load_certificate,
-    load_empirical,
-    load_frequency,
-    load_identification,
-    load_plant,
-    load_posterior,
-    load_records,
-    load_synthesis,
-)
+from workflow.tasks.stages.reference_filter import design_filter
 from workflow.tasks.stages.uncertainty import posterior_of
 
 
 @pytest.fixture(scope="module")
-def run(fast_run) -> RunDirectory:
-    return RunDirectory.open(fast_run[0])
+def run(fast_run) -> RunResults:
+    return RunResults(RunDirectory.open(fast_run[0]))
 
 
 def true_response(omega):
@@ -62,9 +48,9 @@ def true_response(omega):
 
 
 def test_records_know_their_noise_free_output(run):
-    records = load_records(run)
+    records = run.records.records
     assert [item.role for item in records] == ["estimation", "validation"]
-    clean = run.load_stage("records").arrays["noise_free/0/output"]
+    clean = records[0].noise_free
     noise = records[0].record.output - clean
     sensors = paper_link().sensors
     # 700 samples: the standard deviation is known to 2.7 %; 5 sigma.
@@ -74,7 +60,7 @@ def test_records_know_their_noise_free_output(run):
 
 
 def test_ellipses_hold_the_true_response(run):
-    frequency = load_frequency(run, 0)
+    frequency = run.uncertainty.channels[0].frequency
     inside = (frequency.omega_rad_s > 2) & (frequency.omega_rad_s < 100)
     truth = true_response(frequency.omega_rad_s)
     # 95 % each, strongly correlated over frequency: mostly nearly all; far less means a wrong response.
@@ -83,114 +69,105 @@ def test_ellipses_hold_the_true_response(run):
 
 
 def test_posterior_and_display_grid_agree(run):
-    frequency, posterior = load_frequency(run, 0), load_posterior(run, 0)
+    frequency, posterior = run.uncertainty.channels[0].frequency, run.uncertainty.channels[0].posterior
     again = posterior.at(frequency.omega_rad_s, frequency.level)
     np.testing.assert_array_equal(again.centre, frequency.centre)
     np.testing.assert_array_equal(again.covariance, frequency.covariance)
 
 
 def test_empirical_response_is_there(run):
-    empirical = load_empirical(run, 0)
+    empirical = run.uncertainty.channels[0].empirical
     assert empirical is not None
     assert empirical.omega_rad_s.size > 10
 
 
 def test_identification_comes_back_whole(run):
-    found = load_identification(run, 0)
-    about = run.load_stage("identify").document["channels"][0]
-    assert found.identification.model.order == about["order"]
-    assert about["fit_estimation_percent"] == {"prbs": pytest.approx(found.identification.fit_percent[0])}
-    assert set(about["fit_validation_percent"]) == {"fresh <b>prbs</b>"}
+    found = run.identify.channels[0]
+    assert found.identification.model.order == found.order
+    assert found.fit_estimation_percent == {"prbs": pytest.approx(found.identification.fit_percent[0])}
+    assert set(found.fit_validation_percent) == {"fresh <b>prbs</b>"}
     assert [fit.name for fit in found.fresh] == ["fresh <b>prbs</b>"]
 
 
 def test_certificate_is_that_of_the_stored_controller(run):
-    result, certificate = load_synthesis(run), load_certificate(run)
-    config = config_of(run)
-    again = certify(result.controller, [load_plant(run, config)], config.specification)
-    assert again == certificate
+    config = config_of(run.run)
+    plant = run.uncertainty.plant(config)
+    again = certify(run.design.synthesis.controller, [plant], config.specification)
+    assert again == run.certify.certificate
 
 
 def test_every_design_is_compared_with_any_order_and_sampled_whole(run):
-    bracket = bracket_of(run.load_stage("yardstick").document)
-    gamma = load_synthesis(run).gamma
+    bracket, gamma = run.achievable_performance.bracket, run.design.gamma
     assert bracket is not None
     assert bracket.floor <= bracket.ellipse <= bracket.enclosing
     # The design knows more requirements than the bracket, which therefore reaches lower.
     assert bracket.ellipse < 1.001 * gamma
-    joint = joint_of(run.load_stage("certify").document["whole"])
+    joint = run.certify.sampled.joint
     assert joint is not None
     assert joint.draws == 2000
     assert joint.stable_share > 0.999
 
 
 def test_prefilter_takes_the_reference_step_to_the_loop(run, tmp_path):
-    shutil.copytree(run.path, tmp_path / "run")
-    copy = RunDirectory(tmp_path / "run")
-    corner = 0.3 * config_of(run).specification.bandwidth_rad_s
+    shutil.copytree(run.run.path, tmp_path / "run")
+    copy = RunResults(RunDirectory(tmp_path / "run"))
+    corner = 0.3 * config_of(run.run).specification.bandwidth_rad_s
     settings = PrefilterSettings.model_validate({"corner_rad_s": corner, "dense_points": 1000})
-    config = config_of(run).model_copy(update={"prefilter": settings})
+    config = config_of(run.run).model_copy(update={"prefilter": settings})
     stage = StageInput(config, copy, Silence())
-    data = design_filter(stage)
-    found = prefilter_of(data.document)
+    result = design_filter(stage)
+    found = result.filter
     assert found is not None
     assert found.error_after < found.error_before
-    copy.save_stage("prefilter", data, "00")
-    filtered, plain = run_closed_loop(stage), run.load_stage("closed_loop")
-    assert filtered.document["prefiltered"]
-    assert not plain.document["prefiltered"]
-    reference, model = filtered.arrays["reference"], filtered.arrays["model"]
-    assert np.array_equal(reference, plain.arrays["reference"])
+    copy.run.save_stage("reference_filter", result, "00")
+    filtered, plain = run_closed_loop(stage).check, run.closed_loop.check
+    assert filtered.filtered
+    assert not plain.filtered
+    reference, model = filtered.reference, filtered.model_answer
+    assert np.array_equal(reference, plain.reference)
     first = slice(0, reference.size // 2)
 
     def away(loop, signal):
-        return np.max(np.abs(loop.arrays["predicted/output"][0, first] - signal[first]))
+        return np.max(np.abs(loop.predicted_runs.output[0, first] - signal[first]))
 
     # A model three times slower than the loop: with the prefilter the loop is nearer to it.
     assert away(filtered, model) < 0.7 * away(plain, model)
-    assert filtered.document["sensitivity"]["measured"][0] == plain.document["sensitivity"]["measured"][0]
+    assert filtered.sensitivity.measured[0].peak == plain.sensitivity.measured[0].peak
 
 
-def test_closed_loop_arrays_fit_the_schema(run):
-    data = run.load_stage("closed_loop")
-    samples = data.arrays["time_s"].size
-    assert data.document["draws"] == data.document["settled_draws"] == 2
-    assert data.arrays["predicted/output"].shape == (1, samples)
-    for name in ("output", "command", "limited"):
-        assert data.arrays[f"achieved/{name}"].shape == (2, samples)
+def test_closed_loop_runs_differ_in_noise_and_nothing_else(run):
+    check = run.closed_loop.check
+    samples = check.time_s.size
+    assert check.draws == check.settled_draws == 2
+    assert check.predicted_runs.output.shape == (1, samples)
+    for signal in (check.achieved_runs.output, check.achieved_runs.command, check.achieved_runs.limited):
+        assert signal.shape == (2, samples)
     # Noise differs between the runs, the reference does not.
-    assert not np.array_equal(*data.arrays["achieved/output"])
-    step, half = data.document["reference_step"], samples // 2
-    assert set(np.unique(data.arrays["reference"])) == {0.0, step}
-    assert np.all(data.arrays["disturbance"][:half] == 0)
-    assert np.all(data.arrays["disturbance"][half:] == data.document["disturbance"])
+    assert not np.array_equal(*check.achieved_runs.output)
+    step, half = check.reference_step, samples // 2
+    assert set(np.unique(check.reference)) == {0.0, step}
+    assert np.all(check.disturbance[:half] == 0)
+    assert np.all(check.disturbance[half:] == check.disturbance_step)
     # The model predicts the machine: friction here is viscous, so only noise and ellipse are between.
-    error = data.arrays["predicted/output"][0] - data.arrays["achieved/output"][0]
+    error = check.predicted_runs.output[0] - check.achieved_runs.output[0]
     assert np.sqrt(np.mean(error**2)) < 0.05 * step
 
 
 def test_sensitivity_measured_on_the_arm_is_the_predicted_one(run):
     """The fast arm has no dry friction, so S is linear: 5 % is the reach, 1 % is seen."""
-    data = run.load_stage("closed_loop")
-    found = data.document["sensitivity"]
-    assert [row["name"] for row in found["measured"]] == [
+    found = run.closed_loop.check.sensitivity
+    assert [row.name for row in found.measured] == [
         "arm as identified",
         "arm as identified, a tenth of the size",
     ]
-    assert abs(found["measured"][0]["off_nominal_percent"]) < 5
-    assert found["nominal_peak"] <= found["certified_peak"] * (1 + 1e-6)
-    certificate = load_certificate(run)
-    assert found["certified_peak"] == certificate.plants[0].worst_peak_sensitivity
-    for number in range(2):
-        shape = data.arrays[f"sensitivity/{number}/omega_rad_s"].shape
-        assert data.arrays[f"sensitivity/{number}/magnitude"].shape == shape
-        assert data.arrays[f"sensitivity/{number}/std"].shape == shape
+    assert abs(found.measured[0].off_nominal_percent) < 5
+    assert found.nominal_peak <= found.certified_peak * (1 + 1e-6)
+    assert found.certified_peak == run.certify.certificate.plants[0].worst_peak_sensitivity
 
 
-def test_conditions_fit_the_schema(run):
-    data = run.load_stage("closed_loop")
-    names = [row["name"] for row in data.document["conditions"]]
-    assert names == [
+def test_every_condition_is_run_and_settles(run):
+    check = run.closed_loop.check
+    assert [row.name for row in check.conditions] == [
         "slew",
         "push at the tip",
         "payload 0 %",
@@ -203,12 +180,9 @@ def test_conditions_fit_the_schema(run):
         "voltage limit",
         "no anti-windup",
     ]
-    assert all(row["settled"] for row in data.document["conditions"])
-    half = data.arrays["time_s"].size // 2
-    for key in ("reference", "predicted", "achieved", "predicted_command", "achieved_command"):
-        assert data.arrays[f"conditions/{key}"].shape == (len(names), half)
-    limit = data.document["input_limit"]
-    assert np.max(np.abs(data.arrays["conditions/achieved_command"][:-1])) <= limit
+    assert all(row.settled for row in check.conditions)
+    assert all(row.achieved.size == check.time_s.size // 2 for row in check.conditions)
+    assert max(np.max(np.abs(row.achieved_command)) for row in check.conditions[:-1]) <= check.input_limit
 
 
 def test_encoder_rounds_the_hub_angle_only():
@@ -281,10 +255,12 @@ def test_scatter_between_records_needs_four_and_widens_the_ellipses():
         y = gain * lfilter([0.0, 0.3], [1.0, -0.7], u, axis=0) + 1e-3 * rng.standard_normal((800, 1))
         records.append(replace(make_record(f"r{i}"), input=u, output=y))
     found = identify(records, IdentOptions(n_real=1, n_pairs=0))
-    result = ChannelResult("y", found, tuple(records), tuple(records), ())
+    result, some = found.model, tuple(records)
     omega = np.array([1.0, 10.0, 100.0])
-    apart = posterior_of(result, channel.uncertainty, []).at(omega)
-    noise = posterior_of(result, channel.uncertainty.model_copy(update={"method": "tangent"}), []).at(omega)
+    apart = posterior_of(result, some, channel.uncertainty, []).at(omega)
+    noise = posterior_of(result, some, channel.uncertainty.model_copy(update={"method": "tangent"}), []).at(
+        omega
+    )
     truth = 0.3 * np.exp(-1j * omega * 0.01) / (1 - 0.7 * np.exp(-1j * omega * 0.01))
     for gain in (0.8, 1.2):
         assert np.all(apart.contains(gain * truth))
@@ -294,14 +270,13 @@ def test_scatter_between_records_needs_four_and_widens_the_ellipses():
     labels = ["a", "b", "c", "d"]
     labelled = [RunRecord(r, "estimation", c, "") for r, c in zip(records, labels, strict=True)]
     np.testing.assert_array_equal(
-        posterior_of(result, by_condition, labelled).at(omega).covariance, apart.covariance
+        posterior_of(result, some, by_condition, labelled).at(omega).covariance, apart.covariance
     )
     alike = [*labelled[:3], replace(labelled[3], condition="c")]
     with pytest.raises(ValueError, match="at least four conditions of estimation records; found 3"):
-        posterior_of(result, by_condition, alike)
-    few = replace(result, bounded=tuple(records[:3]))
+        posterior_of(result, some, by_condition, alike)
     with pytest.raises(ValueError, match="at least four estimation records; found 3"):
-        posterior_of(few, channel.uncertainty, [])
+        posterior_of(result, some[:3], channel.uncertainty, [])
 
 
 def test_sampling_times_that_differ_are_refused_and_jitter_is_not():

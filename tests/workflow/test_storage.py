@@ -128,7 +128,7 @@ def test_a_reader_never_sees_half_a_file_while_the_writer_is_killed(tmp_path):
     """Kill -9 a process that rewrites one file without pause; whatever is there must be whole."""
     path = tmp_path / "a.npz"
     code = (
-        "import sys, numpy as np; from pathlib import Path; from workflow import storage\n"
+        "import sys, numpy as np; from pathlib import Path; from workflow.engine import storage\n"
         "k = 0\n"
         "while True:\n"
         "    k += 1\n"

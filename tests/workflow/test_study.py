@@ -17,12 +17,14 @@ import pytest
 from tests.workflow.command import FAST_ARM, start_flexlink
 from tests.workflow.study_examples import SMALL_STUDY, assert_same_study, point_bytes, write_study
 from workflow.config.run_config import load_config
+from workflow.engine import codec
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.directory import StudyDirectory
 from workflow.study.run import run_study
 from workflow.tasks.pipeline import config_of
+from workflow.tasks.results import RunResults
 from workflow.tasks.summary import RunSummary
 
 
@@ -63,13 +65,13 @@ def test_numbers_are_those_of_the_certificate(small_study):
     out, _ = small_study
     for row in rows_of(out)[:4]:
         run = RunDirectory.open(out / "points" / row["name"])
-        certify = run.load_stage("certify").document
-        assert (row["state"] == "certified") == certify["certified"]
-        verdict = certify["certificate"]["plants"][0]
-        assert float(row["modulus_margin"]) == verdict["worst_margins"]["modulus"]
-        assert float(row["bandwidth_rad_s"]) == verdict["bandwidth_rad_s"]
-        achieved = run.load_stage("closed_loop").document["achieved"]
-        assert float(row["peak_command"]) == max(one["peak_command"] for one in achieved)
+        results = RunResults(run)
+        assert (row["state"] == "certified") == results.certify.certified
+        verdict = results.certify.certificate.plants[0]
+        assert float(row["modulus_margin"]) == verdict.worst_margins.modulus
+        assert float(row["bandwidth_rad_s"]) == verdict.bandwidth_rad_s
+        achieved = results.closed_loop.check.achieved
+        assert float(row["peak_command"]) == max(one.peak_command for one in achieved)
 
 
 def test_a_point_is_what_flexlink_run_makes_of_its_configuration(small_study, tmp_path):
@@ -98,7 +100,7 @@ def test_points_open_with_the_usual_tools(small_study, tmp_path, flexlink):
 def test_points_of_one_design_share_controller_and_plant(small_study):
     out, _ = small_study
     first, second = (out / "points" / row["name"] / "stages" for row in rows_of(out)[:2])
-    for name in ("uncertainty.npz", "design.json", "certify.json"):
+    for name in ("uncertainty.npz", "design.npz", "certify.json"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
     assert (first / "closed_loop.npz").read_bytes() != (second / "closed_loop.npz").read_bytes()
     assert len(list((out / "plants").iterdir())) == 1
@@ -117,11 +119,11 @@ def test_resuming_computes_only_what_is_missing(small_study, tmp_path):
     (out / "points" / names[2] / "stages" / "certify.json").unlink()
     for name in ("table.csv", "table.json", "study.html"):
         (out / name).unlink()
-    kept = {n: (out / "points" / n / "stages/design.json").stat().st_mtime_ns for n in (names[0], names[3])}
+    kept = {n: (out / "points" / n / "stages/design.npz").stat().st_mtime_ns for n in (names[0], names[3])}
     run_study(write_study(tmp_path), out, resume=True, jobs=1)
     assert_same_study(small_study[0], out)
     for name, before in kept.items():
-        assert (out / "points" / name / "stages/design.json").stat().st_mtime_ns == before
+        assert (out / "points" / name / "stages/design.npz").stat().st_mtime_ns == before
 
 
 def test_a_finished_study_is_taken_up_and_can_be_extended(small_study, tmp_path):
@@ -155,8 +157,9 @@ def test_a_run_directory_is_a_base(fast_run, tmp_path):
             mine = (out / "points" / row["name"] / "stages" / name).read_bytes()
             assert mine == (fast_run[0] / "stages" / name).read_bytes()
     # The base's own specification: the design of the run again.
-    design = RunDirectory(out / "points" / rows_of(out)[0]["name"]).load_stage("design").document
-    assert design == RunDirectory(fast_run[0]).load_stage("design").document
+    design = RunResults(RunDirectory(out / "points" / rows_of(out)[0]["name"])).design
+    again = RunResults(RunDirectory(fast_run[0])).design
+    assert codec.plain(design) == codec.plain(again)
 
 
 def test_other_ellipses_are_made_once_and_shared(fast_run, tmp_path):
@@ -181,8 +184,8 @@ values = [1, 2]
     assert gammas[2] == gammas[3]
     radii = []
     for row in rows:
-        document = RunDirectory(out / "points" / row["name"]).load_stage("uncertainty").document
-        radii.append([band["median_radius_percent"] for band in document["channels"][0]["bands"]])
+        found = RunResults(RunDirectory(out / "points" / row["name"])).uncertainty
+        radii.append([band.median_radius_percent for band in found.channels[0].bands])
     np.testing.assert_array_equal(radii[0], radii[1])
     # chi-square of two degrees of freedom: the squared radius is -2 log(1 - level).
     np.testing.assert_allclose(np.array(radii[2]) / radii[0], np.sqrt(np.log(0.05) / np.log(0.4)), rtol=1e-6)

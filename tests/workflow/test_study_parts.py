@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 
+from control_design.analysis.margins import Margins
 from control_design.convex.reference_filter import Prefilter
+from control_design.plants.plant_set import Mode
 from tests.workflow.command import FAST_ARM, ROOT
-from tests.workflow.report_examples import bracket_document, whole_document
+from tests.workflow.report_examples import achievable, sampled_responses
 from tests.workflow.study_examples import assert_same_study, write_study
 from workflow.config.run_config import RunConfig, load_config
 from workflow.config.settings import check
@@ -33,6 +38,13 @@ from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
 from workflow.study.task import Job, Task, run_task
 from workflow.study.toml_text import toml_text
 from workflow.tasks.entry import built_in_config
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    ClosedLoopResult,
+    DesignResult,
+    ReferenceFilterResult,
+)
 
 
 def test_keys_reach_into_tables_and_lists():
@@ -163,23 +175,23 @@ def test_smaller_is_better_where_it_says_so():
     assert COLUMNS["modulus_margin"].badness(0.9) < COLUMNS["modulus_margin"].badness(0.5)
 
 
+def design_of(gamma):
+    """A design of this gamma: nothing else of it is looked at."""
+    return DesignResult(SimpleNamespace(gamma=gamma), met=False, reason="")
+
+
 def test_margins_in_the_units_of_the_table():
-    margins = {"gain_up": 4.0, "gain_down": 0.5, "phase_rad": 1.0, "delay_s": None, "modulus": 0.4}
-    verdict = {
-        "worst_margins": margins,
-        "nominal_margins": margins | {"gain_down": 0.0},
-        "bandwidth_rad_s": 3.0,
-        "closed_loop_modes": [{"omega_rad_s": 40.0, "zeta": 0.2}, {"omega_rad_s": 200.0, "zeta": 0.1}],
-    }
-    certify = {"certificate": {"plants": [verdict], "gamma": "inf", "gamma_bound": None}}
-    documents = {
-        "design": {"synthesis": {"gamma": 0.8}},
-        "yardstick": {},
-        "certify": certify,
-        "prefilter": {},
-        "closed_loop": {"skipped": "why not"},
-    }
-    found = numbers_of(documents, (30.0, 100.0))
+    margins = Margins(gain_up=4.0, gain_down=0.5, phase_rad=1.0, delay_s=math.inf, modulus=0.4)
+    verdict = SimpleNamespace(
+        worst_margins=margins,
+        nominal_margins=replace(margins, gain_down=0.0),
+        bandwidth_rad_s=3.0,
+        closed_loop_modes=(Mode(40.0, 0.2), Mode(200.0, 0.1)),
+    )
+    certificate = SimpleNamespace(plants=(verdict,), gamma=math.inf, gamma_bound=None)
+    certify = CertifyResult(certificate, certified=False, reason="")
+    rest = AchievablePerformance(), certify, ReferenceFilterResult(), ClosedLoopResult(skipped="why not")
+    found = numbers_of(design_of(0.8), *rest, (30.0, 100.0))
     assert found["gain_margin_dB"] == pytest.approx(6.0206, abs=1e-4)  # down to a half: the nearer side
     assert found["nominal_gain_margin_dB"] == pytest.approx(12.0412, abs=1e-4)
     assert found["phase_margin_deg"] == pytest.approx(57.29578)
@@ -187,24 +199,27 @@ def test_margins_in_the_units_of_the_table():
     assert found["worst_gamma"] is None
     assert (found["mode_damping"], found["mode_omega_rad_s"]) == (0.2, 40.0)
     assert (found["design_gamma"], found["any_order_gamma"], found["matching_error"]) == (0.8, None, None)
-    nothing = documents | {"design": {"synthesis": None}}
-    assert numbers_of(nothing, None)["mode_damping"] == 0.1
+    nothing = DesignResult(None, met=False, reason="")
+    assert numbers_of(nothing, *rest, None)["mode_damping"] == 0.1
 
 
 def test_numbers_beyond_the_margins():
     filtered = Prefilter(
         np.array([[0.9]]), np.array([[0.1]]), np.array([[1.0]]), np.array([[0.0]]), 0.01, 0.95, 0.2, 3.0
     )
-    measured = {"nominal_peak": 1.4, "measured": [{"peak": 1.42}, {"peak": 1.1}]}
-    loop = {"skipped": None, "settled_draws": 1, "draws": 1, "sensitivity": measured, "achieved": [_METRICS]}
-    documents = {
-        "design": {"synthesis": {"gamma": 0.88}},
-        "yardstick": bracket_document(0.8),
-        "certify": {"certificate": None, "whole": whole_document(0.9)},
-        "prefilter": {"prefilter": filtered.to_dict(), "reason": None},
-        "closed_loop": loop,
-    }
-    found = numbers_of(documents, None)
+    peaks = SimpleNamespace(
+        nominal_peak=1.4, measured=(SimpleNamespace(peak=1.42), SimpleNamespace(peak=1.1))
+    )
+    row = SimpleNamespace(**_METRICS)
+    check = SimpleNamespace(settled_draws=1, draws=1, sensitivity=peaks, achieved=(row,))
+    found = numbers_of(
+        design_of(0.88),
+        achievable(0.8),
+        CertifyResult(None, certified=False, reason="", sampled=sampled_responses(0.9)),
+        ReferenceFilterResult(filtered),
+        ClosedLoopResult(check=check),
+        None,
+    )
     assert found["any_order_gamma"] == 0.8
     assert found["above_any_order_percent"] == pytest.approx(10.0)
     assert (found["whole_held_percent"], found["whole_stable_percent"]) == (99.0, 100.0)
