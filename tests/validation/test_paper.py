@@ -19,10 +19,10 @@ from validation.paper.command import DRAWERS, OWN_FILES, PAGE, redraw_paper, wri
 from validation.paper.experiments import run_experiments
 from validation.paper.findings import findings_of
 from validation.paper.methods import METHODS
-from validation.paper.page import page_html
+from validation.paper.page import headlines_of, page_html
 from validation.paper.quotes import OPEN_CHOICES, REPORTED
 from validation.paper.settings import PaperSettings
-from validation.paper.table import csv_text, documents, rows_of
+from validation.paper.table import csv_text, rows_of
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.figures import style
@@ -85,7 +85,7 @@ def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
 
 def test_page_stands_alone_and_says_both_sides(results, pictures):
     rows, findings = rows_of(results), findings_of(results)
-    page = page_html(SMALL, pictures, findings, rows)
+    page = page_html(results, pictures, findings, rows)
     assert page.count("<svg ") == 7
     assert "--seed 7" in page
     assert page.count("The paper reports") == page.count("We find") == 7
@@ -100,15 +100,14 @@ def test_page_stands_alone_and_says_both_sides(results, pictures):
 
 def test_sentences_and_rows_are_made_for_every_figure(results):
     findings, rows = findings_of(results), rows_of(results)
-    assert len(findings) == len(REPORTED)
-    assert all(found.sentences and found.headline for found in findings)
+    assert len(headlines_of(results, findings)) == len(findings.agrees) == len(REPORTED)
     assert {row.figure for row in rows} == {item.number for item in REPORTED}
     assert len({(row.figure, row.quantity) for row in rows}) == len(rows)
     assert all(row.ours for row in rows)
     assert not any(math.isnan(row.value) for row in rows)
 
 
-def test_verdicts_follow_the_numbers(results):
+def test_verdicts_follow_the_numbers(results, pictures):
     """The sentence on OE turns when OE finds the mode: no result of ours is written down beforehand."""
     simulation, experiment = results.simulation, results.experiment
 
@@ -117,24 +116,28 @@ def test_verdicts_follow_the_numbers(results):
         marks = {name: {**many, "mode_found": counts[name]} for name, many in shown.medians.items()}
         return replace(shown, medians=marks)
 
-    lucky = findings_of(replace(results, simulation=found_by(simulation, ("GOBF", "OE"))))[2]
-    assert not lucky.agrees
-    assert "OE" in lucky.headline
-    assert findings_of(replace(results, simulation=found_by(simulation, ("GOBF",))))[2].agrees
-    assert findings_of(replace(results, experiment=found_by(experiment, ("GOBF", "OE"))))[3].agrees
-    assert not findings_of(replace(results, experiment=found_by(experiment, METHODS)))[3].agrees
+    def found(**changes):
+        changed = replace(results, **changes)
+        return findings_of(changed).agrees, headlines_of(changed, findings_of(changed))
+
+    agrees, headlines = found(simulation=found_by(simulation, ("GOBF", "OE")))
+    assert not agrees[3]
+    assert headlines[2] == "the mode is usually found by OE"
+    assert found(simulation=found_by(simulation, ("GOBF",)))[0][3]
+    assert found(experiment=found_by(experiment, ("GOBF", "OE")))[0][4]
+    assert not found(experiment=found_by(experiment, METHODS))[0][4]
     runaway = {**experiment.scores, "ARX": replace(experiment.scores["ARX"], fit_percent=-np.inf)}
     away = replace(results, experiment=replace(experiment, scores=runaway))
-    assert "ARX runs away" in findings_of(away)[5].sentences[0]
+    assert "ARX runs away" in page_html(away, pictures, findings_of(away), rows_of(away))
     assert any(row.ours == "runs away" for row in rows_of(away))
 
 
-def test_table_is_the_same_as_csv_and_json(results):
+def test_csv_holds_the_rows(results):
     rows = rows_of(results)
     read = list(csv.DictReader(csv_text(rows).splitlines()))
-    for line, document in zip(read, documents(rows), strict=True):
-        assert line["quantity"] == document["quantity"]
-        assert float(line["value"]) == pytest.approx(document["value"], rel=1e-8, abs=1e-12)
+    for line, row in zip(read, rows, strict=True):
+        assert line["quantity"] == row.quantity
+        assert float(line["value"]) == pytest.approx(row.value, rel=1e-8, abs=1e-12)
 
 
 @pytest.mark.slow

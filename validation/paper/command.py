@@ -7,7 +7,9 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -20,11 +22,11 @@ from validation.paper.figures_response import (
 )
 from validation.paper.figures_search import draw_surface
 from validation.paper.figures_time import draw_gobf_run, draw_peer_runs
-from validation.paper.findings import Finding, findings_of
-from validation.paper.page import page_html
+from validation.paper.findings import findings_of
+from validation.paper.page import headlines_of, page_html
 from validation.paper.quotes import REPORTED
 from validation.paper.settings import PaperSettings
-from validation.paper.table import csv_text, documents, rows_of
+from validation.paper.table import csv_text, rows_of
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress, Silence
@@ -77,24 +79,31 @@ def redraw_paper(
         progress.update("page", (number - 1) / len(DRAWERS), f"figure {number}")
         pictures[number] = render(draw(results))
     findings, rows = findings_of(results), rows_of(results)
+    headlines = headlines_of(results, findings)
     document = {
         "seed": settings.seed,
         "repeats": settings.repeats,
         "searches": settings.searches,
         "versions": package_versions(),
         "figures": [
-            {"figure": item.number, "title": item.title, "agrees": found.agrees, "found": found.headline}
-            for item, found in zip(REPORTED, findings, strict=True)
+            {
+                "figure": item.number,
+                "title": item.title,
+                "agrees": findings.agrees[item.number],
+                "found": headline,
+            }
+            for item, headline in zip(REPORTED, headlines, strict=True)
         ],
-        "rows": documents(rows),
+        "rows": [asdict(row) for row in rows],
     }
     files = {f"figure-{number}.{picture.kind}": picture.content for number, picture in pictures.items()}
     files[TABLE_CSV] = csv_text(rows).encode("utf-8")
-    files[TABLE_JSON] = _strict(document)
-    files[PAGE] = page_html(settings, pictures, findings, rows).encode("utf-8")
+    text = json.dumps(storage.strict_json(document), allow_nan=False, ensure_ascii=False, indent=1)
+    files[TABLE_JSON] = f"{text}\n".encode()
+    files[PAGE] = page_html(results, pictures, findings, rows).encode("utf-8")
     write_all(out, files)
     progress.finish("page", time.monotonic() - started, taken_up=False)
-    return _summary(out, document, findings)
+    return _summary(out, document)
 
 
 def check_free(out: Path, *, replace: bool) -> None:
@@ -149,25 +158,18 @@ def write_all(out: Path, files: Mapping[str, bytes]) -> None:
         raise InputError(f"cannot write {out}: {error.strerror or error}") from error
 
 
-def _strict(document: Mapping[str, object]) -> bytes:
-    text = json.dumps(storage.strict_json(document), allow_nan=False, ensure_ascii=False, indent=1)
-    return (text + "\n").encode("utf-8")
-
-
-def _summary(out: Path, document: Mapping[str, object], findings: tuple[Finding, ...]) -> RunSummary:
+def _summary(out: Path, document: Mapping[str, Any]) -> RunSummary:
     """One line a figure for the terminal; `numbers` holds every row."""
-    sections = tuple(
-        Section(
-            f"Fig. {item.number}",
-            (Row("as the paper reports" if found.agrees else "not as the paper reports", found.headline),),
-        )
-        for item, found in zip(REPORTED, findings, strict=True)
-    )
-    agreeing = sum(found.agrees for found in findings)
+    figures = document["figures"]
+    verdicts = {True: "as the paper reports", False: "not as the paper reports"}
     return RunSummary(
         title="Ziaei & Wang 2006, redrawn",
-        sections=sections,
+        sections=tuple(
+            Section(f"Fig. {item['figure']}", (Row(verdicts[item["agrees"]], item["found"]),))
+            for item in figures
+        ),
         numbers=document,
-        verdict=f"{agreeing} of {len(findings)} figures as the paper reports; numbers in {out / TABLE_CSV}",
+        verdict=f"{sum(item['agrees'] for item in figures)} of {len(figures)} figures as the paper reports; "
+        f"numbers in {out / TABLE_CSV}",
         report_path=str(out / PAGE),
     )

@@ -1,15 +1,13 @@
-"""The numbers of a run as rows: what the paper prints, where, and what we find; as CSV and as JSON."""
+"""The numbers of a run as rows: what the paper prints, where, and what we find; as CSV."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from validation.paper.experiments import Comparison, PaperResults
 from validation.paper.machines import NOISE_STD, SNR_DB
@@ -161,14 +159,4 @@ def _bound_rows(results: PaperResults) -> list[Row]:
 
 def csv_text(rows: Sequence[Row]) -> str:
     """One header line; the paper's words are quoted where they hold commas."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(("figure", "quantity", "paper", "place", "value", "unit"))
-    for row in rows:
-        writer.writerow((row.figure, row.quantity, row.paper, row.place, f"{row.value:.9g}", row.unit))
-    return stream.getvalue()
-
-
-def documents(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """JSON-able rows."""
-    return [asdict(row) for row in rows]
+    return str(pd.DataFrame(rows).to_csv(index=False, float_format="%.9g", lineterminator="\n"))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from workflow.figures.registry import drawings
@@ -23,10 +23,13 @@ from workflow.report.page import Plot, Section
 
 
 @cache
-def environment() -> Environment:
-    """The one environment of all pages and texts. Everything that comes from the user is escaped."""
+def environment(package: str = "workflow") -> Environment:
+    """The one environment of all pages and texts; another package's templates come before ours.
+
+    Everything that comes from the user is escaped.
+    """
     made = Environment(
-        loader=PackageLoader("workflow", "templates"),
+        loader=ChoiceLoader([PackageLoader(name) for name in dict.fromkeys((package, "workflow"))]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -65,7 +68,7 @@ def render_page(
         if stem in pictures:
             raise ValueError(f"the page has two pictures called {stem!r}: give one another `file`")
         pictures[stem] = render(figure)
-        return _embedded(stem, Markup(caption).striptags(), pictures[stem])
+        return embedded(stem, Markup(caption).striptags(), pictures[stem])
 
     page = environment().get_template(template).render(draw=draw, contents=[], **values)
     return RenderedPage(page.strip() + "\n", pictures)
@@ -86,7 +89,7 @@ def page(
 ) -> str:
     """A page of sections that Python made; pictures by the names that the sections' plots give them."""
     drawn = {
-        block.name: _embedded(block.name, block.caption, pictures[block.name])
+        block.name: embedded(block.name, block.caption, pictures[block.name])
         for section in sections
         for block in section.blocks
         if isinstance(block, Plot)
@@ -94,7 +97,7 @@ def page(
     return environment().get_template(template).render(title=title, sections=sections, drawn=drawn, **values)
 
 
-def _embedded(name: str, label: str, picture: Picture) -> Markup:
+def embedded(name: str, label: str, picture: Picture) -> Markup:
     """The picture inside the page: SVG elements with ids of their own, or a base64 image."""
     label = html.escape(label, quote=True)
     if picture.kind == "svg":
