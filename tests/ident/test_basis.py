@@ -16,8 +16,8 @@ from ident.basis.functions import (
     free_response,
     regressor,
 )
-from ident.basis.paper_realisation import complex_realisation, real_realisation
 from ident.basis.poles import Poles
+from tests.ident.paper_oracles import complex_realisation, real_realisation
 
 real_poles = st.lists(st.floats(-0.95, 0.95), max_size=3)
 pair_poles = st.lists(

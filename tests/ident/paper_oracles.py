@@ -1,9 +1,12 @@
-"""The paper's freedom in the two real functions of a conjugate pair, equations (7) to (19).
+"""Oracles: the paper's freedom in the two real functions of a conjugate pair, equations (7) to (19).
 
 After the all-pass of the poles before it, a pair xi, conj(xi) may use any two functions
 sqrt(1 - |xi|^2) (m1 z + m2)/D(z), D = z^2 - 2 Re(xi) z + |xi|^2, whose numerators x1 = (m1, m2), x2 = (m3,
 m4) satisfy x_k^T M x_k = |1 - xi^2|^2 (14) and x1^T M x2 = 0 (15) with the M of (16). They all span the
 same space.
+
+The state space (22) to (26) of the paper, complex and with E inverted, stands below: the product needs neither
+(`ident.basis.functions.basis_state_space`; E's condition number reaches 5e5), so both are oracles of the tests.
 
 The all-pass factor that (13) writes out, (1 - conj(xi_{i-1}) z) on L_{i-1}, is the all-pass that drives the
 pair here.
@@ -12,7 +15,9 @@ pair here.
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
+from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, RealArray
 
 
@@ -75,3 +80,34 @@ def pair_response(pole: complex, x1: RealArray, x2: RealArray, z: ComplexArray) 
         raise ValueError(f"the numerators {x1} and {x2} do not satisfy (14) and (15) for the pole {pole:.6g}")
     factor = np.sqrt((1 - abs(pole)) * (1 + abs(pole))) / ((z - pole) * (z - np.conj(pole)))
     return np.column_stack([(x1[0] * z + x1[1]) * factor, (x2[0] * z + x2[1]) * factor])
+
+
+def complex_realisation(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
+    """(A_bar, B_bar) = (E^-1 A, E^-1 B) of (24), states x_i = L_i(q) u with L_i of (5); (n, n) and (n, 1).
+
+    Row i of (22) is x_i(k+1) = xi_i x_i(k) + f_i [x_{i-1}(k) - conj(xi_{i-1}) x_{i-1}(k+1)],
+    f_i = sqrt((1 - |xi_i|^2)/(1 - |xi_{i-1}|^2)).
+    """
+    xi = poles.values
+    n = xi.size
+    width = np.sqrt((1 - np.abs(xi)) * (1 + np.abs(xi)))
+    E = np.eye(n, dtype=np.complex128)
+    A = np.diag(xi).astype(np.complex128)
+    for i in range(1, n):
+        factor = width[i] / width[i - 1]
+        E[i, i - 1] = np.conj(xi[i - 1]) * factor
+        A[i, i - 1] = factor
+    B = np.zeros((n, 1), dtype=np.complex128)
+    B[0, 0] = width[0]
+    inverse = np.linalg.inv(E)
+    return np.asarray(inverse @ A, dtype=np.complex128), np.asarray(inverse @ B, dtype=np.complex128)
+
+
+def real_realisation(poles: Poles) -> tuple[RealArray, RealArray]:
+    """(T A_bar T^-1, T B_bar) of (25), (26): real states, the pair functions those of `kautz_numerators`."""
+    A, B = complex_realisation(poles)
+    blocks: list[ComplexArray] = [np.eye(poles.real.size, dtype=np.complex128)]
+    for pole in poles.pairs:
+        blocks.append(combination(complex(pole), *kautz_numerators(complex(pole))))
+    T = scipy.linalg.block_diag(*blocks)
+    return np.real(T @ A @ np.linalg.inv(T)), np.real(T @ B)
