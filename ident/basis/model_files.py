@@ -45,36 +45,24 @@ class ModelFile:
                 f"the ellipses' dt_s = {self.ellipses.dt_s} is not the model's, {self.model.dt_s}"
             )
 
+    def _document(self) -> dict[str, Any]:
+        """The fields of the file, in its order."""
+        model = self.model
+        document: dict[str, Any] = {"format": FORMAT, "format_version": FORMAT_VERSION}
+        names = ("input_name", "output_name", "dt_s", "integrators", "input_delay_samples", "feedthrough")
+        document |= {name: getattr(model, name) for name in names}
+        document |= {"poles_real": model.poles.real, "poles_pairs": model.poles.pairs}
+        document |= {"coefficients": model.coefficients}
+        document |= zip("ABCD", model.state_space(), strict=True)
+        if self.ellipses is not None:
+            own = ("level", "method", "omega_rad_s", "centre", "covariance")
+            document["ellipses"] = {name: getattr(self.ellipses, name) for name in own}
+        return document
+
     def to_json(self) -> str:
         """JSON text; floats with as many digits as they have, so that reading gives the same bits."""
-        model, (A, B, C, D) = self.model, self.model.state_space()
-        document: dict[str, Any] = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "input_name": model.input_name,
-            "output_name": model.output_name,
-            "dt_s": float(model.dt_s),
-            "integrators": int(model.integrators),
-            "input_delay_samples": int(model.input_delay_samples),
-            "feedthrough": float(model.feedthrough),
-            "poles_real": model.poles.real.tolist(),
-            "poles_pairs": [[pole.real, pole.imag] for pole in model.poles.pairs.tolist()],
-            "coefficients": model.coefficients.tolist(),
-            "A": A.tolist(),
-            "B": B.tolist(),
-            "C": C.tolist(),
-            "D": D.tolist(),
-        }
-        if self.ellipses is not None:
-            centre = self.ellipses.centre
-            document["ellipses"] = {
-                "level": float(self.ellipses.level),
-                "method": self.ellipses.method,
-                "omega_rad_s": self.ellipses.omega_rad_s.tolist(),
-                "centre": np.column_stack([centre.real, centre.imag]).tolist(),
-                "covariance": self.ellipses.covariance.tolist(),
-            }
-        return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+        text = json.dumps(self._document(), default=_as_lists, indent=1, allow_nan=False, ensure_ascii=False)
+        return text + "\n"
 
     @classmethod
     def from_json(cls, text: str, source: str = "model file") -> ModelFile:
@@ -91,32 +79,8 @@ class ModelFile:
 
     def to_mat(self) -> bytes:
         """Content of a .mat file; every number is a double, vectors are columns, pairs and centre complex."""
-        model, (A, B, C, D) = self.model, self.model.state_space()
-        variables: dict[str, Any] = {
-            "format": FORMAT,
-            "format_version": float(FORMAT_VERSION),
-            "input_name": model.input_name,
-            "output_name": model.output_name,
-            "dt_s": float(model.dt_s),
-            "integrators": float(model.integrators),
-            "input_delay_samples": float(model.input_delay_samples),
-            "feedthrough": float(model.feedthrough),
-            "poles_real": model.poles.real,
-            "poles_pairs": model.poles.pairs,
-            "coefficients": model.coefficients,
-            "A": A,
-            "B": B,
-            "C": C,
-            "D": D,
-        }
-        if self.ellipses is not None:
-            variables["ellipses"] = {
-                "level": float(self.ellipses.level),
-                "method": self.ellipses.method,
-                "omega_rad_s": self.ellipses.omega_rad_s[:, None],
-                "centre": self.ellipses.centre[:, None],
-                "covariance": self.ellipses.covariance,
-            }
+        variables = self._document()
+        variables |= {name: float(value) for name, value in variables.items() if isinstance(value, int)}
         buffer: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
         scipy.io.savemat(buffer, variables, oned_as="column")
         return bytes(_MAT_HEADER + buffer.getvalue()[len(_MAT_HEADER) :])
@@ -134,6 +98,13 @@ class ModelFile:
         return _read(document, source)
 
 
+def _as_lists(array: Any) -> Any:
+    """An array in JSON; a complex one as rows [real part, imaginary part]."""
+    if np.iscomplexobj(array):
+        array = np.column_stack([array.real, array.imag])
+    return array.tolist()
+
+
 def _plain(value: Any) -> Any:
     """A MATLAB variable as it would stand in JSON: text, a number, or an array."""
     array = np.asarray(value)
@@ -144,23 +115,17 @@ def _plain(value: Any) -> Any:
 
 def _read(document: Mapping[str, Any], source: str) -> ModelFile:
     if document.get("format") != FORMAT:
-        raise ValueError(f"{source}: not a model file: 'format' is {_shown(document)}, expected '{FORMAT}'")
+        shown = repr(document["format"])[:60] if "format" in document else "missing"
+        raise ValueError(f"{source}: not a model file: 'format' is {shown}, expected '{FORMAT}'")
     version = document.get("format_version")
     if version != FORMAT_VERSION:
         raise ValueError(
             f"{source}: format_version is {version}; this version of flexlink reads {FORMAT_VERSION}"
         )
     try:
-        model = GobfModel(
-            poles=Poles(_vector(document, "poles_real"), _complex_vector(document, "poles_pairs")),
-            coefficients=_vector(document, "coefficients"),
-            dt_s=_number(document, "dt_s"),
-            feedthrough=_number(document, "feedthrough"),
-            integrators=_count(document, "integrators"),
-            input_delay_samples=_count(document, "input_delay_samples"),
-            input_name=_text(document, "input_name"),
-            output_name=_text(document, "output_name"),
-        )
+        fields = {name: read(document, name) for name, read in _MODEL.items()}
+        poles = Poles(fields.pop("poles_real"), fields.pop("poles_pairs"))
+        model = GobfModel(poles=poles, **fields)
         for name, computed in zip("ABCD", model.state_space(), strict=True):
             stated = np.asarray(_array(document, name), dtype=np.float64)
             scale = 1.0 + np.abs(computed).max(initial=0.0)
@@ -182,15 +147,9 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
 def _read_ellipses(document: Any, dt_s: float) -> FrequencyUncertainty:
     if not isinstance(document, Mapping):
         raise ValueError("'ellipses' must hold fields; expected the ones that were written")
-    omega = _vector(document, "omega_rad_s")
-    return FrequencyUncertainty(
-        omega_rad_s=omega,
-        centre=_complex_vector(document, "centre"),
-        covariance=np.asarray(_array(document, "covariance"), dtype=np.float64).reshape(omega.size, 2, 2),
-        dt_s=dt_s,
-        level=_number(document, "level"),
-        method=_text(document, "method"),
-    )
+    fields = {name: read(document, name) for name, read in _ELLIPSES.items()}
+    fields["covariance"] = np.asarray(fields["covariance"], dtype=np.float64).reshape(-1, 2, 2)
+    return FrequencyUncertainty(**fields, dt_s=dt_s)
 
 
 def _field(document: Mapping[str, Any], name: str) -> Any:
@@ -254,5 +213,21 @@ def _text(document: Mapping[str, Any], name: str) -> str:
     return value
 
 
-def _shown(document: Mapping[str, Any]) -> str:
-    return "missing" if "format" not in document else repr(document["format"])[:60]
+_MODEL = {
+    "poles_real": _vector,
+    "poles_pairs": _complex_vector,
+    "coefficients": _vector,
+    "dt_s": _number,
+    "feedthrough": _number,
+    "integrators": _count,
+    "input_delay_samples": _count,
+    "input_name": _text,
+    "output_name": _text,
+}
+_ELLIPSES = {
+    "omega_rad_s": _vector,
+    "centre": _complex_vector,
+    "covariance": _array,
+    "level": _number,
+    "method": _text,
+}

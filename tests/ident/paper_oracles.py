@@ -5,8 +5,8 @@ sqrt(1 - |xi|^2) (m1 z + m2)/D(z), D = z^2 - 2 Re(xi) z + |xi|^2, whose numerato
 m4) satisfy x_k^T M x_k = |1 - xi^2|^2 (14) and x1^T M x2 = 0 (15) with the M of (16). They all span the
 same space.
 
-The state space (22) to (26) of the paper, complex and with E inverted, stands below. The product needs neither
-(`ident.basis.functions.basis_state_space`; the condition number of E reaches 5e5): both are oracles.
+The state space (22) to (26) of the paper, complex and with E inverted, stands below; the product needs none
+of it (`ident.basis.functions.basis_state_space`; the condition number of E reaches 5e5): both are oracles.
 
 The all-pass factor that (13) writes out, (1 - conj(xi_{i-1}) z) on L_{i-1}, is the all-pass that drives the
 pair here.
