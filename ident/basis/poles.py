@@ -63,35 +63,6 @@ class Poles:
                 raise ValueError(f"a pair is given by its pole with positive imaginary part; got {pole:.6g}")
 
     @classmethod
-    def from_values(cls, values: Iterable[complex]) -> Poles:
-        """Sort a list of poles into real ones and pairs.
-
-        Raises
-        ------
-        ValueError
-            If a complex pole has no conjugate partner (to 1e-9), or a pole is outside the unit circle.
-        """
-        real: list[float] = []
-        upper: list[complex] = []
-        lower: list[complex] = []
-        for value in values:
-            pole = complex(value)
-            if pole.imag == 0:
-                real.append(pole.real)
-            elif pole.imag > 0:
-                upper.append(pole)
-            else:
-                lower.append(pole)
-        for pole in upper:
-            partner = min(lower, key=lambda other: abs(other - pole.conjugate()), default=None)
-            if partner is None or not abs(partner - pole.conjugate()) <= 1e-9:
-                raise ValueError(f"complex poles come in conjugate pairs; {pole:.6g} has no partner")
-            lower.remove(partner)
-        if lower:
-            raise ValueError(f"complex poles come in conjugate pairs; {lower[0]:.6g} has no partner")
-        return cls(np.array(real), np.array(upper, dtype=np.complex128))
-
-    @classmethod
     def from_continuous(
         cls,
         *,

@@ -21,32 +21,6 @@ from ident.data.record import Record
 from ident.uncertainty.embedding import EmbeddingOptions, common_fir_length, tangent
 
 
-def mean_record(records: Sequence[Record], name: str) -> Record:
-    """Average of records repeated with the same reference: the same linear system, less noise, fewer samples.
-
-    Raises ValueError when lengths, sampling times or channels differ.
-    """
-    if not records:
-        raise ValueError("need at least one record")
-    first = records[0]
-    for record in records[1:]:
-        channels = (record.input_names, record.output_names, record.reference_names)
-        if (
-            record.n_samples != first.n_samples
-            or record.dt_s != first.dt_s
-            or channels != (first.input_names, first.output_names, first.reference_names)
-        ):
-            raise ValueError(f"{record.label} and {first.label} differ in length, sampling time or channels")
-    references = [record.reference for record in records if record.reference is not None]
-    return replace(
-        first,
-        name=name,
-        input=np.mean([record.input for record in records], axis=0),
-        output=np.mean([record.output for record in records], axis=0),
-        reference=np.mean(references, axis=0) if references else None,
-    )
-
-
 def group_posteriors(
     groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[ResponsePosterior]:

@@ -9,7 +9,7 @@ left, everything conditioned on the data, averaged over one mode that the search
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,21 +18,19 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.basis.posterior import EmbeddingReport, ResponsePosterior
+from ident.basis.posterior import ResponsePosterior
 from ident.basis.structure import Structure
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding_algebra import (
-    KernelGrid,
     KernelPosterior,
     ReducedRegression,
-    conditional_posterior,
-    evaluate_grid,
+    averaged_posterior,
+    embedding_report,
     exponential_factor,
-    grid_weights,
     joint_factor,
-    kernel_spectrum,
+    kernel_grid,
     prior_posterior,
     reduce_regression,
     tc_factor,
@@ -181,15 +179,10 @@ def _embed(
         input_delay_samples=model.input_delay_samples,
         input_name=model.input_name,
         output_name=model.output_name,
-        report=EmbeddingReport(
-            method="classical embedding" if classical_recipe else "tangent embedding",
-            noise_std=float(np.sqrt(kernel.noise_variance)),
-            alpha=kernel.alpha,
-            lam=kernel.lam,
-            probability_no_remainder=kernel.probability_no_remainder,
-            log_evidence=kernel.log_evidence,
-            n_rows=reduced.n_rows,
-            n_regressors=reduced.n_regressors,
+        report=embedding_report(
+            "classical embedding" if classical_recipe else "tangent embedding",
+            reduced,
+            kernel,
             ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
             probability_missed_mode=missed.probability if missed else 0.0,
             missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
@@ -235,15 +228,9 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     """Posterior on these rows; modes that an order selection would have kept are added to their poles."""
     n_added = 0
     while True:
-        reduced, grid = _kernel_grid(rows, tc_factor)
-        weights, none = grid_weights(grid, options.prior_no_remainder)
-        if options.hyperparameters == "maximum":
-            # alpha = 0 is the lower end of the grid in the limit, so it wins only where the whole grid is
-            # worse.
-            none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
-            weights = np.zeros_like(weights)
-            weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
-        kernel = conditional_posterior(grid, weights, none)
+        reduced = reduce_regression(rows.blocks())
+        grid = kernel_grid(reduced, tc_factor)
+        kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
         candidates = candidate_pairs(max(record.n_samples for record in rows.records))
@@ -258,23 +245,8 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
 
 
 def _solve_classical(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
-    reduced, grid = _kernel_grid(rows, exponential_factor)
-    return _Solved(rows, reduced, prior_posterior(grid))
-
-
-def _kernel_grid(
-    rows: EmbeddingRows, factor: Callable[[float, int], RealArray]
-) -> tuple[ReducedRegression, KernelGrid]:
     reduced = reduce_regression(rows.blocks())
-    length = rows.fir_length
-    # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
-    decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
-    # From a remainder far below the noise to one a hundred thousand times its amplitude.
-    relative_alpha = np.geomspace(1e-2, 1e10, 49)
-    spectra = [
-        kernel_spectrum(reduced, lam, factor(lam, length)) for lam in np.exp(-1.0 / decay_samples).tolist()
-    ]
-    return reduced, evaluate_grid(reduced, spectra, relative_alpha)
+    return _Solved(rows, reduced, prior_posterior(kernel_grid(reduced, exponential_factor)))
 
 
 def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:

@@ -8,13 +8,15 @@ record length.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import lapack, qr, solve_triangular, svd
 
+from ident.basis.posterior import EmbeddingReport
 from ident.data.arrays import RealArray
 
 # Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
@@ -101,13 +103,6 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
     q, r, _ = qr(scaled, mode="economic", pivoting=True)
     rank = int(np.count_nonzero(np.abs(np.diag(r)) > _NUISANCE_RANK))
     return np.asarray(q[:, :rank])
-
-
-def without_nuisance(columns: RealArray, basis: RealArray) -> RealArray:
-    """Columns minus their projection on an orthonormal basis, twice, so that rounding is removed too."""
-    for _ in range(2):
-        columns = columns - basis @ (basis.T @ columns)
-    return np.asarray(columns, dtype=np.float64)
 
 
 def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
@@ -272,6 +267,19 @@ def evaluate_grid(
     )
 
 
+def kernel_grid(reduced: ReducedRegression, factor: Callable[[float, int], RealArray]) -> KernelGrid:
+    """`evaluate_grid` over twelve decays and 49 scales of a shape (`tc_factor`, `exponential_factor`)."""
+    length = reduced.fir_length
+    # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
+    decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
+    # From a remainder far below the noise to one a hundred thousand times its amplitude.
+    relative_alpha = np.geomspace(1e-2, 1e10, 49)
+    spectra = [
+        kernel_spectrum(reduced, lam, factor(lam, length)) for lam in np.exp(-1.0 / decay_samples).tolist()
+    ]
+    return evaluate_grid(reduced, spectra, relative_alpha)
+
+
 def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:
     """log of the likelihood averaged over the prior of `grid_weights`."""
     n = grid.log_likelihood.size
@@ -289,6 +297,19 @@ def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray
     weights, none = np.exp(log_grid - top), float(np.exp(log_none - top))
     total = float(weights.sum()) + none
     return weights / total, none / total
+
+
+def averaged_posterior(
+    grid: KernelGrid, prior_no_remainder: float, hyperparameters: Literal["average", "maximum"]
+) -> KernelPosterior:
+    """`conditional_posterior` with the weights of the data, or all weight on the likeliest pair."""
+    weights, none = grid_weights(grid, prior_no_remainder)
+    if hyperparameters == "maximum":
+        # alpha = 0 is the lower end of the grid in the limit, so it wins only where the whole grid is worse.
+        none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
+        weights = np.zeros_like(weights)
+        weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
+    return conditional_posterior(grid, weights, none)
 
 
 def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: float) -> KernelPosterior:
@@ -347,6 +368,23 @@ def prior_posterior(grid: KernelGrid) -> KernelPosterior:
         lam=spectrum.lam,
         probability_no_remainder=0.0,
         log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
+    )
+
+
+def embedding_report(
+    method: str, reduced: ReducedRegression, kernel: KernelPosterior, **more: Any
+) -> EmbeddingReport:
+    """What a reader can judge the posterior by; `more` are the fields that neither of the two knows."""
+    return EmbeddingReport(
+        method=method,
+        noise_std=float(np.sqrt(kernel.noise_variance)),
+        alpha=kernel.alpha,
+        lam=kernel.lam,
+        probability_no_remainder=kernel.probability_no_remainder,
+        log_evidence=kernel.log_evidence,
+        n_rows=reduced.n_rows,
+        n_regressors=reduced.n_regressors,
+        **more,
     )
 
 

@@ -16,7 +16,6 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import first_rows, whitened
 from ident.uncertainty.embedding_algebra import RegressionBlock
-from ident.uncertainty.undetected_mode import PairBlock
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +71,11 @@ class EmbeddingRows:
             used = slice(0 if np.any(rows.first) else n, None)
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel[used], rows.output[used])
 
-    def pair_blocks(self) -> Iterator[PairBlock]:
-        """Rows with the signal that drives one more pair after all the poles."""
+    def pair_blocks(self) -> Iterator[Rows]:
+        """Rows with the signal that drives one more pair after all the poles in place of the input."""
         for rows in self:
-            yield PairBlock(
-                nuisance=rows.nuisance,
-                regressors=rows.regressors,
-                output=rows.output,
-                signal=all_pass_signal(self.poles, rows.input),
-                head=all_pass_signal(self.poles, rows.head),
-                first=rows.first,
-            )
+            signal, head = (all_pass_signal(self.poles, part) for part in (rows.input, rows.head))
+            yield replace(rows, input=signal, head=head)
 
     def _rows(self, record: Record) -> Rows:
         """Matrices of one record, every column whitened.

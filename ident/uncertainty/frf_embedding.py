@@ -9,16 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from ident.basis.poles import Poles
-from ident.basis.posterior import EmbeddingReport, ResponsePosterior
+from ident.basis.posterior import ResponsePosterior
 from ident.fit.frf_regression import FrfRegression
 from ident.uncertainty.embedding import EmbeddingOptions
 from ident.uncertainty.embedding_algebra import (
     RegressionBlock,
-    conditional_posterior,
-    evaluate_grid,
-    grid_weights,
+    averaged_posterior,
+    embedding_report,
     joint_factor,
-    kernel_spectrum,
+    kernel_grid,
     reduce_regression,
     tc_factor,
 )
@@ -65,17 +64,8 @@ def embed_response(
             )
         ]
     )
-    decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
-    spectra = [
-        kernel_spectrum(reduced, lam, tc_factor(lam, length)) for lam in np.exp(-1 / decay_samples).tolist()
-    ]
-    grid = evaluate_grid(reduced, spectra, np.geomspace(1e-2, 1e10, 49))
-    weights, none = grid_weights(grid, options.prior_no_remainder)
-    if options.hyperparameters == "maximum":
-        none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
-        weights = np.zeros_like(weights)
-        weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
-    kernel = conditional_posterior(grid, weights, none)
+    grid = kernel_grid(reduced, tc_factor)
+    kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
     mean, factor = joint_factor(reduced, kernel)
     widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
     return ResponsePosterior(
@@ -87,16 +77,7 @@ def embed_response(
         has_feedthrough=data.feedthrough,
         integrators=integrators,
         input_delay_samples=input_delay_samples,
-        report=EmbeddingReport(
-            method="tangent embedding of a measured response",
-            noise_std=float(np.sqrt(kernel.noise_variance)),
-            alpha=kernel.alpha,
-            lam=kernel.lam,
-            probability_no_remainder=kernel.probability_no_remainder,
-            log_evidence=kernel.log_evidence,
-            n_rows=reduced.n_rows,
-            n_regressors=reduced.n_regressors,
-        ),
+        report=embedding_report("tangent embedding of a measured response", reduced, kernel),
     )
 
 

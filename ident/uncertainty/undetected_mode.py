@@ -33,6 +33,7 @@ from ident.uncertainty.embedding_algebra import (
     nuisance_basis,
     symmetric_factor,
 )
+from ident.uncertainty.embedding_rows import Rows
 
 # Damping ratios of lightly damped structures; a true one half way (in ratio) between two of them or at 0.005
 # loses less than a tenth of its energy.
@@ -59,22 +60,6 @@ _BLOCK = 512
 # Shares of a pair's columns (in energy) that are rounding, and that make it a hypothesis of its own.
 _ROUNDING = 1e-9
 _DISTINGUISHABLE = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class PairBlock:
-    """Rows of one record: nuisance (T,n), regressors F (T,p), output y (T,), all whitened.
-
-    signal (T,) is the whitened input after the all-pass of F's poles; the first n rows are those of the plain
-    signal, head (n,), times first (n,n), which is zero where the first rows are dropped.
-    """
-
-    nuisance: RealArray
-    regressors: RealArray
-    output: RealArray
-    signal: RealArray
-    head: RealArray
-    first: RealArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +140,12 @@ def candidate_pairs(n_samples: int) -> CandidatePairs:
 
 
 def pair_statistics(
-    blocks: Iterable[PairBlock], reduced: ReducedRegression, poles: ComplexArray
+    blocks: Iterable[Rows], reduced: ReducedRegression, poles: ComplexArray
 ) -> PairStatistics:
-    """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs."""
+    """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs.
+
+    blocks: `EmbeddingRows.pair_blocks`, the input sent through the all-pass of the regressors' poles.
+    """
     q = reduced.n_regressors
     gram = np.zeros((3, poles.size))
     inner, size = np.zeros((2 * poles.size, q + 1)), np.zeros(poles.size)
@@ -174,9 +162,9 @@ def pair_statistics(
         n = basis.shape[1]
         products = np.zeros((others.shape[1], 2 * poles.size))
         gram_here, states = np.zeros((3, poles.size)), np.zeros((2, poles.size))
-        for start in range(0, block.signal.size, _BLOCK):
+        for start in range(0, block.input.size, _BLOCK):
             part = slice(start, start + _BLOCK)
-            x1, x2 = _pair_rows(parameters, kernel_array(block.signal[part]), states)
+            x1, x2 = _pair_rows(parameters, kernel_array(block.input[part]), states)
             if start == 0 and block.head.size:
                 plain = _pair_rows(parameters, kernel_array(block.head), np.zeros((2, poles.size)))
                 x1[: block.head.size], x2[: block.head.size] = (block.first @ x for x in plain)
@@ -340,9 +328,7 @@ def _worth_keeping(poles: ComplexArray, probability: RealArray) -> npt.NDArray[n
     return np.sort(likeliest)
 
 
-def refined_pair(
-    blocks: Callable[[], Iterable[PairBlock]], reduced: ReducedRegression, pair: complex
-) -> complex:
+def refined_pair(blocks: Callable[[], Iterable[Rows]], reduced: ReducedRegression, pair: complex) -> complex:
     """The pair near this grid point that explains most: frequency and damping on grids that shrink around it.
 
     Six rounds of 5 x 5 end within a hundredth of a half bandwidth; the tangent columns cover the rest.

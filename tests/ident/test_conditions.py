@@ -11,7 +11,7 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.uncertainty.conditions import combine_posteriors, combine_responses, mean_record, record_posteriors
+from ident.uncertainty.conditions import combine_posteriors, combine_responses, record_posteriors
 from ident.uncertainty.embedding import EmbeddingOptions
 
 DT = 0.01
@@ -87,22 +87,6 @@ def test_records_of_different_gain_give_an_ellipse_of_that_gain_spread():
     unequal = record_posteriors([records[0], records[1].slice(0, 120)], model)
     assert unequal[0].fir_length == unequal[1].fir_length < 150
     assert combine_posteriors(posteriors).report.method == "tangent embedding, 4 conditions"
-
-
-def test_mean_record_averages_signals_and_noise():
-    rng = np.random.default_rng(3)
-    records = []
-    for _ in range(4):
-        u = rng.standard_normal((50, 1))
-        records.append(Record("a", u, 2 * u, DT, ("u",), ("y",), reference=u + 1, reference_names=("r",)))
-    mean = mean_record(records, "mean")
-    np.testing.assert_allclose(mean.output, 2 * mean.input, rtol=1e-12)
-    np.testing.assert_allclose(mean.reference, mean.input + 1, rtol=1e-12)
-    assert mean.name == "mean"
-    with pytest.raises(ValueError, match="differ in length"):
-        mean_record([records[0], records[1].slice(0, 40)], "m")
-    with pytest.raises(ValueError, match="at least one"):
-        mean_record([], "m")
 
 
 def test_what_cannot_be_combined_is_refused():
