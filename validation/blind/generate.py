@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from validation.blind.cases import SIMULATORS, BlindCase, Simulator, Sort, make_case, schedule
 from validation.blind.exudyn_truth import load_exudyn
@@ -79,23 +80,8 @@ def folder_hash(folder: Path) -> str:
 
 def answer_toml(answer: Mapping[str, Any]) -> str:
     """Text of an answer file as the labelled cases have it (the true rig goes into a file of its own)."""
-    lines = [
-        f"{key} = {_toml(answer[key])}"
-        for key in ("case", "verdict", "severity", "max_ratio", "sort", "nominal")
-    ]
-    for effect in answer["effects"]:
-        lines += ["", "[[effects]]", f'name = "{effect["name"]}"', "[effects.parameters]"]
-        lines += [f"{key} = {_toml(value)}" for key, value in effect["parameters"].items()]
-    for effect in answer["unlisted"]:
-        lines += ["", "[[unlisted]]", *(f"{key} = {_toml(value)}" for key, value in effect.items())]
-    lines += ["", "[pooled_gap]", *(f"{k} = {_toml(v)}" for k, v in answer["pooled_gap"].items())]
-    for name, sizes in answer["experiments"].items():
-        lines += ["", f"[experiments.{name}]", *(f"{k} = {_toml(v)}" for k, v in sizes.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    shown = {key: value for key, value in answer.items() if key not in ("true_rig", "sha256")}
+    return str(tomlkit.dumps(shown))
 
 
 def _one(seed: int, out: Path, open_cases: bool, simulator: Simulator, job: tuple[int, Plan]) -> Answer:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from validation.blind.truth import LISTED
+from workflow.report.rendering import environment
 from workflow.tasks.summary import Row, RunSummary, Section
 
 _SLICES = ("all", "exact", "uncertain")
@@ -34,66 +36,32 @@ def cell(numbers: Mapping[str, Any]) -> str:
 
 def text(document: Mapping[str, Any]) -> str:
     """The whole of scores.json as a page of plain text."""
-    settings = document["settings"]
-    only = settings.get("only")
-    found = document["diagnosis"]
-    lines = [
-        f"flexlink blind --cases {settings['cases']} --seed {settings['seed']} "
-        f"--simulator {settings['simulator']}" + (f" --only {only}" if only else ""),
-        f"commitment (salted SHA-256 of the labels, published before the diagnosis): "
-        f"{document['commitment']}",
-        "",
-        scores_text(found).rstrip("\n"),
-    ]
-    for name, scored in document["baselines"].items():
-        lines += ["", f"baseline: {name}", *_table(scored)]
-    lines += [f"  {case}: {reason}" for case, reason in document["failed"].items()]
-    return "\n".join(lines) + "\n"
+    return _by_template(document["diagnosis"], document)
 
 
 def scores_text(found: Mapping[str, Any]) -> str:
     """One set of scores: table, counts, calibration, and every case that is wrong."""
-    lines = [f"{found['n_cases']} cases; shares with 95 % Wilson intervals", "", *_table(found)]
-    lines += ["", "true cause -> answers (single effects, none, unknown)"]
-    lines += _counts(found["confusion"])
-    if found["unlisted"]:
-        lines += ["", "causes beyond the list -> answers", *_counts(found["unlisted"])]
-    if found["several"]:
-        lines += ["", "several effects", *(f"  {word}: {n}" for word, n in sorted(found["several"].items()))]
-    lines += ["", "probability of the first answer -> how often it was right"]
-    lines += [
-        f"  {b['low']:.1f}-{b['high']:.1f}: {b['count']} cases, said {b['probability']:.2f}, "
-        f"right {b['share']:.2f}"
-        for b in found["calibration"]
-        if b["count"]
-    ]
-    lines += ["", "cases whose verdict or set is wrong"]
-    lines += [
-        f"  {w['case']} ({w['nominal']}, ratio {w['max_ratio']:.3g}): true {w['true']}; said {w['said']} "
-        f"with p = {w['probability']:.2f}"
-        for w in found["wrong"]
-    ]
-    return "\n".join(lines) + "\n"
+    return _by_template(found, None)
 
 
-def _table(scored: Mapping[str, Any]) -> list[str]:
+def _by_template(found: Mapping[str, Any], document: Mapping[str, Any] | None) -> str:
+    template = environment("validation").get_template("blind_scores.txt.j2")
+    made = template.render(found=found, document=document, table=_table)
+    return Markup(made).unescape().strip("\n") + "\n"
+
+
+def _table(scored: Mapping[str, Any]) -> str:
+    """Rows of the accuracy table by slices, in columns."""
     rows = [("", *_SLICES)]
     for name in scored["table"]["all"]:
         cells = [cell(scored["table"][part][name]) for part in _SLICES]
         if any(c != "-" for c in cells):
             rows.append((name, *cells))
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return [
+    return "\n".join(
         "  ".join(value.ljust(width) for value, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
-    ]
-
-
-def _counts(table: Mapping[str, Mapping[str, int]]) -> list[str]:
-    return [
-        f"  {row}: " + ", ".join(f"{said} {n}" for said, n in sorted(columns.items(), key=lambda i: -i[1]))
-        for row, columns in sorted(table.items())
-    ]
+    )
 
 
 def summary(document: Mapping[str, Any], out: Path) -> RunSummary:

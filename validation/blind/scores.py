@@ -8,11 +8,13 @@ gap_after), answers are those of the gap cases (verdict, effects with parameters
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from validation.blind.sizes import FAMILY
 
@@ -24,7 +26,6 @@ CONFIDENT = 0.8
 _BINS = 10
 # Closure is a ratio of gaps: with less gap than this (in noise deviations) it says nothing.
 _LEAST_GAP = 0.02
-_Z = 1.959963984540054
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,11 @@ class Pair:
         return frozenset(self.said.get("combination") or (self.first,))
 
     @property
+    def answer(self) -> str:
+        """All that was accepted, or the verdict."""
+        return " + ".join(sorted(self.accepted)) or self.verdict
+
+    @property
     def probability(self) -> float:
         """Of the first answer; a document that gives none for it is taken to be sure."""
         listed = {str(e["name"]): e.get("probability") for e in self.said.get("effects", ())}
@@ -106,10 +112,8 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share, after Wilson (1927); (0, 1) without cases."""
     if count == 0:
         return 0.0, 1.0
-    share, z2 = hits / count, _Z**2
-    centre = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = _Z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    found = binomtest(hits, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def scores(predictions: Sequence[Document], answers: Sequence[Document]) -> dict[str, Any]:
@@ -142,15 +146,17 @@ def scores(predictions: Sequence[Document], answers: Sequence[Document]) -> dict
     return {
         "n_cases": len(pairs),
         "table": {name: _rows(part) for name, part in slices.items()},
-        "confusion": _confusion(pairs),
-        "unlisted": _unlisted(pairs),
-        "several": _several(pairs),
+        "confusion": _counted(
+            (p.names[0] if p.kind == "single" else p.kind, p.first) for p in pairs if p.kind != "several"
+        ),
+        "unlisted": _counted((_cause(p), p.answer) for p in pairs if p.kind == "unknown"),
+        "several": dict(Counter(_set_found(p) for p in pairs if p.kind == "several")),
         "calibration": _calibration(pairs),
         "wrong": [
             {
                 "case": p.true["case"],
                 "true": " + ".join(p.names) or _cause(p),
-                "said": " + ".join(sorted(p.accepted)) or p.verdict,
+                "said": p.answer,
                 "probability": p.probability,
                 "max_ratio": p.ratio,
                 "nominal": p.nominal,
@@ -169,7 +175,7 @@ def _rows(pairs: Sequence[Pair]) -> dict[str, Any]:
     listed = single + several
     unlisted = [p for p in pairs if p.kind == "unknown"]
     nothing = [p for p in pairs if p.kind == "none"]
-    rows: dict[str, Any] = {
+    return {
         "top-1, ratio >= 3": _share([_top(p, 1) for p in clear]),
         "top-2, ratio >= 3": _share([_top(p, 2) for p in clear]),
         "family, ratio >= 3": _share([_family(p) for p in clear]),
@@ -195,31 +201,19 @@ def _rows(pairs: Sequence[Pair]) -> dict[str, Any]:
         "expected calibration error": {"value": _calibration_error(pairs), "count": len(pairs)},
         "CPU per case [s]": _spread([float(p.said["cpu_s"]) for p in pairs if "cpu_s" in p.said]),
     }
-    return rows
 
 
 def _share(hits: Sequence[bool]) -> dict[str, Any]:
     count, right = len(hits), sum(map(bool, hits))
-    low, high = wilson(right, count)
-    return {
-        "share": right / count if count else math.nan,
-        "hits": right,
-        "count": count,
-        "interval": [low, high],
-    }
+    share = right / count if count else math.nan
+    return {"share": share, "hits": right, "count": count, "interval": list(wilson(right, count))}
 
 
 def _spread(values: Sequence[float]) -> dict[str, Any]:
     if not values:
         return {"median": math.nan, "p10": math.nan, "p90": math.nan, "mean": math.nan, "count": 0}
     low, middle, high = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
-    return {
-        "median": middle,
-        "p10": low,
-        "p90": high,
-        "mean": float(np.mean(values)),
-        "count": len(values),
-    }
+    return {"median": middle, "p10": low, "p90": high, "mean": float(np.mean(values)), "count": len(values)}
 
 
 def _mean(values: Sequence[float]) -> dict[str, Any]:
@@ -291,35 +285,26 @@ def _calibration(pairs: Sequence[Pair]) -> list[dict[str, Any]]:
     bins = []
     for k in range(_BINS):
         inside = [p for p in pairs if min(int(p.probability * _BINS), _BINS - 1) == k]
-        right = [p.first_is_right for p in inside]
-        bins.append(
-            {
-                "low": k / _BINS,
-                "high": (k + 1) / _BINS,
-                "count": len(inside),
-                "probability": float(np.mean([p.probability for p in inside])) if inside else math.nan,
-                **{key: value for key, value in _share(right).items() if key in ("share", "interval")},
-            }
-        )
+        right = _share([p.first_is_right for p in inside])
+        said = _mean([p.probability for p in inside])["value"]
+        bins.append({"low": k / _BINS, "high": (k + 1) / _BINS, "probability": said, **right})
     return bins
 
 
 def _calibration_error(pairs: Sequence[Pair]) -> float:
-    if not pairs:
-        return math.nan
     filled = [b for b in _calibration(pairs) if b["count"]]
-    return float(sum(b["count"] * abs(b["share"] - b["probability"]) for b in filled) / len(pairs))
+    return (
+        float(sum(b["count"] * abs(b["share"] - b["probability"]) for b in filled) / len(pairs))
+        if pairs
+        else math.nan
+    )
 
 
-def _confusion(pairs: Sequence[Pair]) -> dict[str, dict[str, int]]:
-    """True cause -> answer -> number of cases; cases with several effects are counted in `several`."""
+def _counted(cells: Iterable[tuple[str, str]]) -> dict[str, dict[str, int]]:
+    """Row -> column -> how often."""
     table: dict[str, dict[str, int]] = {}
-    for pair in pairs:
-        if pair.kind == "several":
-            continue
-        row = pair.names[0] if pair.kind == "single" else pair.kind
-        columns = table.setdefault(row, {})
-        columns[pair.first] = columns.get(pair.first, 0) + 1
+    for (row, column), n in Counter(cells).items():
+        table.setdefault(row, {})[column] = n
     return table
 
 
@@ -328,29 +313,13 @@ def _cause(pair: Pair) -> str:
     return ", ".join(str(e["name"]) for e in hidden) or pair.kind
 
 
-def _unlisted(pairs: Sequence[Pair]) -> dict[str, dict[str, int]]:
-    table: dict[str, dict[str, int]] = {}
-    for pair in pairs:
-        if pair.kind == "unknown":
-            columns = table.setdefault(_cause(pair), {})
-            answer = " + ".join(sorted(pair.accepted)) or pair.verdict
-            columns[answer] = columns.get(answer, 0) + 1
-    return table
-
-
-def _several(pairs: Sequence[Pair]) -> dict[str, int]:
-    table: dict[str, int] = {}
-    for pair in pairs:
-        if pair.kind != "several":
-            continue
-        common = len(pair.accepted & set(pair.names))
-        if pair.verdict != "effect":
-            word = pair.verdict
-        elif pair.all_right:
-            word = "exact set"
-        elif common == len(pair.names):
-            word = "all of them and more"
-        else:
-            word = "some of them" if common else "none of them"
-        table[word] = table.get(word, 0) + 1
-    return table
+def _set_found(pair: Pair) -> str:
+    """How much of several effects was named."""
+    if pair.verdict != "effect":
+        return pair.verdict
+    if pair.all_right:
+        return "exact set"
+    common = len(pair.accepted & set(pair.names))
+    if common == len(pair.names):
+        return "all of them and more"
+    return "some of them" if common else "none of them"
