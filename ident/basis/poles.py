@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -129,11 +128,3 @@ class Poles:
         """
         with np.errstate(divide="ignore"):
             return np.asarray(-np.log(np.abs(self.real)) / dt_s, dtype=np.float64)
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        return {"real": self.real, "pairs": self.pairs}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Poles:
-        return cls(arrays["real"], arrays["pairs"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import numpy as np
@@ -47,15 +47,6 @@ class EmbeddingReport:
     probability_missed_mode: float = 0.0
     missed_mode_rad_s: float = 0.0
     n_added_modes: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` is the inverse."""
-        return asdict(self) | {"ar_coefficients": list(self.ar_coefficients)}
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`."""
-        return cls(**(dict(document) | {"ar_coefficients": tuple(document["ar_coefficients"])}))
 
 
 @dataclass(frozen=True, eq=False)

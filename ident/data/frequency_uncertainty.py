@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -118,29 +117,6 @@ class FrequencyUncertainty:
         import control
 
         return control.FrequencyResponseData(self.centre, self.omega_rad_s, dt=self.dt_s)
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Plain arrays for `np.savez`; `from_arrays` gives back exactly this record."""
-        return {
-            "omega_rad_s": self.omega_rad_s,
-            "centre": self.centre,
-            "covariance": self.covariance,
-            "dt_s": np.array(self.dt_s),
-            "level": np.array(self.level),
-            "method": np.array(self.method),
-        }
-
-    @classmethod
-    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[Any]]) -> Self:
-        """Inverse of `to_arrays`."""
-        return cls(
-            omega_rad_s=mapping["omega_rad_s"],
-            centre=mapping["centre"],
-            covariance=mapping["covariance"],
-            dt_s=float(mapping["dt_s"]),
-            level=float(mapping["level"]),
-            method=str(mapping["method"]),
-        )
 
     @classmethod
     def from_csv(cls, path: str | Path, dt_s: float, *, level: float = 0.95) -> Self:

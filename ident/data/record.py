@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Self
@@ -150,37 +150,6 @@ class Record:
             input=self.input[part],
             output=self.output[part],
             reference=None if self.reference is None else self.reference[part],
-        )
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        arrays: dict[str, np.ndarray[Any, Any]] = {
-            "name": np.array(self.name),
-            "source": np.array(self.source),
-            "input": self.input,
-            "output": self.output,
-            "dt_s": np.array(self.dt_s),
-        }
-        if self.reference is not None:
-            arrays["reference"] = self.reference
-        for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
-            arrays[key] = np.array(getattr(self, key), dtype=np.str_)
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Record:
-        names = {
-            key: tuple(str(item) for item in arrays[key])
-            for key in ("input_names", "output_names", "reference_names", "input_units", "output_units")
-        }
-        return cls(
-            name=str(arrays["name"]),
-            source=str(arrays["source"]),
-            input=arrays["input"],
-            output=arrays["output"],
-            dt_s=float(arrays["dt_s"]),
-            reference=arrays.get("reference"),
-            **names,
         )
 
     @classmethod

@@ -121,16 +121,11 @@ def test_to_control_and_round_trip(tmp_path):
     response = record.to_control()
     assert response.dt == DT
     np.testing.assert_array_equal(response.frdata[0, 0], record.centre)
-    np.savez(tmp_path / "a.npz", **record.to_arrays())
-    with np.load(tmp_path / "a.npz") as stored:
-        again = FrequencyUncertainty.from_arrays(stored)
     record.to_csv(tmp_path / "a.csv")
-    from_file = FrequencyUncertainty.from_csv(tmp_path / "a.csv", DT, level=0.9)
-    for other in (again, from_file):
-        for name in ("omega_rad_s", "centre", "covariance"):
-            np.testing.assert_array_equal(getattr(other, name), getattr(record, name))
-        assert (other.dt_s, other.level) == (DT, 0.9)
-    assert again.method == "test"
+    again = FrequencyUncertainty.from_csv(tmp_path / "a.csv", DT, level=0.9)
+    for name in ("omega_rad_s", "centre", "covariance"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(record, name))
+    assert (again.dt_s, again.level) == (DT, 0.9)
     with pytest.raises(ValueError, match="read-only"):
         record.covariance[0, 0, 0] = 1.0
 

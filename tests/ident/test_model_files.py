@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from ident import GobfModel, Poles
 from ident.basis.model_files import FORMAT, ModelFile
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from workflow.engine import codec
 
 numbers = st.floats(-1e6, 1e6)
 inside = st.floats(-0.99, 0.99)
@@ -52,13 +53,11 @@ def ellipses(dt_s=0.005):
 
 
 def assert_same_bits(one, other):
-    for name, value in one.to_arrays().items():
-        again = other.to_arrays()[name]
-        assert again.dtype == value.dtype or value.dtype.kind == "U"
-        if value.dtype.kind == "U":
-            assert again.tolist() == value.tolist()
-        else:
-            assert again.tobytes() == value.tobytes()
+    (document, arrays), (again, same) = codec.pack(one), codec.pack(other)
+    assert document == again
+    assert {name: array.tobytes() for name, array in arrays.items()} == {
+        name: array.tobytes() for name, array in same.items()
+    }
 
 
 @settings(max_examples=60, deadline=None)

@@ -37,12 +37,6 @@ def test_doubled_keeps_neighbours_together():
     np.testing.assert_array_equal(doubled.pairs, [0.9j, 0.9j])
 
 
-def test_round_trip_through_arrays_is_exact():
-    poles = Poles([0.5], [0.9 * np.exp(0.3j)])
-    again = Poles.from_arrays(poles.to_arrays())
-    np.testing.assert_array_equal(again.values, poles.values)
-
-
 @pytest.mark.parametrize(
     ("real", "pairs", "message"),
     [

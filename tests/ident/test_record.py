@@ -299,25 +299,6 @@ def test_siso_and_slice():
         record.slice(2, 2)
 
 
-def test_record_round_trip_through_arrays(tmp_path):
-    record = two_by_two()
-    np.savez(tmp_path / "r.npz", **record.to_arrays())
-    with np.load(tmp_path / "r.npz", allow_pickle=False) as stored:
-        again = Record.from_arrays(dict(stored))
-    for key in ("input", "output", "reference"):
-        np.testing.assert_array_equal(getattr(again, key), getattr(record, key))
-    for key in (
-        "name",
-        "dt_s",
-        "input_names",
-        "output_names",
-        "reference_names",
-        "input_units",
-        "output_units",
-    ):
-        assert getattr(again, key) == getattr(record, key)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
