@@ -6,14 +6,15 @@ from diagnosis.evidence.search import Search, search
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-from diagnosis.next_experiment.competing import rivals_of
-from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.competing import competing_hypotheses
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment
-from diagnosis.where.where_records import Where
+from diagnosis.where.findings import Where
 
 __all__ = [
     "Case",
+    "CompetingHypothesis",
     "Diagnosis",
     "EffectParameter",
     "Experiment",
@@ -27,12 +28,11 @@ __all__ = [
     "PlantExperiment",
     "Probabilities",
     "ResidualModel",
-    "Rival",
     "Search",
     "Where",
+    "competing_hypotheses",
     "diagnose",
     "pooled_rms",
     "probabilities",
-    "rivals_of",
     "search",
 ]

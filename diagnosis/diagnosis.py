@@ -18,23 +18,25 @@ from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.machine.rounding import Rounding, leads_over, rounding_effect
-from diagnosis.next_experiment.competing import rival_of_fit, rivals_of
-from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.competing import competing_hypotheses, competing_hypothesis
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
 Verdict = Literal["none", "effect", "unknown"]
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
+# Nominal parameters as stated, re-estimated within their tolerances, effects added.
+Model = Literal["stated", "refit", "repaired"]
 
 NOISE_FLOOR = 1.0
 # The evidence as it is; not calibrated on many cases of known answer.
 TEMPERATURE = 1.0
-# A stated value that has to be off by more tolerances than this is a finding of its own.
+# A stated value that has to be off by more tolerances than this is significant by itself.
 FAR_OFF = 3.0
-# Below this probability of the first answer, or with a rival above that one, the answer is called ambiguous.
-_SURE, _RIVAL = 0.8, 0.05
+# Below this probability of the first answer, or with another one above that, the answer is called ambiguous.
+_SURE, _POSSIBLE = 0.8, 0.05
 # At most so many explanations are told apart by the next experiment.
-_RIVALS = 3
+_MOST_COMPETING = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
 _AS_GOOD = 6.0
 _LAST_ITERATIONS = 30
@@ -102,7 +104,7 @@ class Diagnosis:
     unlisted : tuple of effects
         What explains the records where the answer is unknown and yet can be named: a cause beyond the list
         that looks like one of it, with whatever it acts beside.
-    rivals : tuple of Rival
+    competing : tuple of CompetingHypothesis
         Fitted explanations that contradict each other, most probable first, for `next_experiment`; only for a
         flexible link.
     """
@@ -130,7 +132,67 @@ class Diagnosis:
     simulations: int
     held_out_decided: bool = False
     unlisted: tuple[Any, ...] = ()
-    rivals: tuple[Rival, ...] = ()
+    competing: tuple[CompetingHypothesis, ...] = ()
+
+    @property
+    def probability(self) -> float:
+        """Of the answer: the main cause where it stands alone, the whole set where there are several."""
+        if self.verdict != "effect":
+            return self.probabilities[self.verdict]
+        if len(self.combination) == 1:
+            return self.probabilities[self.combination[0]]
+        return self.sets[tuple(sorted(self.combination))]
+
+    def presence(self, name: str) -> float:
+        """Probability that an effect is there at all; of "none" and "unknown" that they are the answer."""
+        return next(effect.presence for effect in self.effects if effect.name == name)
+
+    @property
+    def runner_up(self) -> str:
+        """The likeliest answer beside the accepted ones."""
+        others = [name for name in self.probabilities if name not in self.combination]
+        return max((self.presence(name), name) for name in others)[1]
+
+    @property
+    def residuals(self) -> dict[Model, dict[str, Real]]:
+        """Model -> experiment -> residuals (T, Y) over noise."""
+        return {
+            "stated": self.residuals_before,
+            "refit": self.residuals_refit,
+            "repaired": self.residuals_after,
+        }
+
+    @property
+    def models(self) -> tuple[Model, ...]:
+        """Models to compare: re-estimated where there are tolerances, repaired where effects were found."""
+        moved: tuple[Model, ...] = ("refit",) if self.deviations else ()
+        added: tuple[Model, ...] = ("repaired",) if self.combination else ()
+        return ("stated", *moved, *added)
+
+    @property
+    def gaps(self) -> dict[Model, float]:
+        """Held-out residual over noise of the models to compare."""
+        pooled: dict[Model, float] = {
+            "stated": self.gap_before,
+            "refit": self.gap_refit,
+            "repaired": self.gap_after,
+        }
+        return {model: pooled[model] for model in self.models}
+
+    @property
+    def gap_by_experiment(self) -> dict[str, dict[Model, float]]:
+        """Experiment -> model -> RMS of the residuals over noise, all sensors together."""
+        return {
+            e.name: {model: pooled_rms(self.residuals[model][e.name]) for model in self.models}
+            for e in self.case.experiments
+        }
+
+    @property
+    def worst_experiment(self) -> tuple[str, float]:
+        """Where most is left with the effects added: its name and RMS over noise."""
+        after = {name: pooled_rms(e) for name, e in self.residuals_after.items()}
+        name = max(after, key=after.__getitem__)
+        return name, after[name]
 
 
 def diagnose(
@@ -182,7 +244,7 @@ def diagnose(
     together = accepted.names if rounding is None else rounding.joined(accepted.names, leads=leads)
     gap_before, gap_refit, gap_after = (_held_out(case, r) for r in (before, refit, after))
     closed, interval = _closed(case, refit, after, rng, floor)
-    ambiguous_with = _rivals(weighed, hypotheses, accepted, together, answer)
+    ambiguous_with = _competing(weighed, hypotheses, accepted, together, answer)
     return Diagnosis(
         case=case,
         verdict=verdict,
@@ -207,7 +269,7 @@ def diagnose(
         simulations=found.simulations + model.simulations,
         held_out_decided=seen is not None,
         unlisted=likeliest.fit.effects if verdict == "unknown" and not likeliest.is_answer else (),
-        rivals=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),
+        competing=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),
     )
 
 
@@ -216,17 +278,19 @@ def _to_part(
     hypotheses: Sequence[Hypothesis],
     weighed: Probabilities,
     alike: Sequence[Hypothesis],
-) -> tuple[Rival, ...]:
-    """Rivals of the next experiment; what is unknown is one where it has a name, as the double of gravity."""
-    rivals = rivals_of(case, hypotheses, weighed.sets)
+) -> tuple[CompetingHypothesis, ...]:
+    """What the next experiment is to separate; what is unknown is one where it has a name (a look-alike)."""
+    competing = competing_hypotheses(case, hypotheses, weighed.sets)
     if not alike:
-        return rivals
+        return competing
     likeliest = max(alike, key=lambda h: h.unknown_weight)
     imitated = [LOOK_ALIKES[n].look_alike_of for n in likeliest.names if n in LOOK_ALIKES]
-    if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < _RIVAL:
-        return rivals
-    double = rival_of_fit(case, likeliest.fit, weighed.cause["unknown"])
-    return tuple(sorted((*rivals, double), key=lambda rival: -rival.probability))[:_RIVALS]
+    if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < _POSSIBLE:
+        return competing
+    double = competing_hypothesis(case, likeliest.fit, weighed.cause["unknown"])
+    return tuple(sorted((*competing, double), key=lambda hypothesis: -hypothesis.probability))[
+        :_MOST_COMPETING
+    ]
 
 
 def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
@@ -242,7 +306,7 @@ def _polished(model: ResidualModel, end: Fit) -> Fit:
     return last if last.cost <= end.cost else end
 
 
-def _detail(verdict: Verdict, weighed: Probabilities, rivals: Sequence[str], last: Fit) -> DetailVerdict:
+def _detail(verdict: Verdict, weighed: Probabilities, competing: Sequence[str], last: Fit) -> DetailVerdict:
     if not last.converged:
         return "not_converged"
     if verdict == "unknown":
@@ -251,11 +315,11 @@ def _detail(verdict: Verdict, weighed: Probabilities, rivals: Sequence[str], las
     if verdict == "none":
         return "parametric" if far else "none"
     shares = {**weighed.presence, **{name: weighed.cause[name] for name in ("none", "unknown")}}
-    likely = any(shares[name] >= _RIVAL for name in rivals)
+    likely = any(shares[name] >= _POSSIBLE for name in competing)
     return "ambiguous" if weighed.cause[weighed.answer] < _SURE or likely else "effect"
 
 
-def _rivals(
+def _competing(
     weighed: Probabilities,
     hypotheses: Sequence[Hypothesis],
     accepted: Hypothesis,
@@ -270,7 +334,7 @@ def _rivals(
     share = {name: p for name, p in weighed.presence.items() if name not in together}
     share |= {name: weighed.cause[name] for name in ("none", "unknown")}
     share.pop(answer, None)
-    likely = [name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _RIVAL]
+    likely = [name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _POSSIBLE]
     if accepted.names and answer != "unknown":
         for h in sorted(hypotheses, key=lambda h: h.fit.cost):
             if len(h.names) == len(accepted.names) and h.fit.cost <= accepted.fit.cost + _AS_GOOD:

@@ -108,16 +108,9 @@ def _run(run: LoopRun) -> Figure:
 
 @plot.register(Diagnosis)
 def _causes(found: Diagnosis) -> Figure:
-    from workflow.diagnose.words import effect_words
     from workflow.figures.gap_answer import draw_probabilities
 
-    ranked = sorted(found.probabilities.items(), key=lambda item: -item[1])
-    accepted = found.combination or (found.verdict,)
-    return draw_probabilities(
-        [effect_words(name) for name, _ in ranked],
-        [probability for _, probability in ranked],
-        [name in accepted for name, _ in ranked],
-    )
+    return draw_probabilities(found)
 
 
 def _loop(plant: UncertainPlant, controller: Controller, specification: Specification) -> Figure:

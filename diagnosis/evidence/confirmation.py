@@ -2,7 +2,7 @@
 
 They are predicted from values that were fitted without them. As long as they confirm the answer they decide
 nothing. Where they leave more over than noise, solver disagreement and uncertain values explain, or where a
-rival predicts them far better, every answer that was still possible is confronted with them.
+competing hypothesis predicts them far better, every answer that was still possible is confronted with them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from diagnosis.machine.machine_protocol import Real
 
 # Log odds for an unknown rest that held-out records may add before the answer counts as not confirmed.
 _CONFIRMED = 2.0
-# Log weight by which a rival may lead the answer once both have predicted the held-out records.
+# Log weight by which another one may lead the answer once both have predicted the held-out records.
 _CONTRADICTED = 2.0
 
 
@@ -54,7 +54,7 @@ def confronted(
 def _contradicted(
     model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis, first: _Prediction
 ) -> bool:
-    """Whether a rival of no more effects is well ahead of the accepted answer once both have predicted."""
+    """Whether another one with no more effects is well ahead of the accepted one once both have predicted."""
     ahead = accepted.log_weight + first.gain + _CONTRADICTED
     close: dict[tuple[frozenset[str], bool], Hypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):

@@ -1,4 +1,4 @@
-"""Surviving explanations of a diagnosis as rivals of the next experiment, with what their fits know."""
+"""Surviving explanations of a diagnosis as hypotheses for the next experiment, with what their fits know."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from diagnosis.fit.fit import Fit
 from diagnosis.fit.nominal import NominalParameters
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from plant.effects import Effect
 from plant.simulate import simulate
 
 # In tolerances: small against one, large against the wobble of friction.
 _DEVIATION_STEP = 0.02
-# A set less probable than this is only kept when there would be no rival at all without it.
+# A set less probable than this is only kept when there would be none at all without it.
 _SURVIVES = 0.01
 
 
@@ -31,13 +31,13 @@ class Weighed(Protocol):
     def log_weight(self) -> float: ...
 
 
-def rivals_of(
+def competing_hypotheses(
     case: Case, hypotheses: Sequence[Weighed], sets: Mapping[tuple[str, ...], float], at_most: int = 3
-) -> tuple[Rival, ...]:
+) -> tuple[CompetingHypothesis, ...]:
     """The most probable fitted sets of effects that contradict each other; two at least if there are two.
 
     A set that contains a more probable one, or lies within it, names the same cause and more or less beside
-    it: no rival.
+    it: they do not compete.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def rivals_of(
         passed over.
     """
     if not at_most >= 2:
-        raise ValueError(f"rivals come in pairs at least; got at_most = {at_most}")
+        raise ValueError(f"competing hypotheses come in pairs at least; got at_most = {at_most}")
     best: dict[tuple[str, ...], Weighed] = {}
     for hypothesis in hypotheses:
         key = tuple(sorted(hypothesis.fit.names))
@@ -59,14 +59,14 @@ def rivals_of(
     for key in sorted(best, key=lambda k: (sets.get(k, 0.0), best[k].log_weight), reverse=True):
         if len(kept) == at_most or (len(kept) >= 2 and sets.get(key, 0.0) < _SURVIVES):
             break
-        # No effect at all is a rival of everything, though it is contained in every set.
+        # No effect at all competes with everything, though it is contained in every set.
         if not any(key and other and (set(key) <= set(other) or set(other) <= set(key)) for other in kept):
             kept.append(key)
-    return tuple(rival_of_fit(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
+    return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
 
 
-def rival_of_fit(case: Case, fit: Fit, probability: float) -> Rival:
-    """A fit as a rival: its rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
+def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
+    """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
     nominal = NominalParameters(case.rig)
     noise = case.noise
 
@@ -95,4 +95,4 @@ def rival_of_fit(case: Case, fit: Fit, probability: float) -> Rival:
                 columns.append((outputs(fit.deviations, tuple(effects), voltage) - start) / step)
         return np.column_stack(columns) if columns else np.zeros((start.size, 0))
 
-    return Rival(probability, nominal.at(fit.deviations), fit.effects, directions, fit.hessian)
+    return CompetingHypothesis(probability, nominal.at(fit.deviations), fit.effects, directions, fit.hessian)

@@ -1,13 +1,13 @@
 """How far two explanations of a machine lie apart in the records of an experiment.
 
-Two rivals i and j predict outputs y_i, y_j for an input. Their difference in noise deviations, D, is what an
-experiment has to show, less what free parameters absorb: with derivatives J by them and the precision L of
+Two hypotheses i and j predict outputs y_i, y_j for an input. Their difference in noise deviations, D, is what
+an experiment has to show, less what free parameters absorb: with derivatives J by them and the precision L of
 what is known about them,
 
     d^2 = D' (I + J L^-1 J')^-1 D = D'D - D'J (J'J + L)^-1 J'D,
 
 the expected log Bayes factor is about d^2 / 2, and d reads as standard deviations between the two. Where fits
-to the records give the precision, J holds both rivals' parameters. Where they do not, one rival is taken as
+to the records give the precision, J holds both hypotheses' parameters. Where they do not, one is taken as
 true at its parameters and the other one refits its own (effect parameters known to a factor e, nominal ones
 to their tolerances), and d^2 is the mean of both ways round: with both free, any two effects could vanish
 together. To first order in the free parameters.
@@ -35,7 +35,7 @@ _LOG_PRECISION = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Rival:
+class CompetingHypothesis:
     """One explanation that is left.
 
     Attributes
@@ -46,7 +46,7 @@ class Rival:
     effects : tuple of Effect
     directions : callable, optional
         Voltage (T,) -> derivatives (2 T, P) of the outputs in noise deviations, hub before tip sample by
-        sample, by the rival's free parameters. Without it: difference quotients by the logarithms of the
+        sample, by the hypothesis' free parameters. Without it: difference quotients by the logarithms of the
         effects' parameters and by the tolerances of the rig (there without non-smooth effects, whose contacts
         say little about a small change of a parameter and cost most of the time).
     precision : (P, P), optional
@@ -65,26 +65,28 @@ class Rival:
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1 + 1e-9:  # a sum of shares may round above one
-            raise ValueError(f"a rival's probability lies between 0 and 1; got {self.probability}")
+            raise ValueError(f"a hypothesis' probability lies between 0 and 1; got {self.probability}")
         object.__setattr__(self, "effects", tuple(self.effects))
         if (self.directions is None) != (self.precision is None):
-            raise ValueError("a rival with directions needs their precision, and the other way round")
+            raise ValueError("a hypothesis with directions needs their precision, and the other way round")
         if not self.name:
             names = " with ".join(type(effect).id for effect in self.effects)
             object.__setattr__(self, "name", names or "no effect")
 
 
-def distances(rivals: Sequence[Rival], voltage: Real, whitened: Sequence[Real]) -> tuple[Real, list[Real]]:
+def distances(
+    competing: Sequence[CompetingHypothesis], voltage: Real, whitened: Sequence[Real]
+) -> tuple[Real, list[Real]]:
     """d of every pair in standard deviations, and what parameters leave of its difference (2 T,).
 
-    whitened: every rival's outputs (2 T,) in noise deviations for the voltage (T,), sample by sample.
+    whitened: every hypothesis' outputs (2 T,) in noise deviations for the voltage (T,), sample by sample.
     """
-    noise = noise_of(rivals[0].rig)
-    free = [_directions(r, voltage, y, noise) for r, y in zip(rivals, whitened, strict=True)]
+    noise = noise_of(competing[0].rig)
+    free = [_directions(r, voltage, y, noise) for r, y in zip(competing, whitened, strict=True)]
     found, remains = [], []
-    for i, j in combinations(range(len(rivals)), 2):
+    for i, j in combinations(range(len(competing)), 2):
         D = whitened[i] - whitened[j]
-        if rivals[i].precision is not None and rivals[j].precision is not None:
+        if competing[i].precision is not None and competing[j].precision is not None:
             J = np.hstack([free[i][0], free[j][0]])
             sides = [(J, block_diag(free[i][1], free[j][1]))]
         else:
@@ -109,29 +111,31 @@ def _left(D: Real, J: Real, L: Real) -> tuple[float, Real]:
     return max(float(D @ D - moment @ absorbed), 0.0), np.asarray(D - J @ absorbed)
 
 
-def _directions(rival: Rival, voltage: Real, whitened: Real, noise: Real) -> tuple[Real, Real]:
+def _directions(
+    hypothesis: CompetingHypothesis, voltage: Real, whitened: Real, noise: Real
+) -> tuple[Real, Real]:
     """Derivatives (2 T, P) by the free parameters and their precision (P, P)."""
-    if rival.directions is not None and rival.precision is not None:
-        J = np.asarray(rival.directions(voltage), dtype=np.float64)
-        L = np.asarray(rival.precision, dtype=np.float64)
+    if hypothesis.directions is not None and hypothesis.precision is not None:
+        J = np.asarray(hypothesis.directions(voltage), dtype=np.float64)
+        L = np.asarray(hypothesis.precision, dtype=np.float64)
         if J.shape != (whitened.size, L.shape[0]) or L.shape != (J.shape[1], J.shape[1]):
             raise ValueError(
-                f"rival {rival.name}: directions must be ({whitened.size}, P) and precision (P, P); "
+                f"hypothesis {hypothesis.name}: needs directions ({whitened.size}, P) and precision (P, P); "
                 f"got {J.shape} and {L.shape}"
             )
         return J, L
     columns, precision = [], []
-    for rig, effects, step in _effect_steps(rival):
+    for rig, effects, step in _effect_steps(hypothesis):
         output = simulate(rig, voltage, effects).output / noise
         columns.append((output.ravel() - whitened) / step)
         precision.append(_LOG_PRECISION)
-    if rival.rig.tolerances:
-        effects = tuple(e for e in rival.effects if type(e).dependence != "non-smooth")
+    if hypothesis.rig.tolerances:
+        effects = tuple(e for e in hypothesis.effects if type(e).dependence != "non-smooth")
         start = whitened
-        if len(effects) < len(rival.effects):
-            start = (simulate(rival.rig, voltage, effects).output / noise).ravel()
-        for key, tolerance in rival.rig.tolerances.items():
-            moved = rival.rig.scaled({key: 1.0 / (1.0 + tolerance * _TOLERANCE_STEP)})
+        if len(effects) < len(hypothesis.effects):
+            start = (simulate(hypothesis.rig, voltage, effects).output / noise).ravel()
+        for key, tolerance in hypothesis.rig.tolerances.items():
+            moved = hypothesis.rig.scaled({key: 1.0 / (1.0 + tolerance * _TOLERANCE_STEP)})
             output = simulate(moved, voltage, effects).output / noise
             columns.append((output.ravel() - start) / _TOLERANCE_STEP)
             precision.append(1.0)
@@ -140,16 +144,16 @@ def _directions(rival: Rival, voltage: Real, whitened: Real, noise: Real) -> tup
     return np.column_stack(columns), np.diag(precision)
 
 
-def _effect_steps(rival: Rival) -> list[tuple[Rig, tuple[Effect, ...], float]]:
-    """The rival with one effect parameter moved: rig, effects, step; one entry per parameter."""
+def _effect_steps(hypothesis: CompetingHypothesis) -> list[tuple[Rig, tuple[Effect, ...], float]]:
+    """The hypothesis with one effect parameter moved: rig, effects, step; one entry per parameter."""
     found = []
-    for k, effect in enumerate(rival.effects):
+    for k, effect in enumerate(hypothesis.effects):
         for name, value in effect.parameters().items():
             step = _STEP[type(effect).dependence]
             moved, step = _moved(effect, name, value, step)
             if moved is not None:
-                effects = (*rival.effects[:k], moved, *rival.effects[k + 1 :])
-                found.append((rival.rig, effects, step))
+                effects = (*hypothesis.effects[:k], moved, *hypothesis.effects[k + 1 :])
+                found.append((hypothesis.rig, effects, step))
     return found
 
 

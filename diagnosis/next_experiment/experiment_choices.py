@@ -76,11 +76,6 @@ class Excitation:
     def scaled(self, factor: float) -> Excitation:
         return replace(self, voltage_V=self.voltage_V * factor)
 
-    @property
-    def words(self) -> str:
-        parts = ", ".join(_words(name, value) for name, value in self.parameters.items())
-        return f"{self.kind} of {self.amplitude_V:.3g} V" + (f" ({parts})" if parts else "")
-
 
 def excitations(
     voltage_V: float, n_samples: int, dt_s: float, rng: np.random.Generator
@@ -114,17 +109,9 @@ def excitations(
     )
 
 
-# Kinds that are also tried at a third of what the limits allow: dry friction, play and dead zones weigh more
-# in small motions.
+# Kinds that are also tried at a third of what the limits allow: dry friction, backlash and dead zones weigh
+# more in small motions.
 ALSO_WEAK = ("random binary", "triangle")
-
-
-def _words(name: str, value: float | int | str) -> str:
-    """up_to_Hz 35.0 -> up to 35 Hz."""
-    what, _, unit = name.rpartition("_")
-    if not what or isinstance(value, str):
-        return f"{name.replace('_', ' ')} {value}"
-    return f"{what.replace('_', ' ')} {value:.3g} {unit}"
 
 
 def within(

@@ -1,16 +1,15 @@
-"""Which experiment to run next: the feasible one that tells the surviving rivals apart best."""
+"""Which experiment to run next: the feasible one that tells the competing hypotheses apart best."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.next_experiment.discrimination import Rival, distances, noise_of
+from diagnosis.next_experiment.discrimination import CompetingHypothesis, distances, noise_of
 from diagnosis.next_experiment.experiment_choices import (
     ALSO_WEAK,
     Excitation,
@@ -24,9 +23,9 @@ from plant.simulate import simulate
 
 # A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
 _SETTLED = 20.0
-# Below this nothing is said to separate two rivals.
+# Below this nothing is said to separate two hypotheses.
 _SEPARATES = 3.0
-# A runner-up with less than this share of the first rival's probability is beaten.
+# A runner-up with less than this share of the first hypothesis' probability is beaten.
 _DECIDED = 0.01
 # Enough amplitudes and phases that a handful of free parameters cannot absorb them.
 _TAILORED_LINES = 12
@@ -34,12 +33,15 @@ _TAILORED_LINES = 12
 
 @dataclass(frozen=True)
 class Separation:
-    """How far an experiment parts two rivals."""
+    """How far an experiment parts two hypotheses."""
 
-    rivals: tuple[str, str]
+    hypotheses: tuple[str, str]
     standard_deviations: float
     log_bayes_factor: float
-    sentence: str
+
+    @property
+    def separated(self) -> bool:
+        return self.standard_deviations >= _SEPARATES
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Considered:
     """
 
     kind: str
-    description: str
+    parameters: Mapping[str, float | int | str]
     amplitude_V: float
     feasible: bool
     at_most: float
@@ -67,14 +69,15 @@ class NextExperiment:
     kind, parameters, amplitude_V, duration_s, dt_s, voltage_V (T,)
         The excitation.
     separations : tuple of Separation
-        Every pair of rivals.
+        Every pair of hypotheses.
     expected_log_bayes_factor : float
         Over the pairs, weighted with the product of their probabilities.
     hub_angle_range_rad, deflection_range_m
-        Least and largest value any of the rivals predicts.
+        Least and largest value any of the hypotheses predicts.
     separates : bool
         Whether any pair comes apart by three standard deviations.
-    sentence : str
+    decided : bool
+        The records already decide for the first hypothesis; the experiment would only confirm it.
     considered : tuple of Considered
         Best first.
     """
@@ -90,39 +93,12 @@ class NextExperiment:
     hub_angle_range_rad: tuple[float, float]
     deflection_range_m: tuple[float, float]
     separates: bool
-    sentence: str
-    considered: tuple[Considered, ...] = field(default=())
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values; `json.dumps` takes it."""
-        return {
-            "kind": self.kind,
-            "parameters": dict(self.parameters),
-            "amplitude_V": self.amplitude_V,
-            "duration_s": self.duration_s,
-            "dt_s": self.dt_s,
-            "voltage_V": self.voltage_V.tolist(),
-            "separations": [
-                {
-                    "rivals": list(s.rivals),
-                    "standard_deviations": s.standard_deviations,
-                    "log_bayes_factor": s.log_bayes_factor,
-                    "sentence": s.sentence,
-                }
-                for s in self.separations
-            ],
-            "expected_log_bayes_factor": self.expected_log_bayes_factor,
-            "hub_angle_range_rad": list(self.hub_angle_range_rad),
-            "deflection_range_m": list(self.deflection_range_m),
-            "separates": self.separates,
-            "sentence": self.sentence,
-            "sentences": [self.sentence],
-            "considered": [vars(c) for c in self.considered],
-        }
+    decided: bool
+    considered: tuple[Considered, ...] = ()
 
 
 def next_experiment(
-    rivals: Sequence[Rival],
+    competing: Sequence[CompetingHypothesis],
     limits: Limits,
     *,
     n_samples: int = 1400,
@@ -133,7 +109,7 @@ def next_experiment(
 
     Parameters
     ----------
-    rivals
+    competing
         Two at least, all with the same sampling period and noise.
     choices
         Excitations to choose from, by default `excitations` of the voltage limit and n_samples.
@@ -143,24 +119,24 @@ def next_experiment(
     Raises
     ------
     ValueError
-        Fewer than two rivals, rivals that sample differently or are noise-free, no excitation that stays in
-        the limits.
+        Fewer than two hypotheses, hypotheses that sample differently or are noise-free, no excitation that
+        stays in the limits.
     """
-    rivals = tuple(rivals)
-    _check(rivals)
-    weights = _pair_weights(rivals)
-    dt = rivals[0].rig.sampling.dt_s
+    competing = tuple(competing)
+    _check(competing)
+    weights = _pair_weights(competing)
+    dt = competing[0].rig.sampling.dt_s
     if choices is None:
         rng = np.random.default_rng(0) if rng is None else rng
         choices = excitations(limits.voltage_V, n_samples, dt, rng)
-        own = [_Prospect.of(choice, limits, rivals) for choice in choices]
+        own = [_Prospect.of(choice, limits, competing) for choice in choices]
         weak = [p.excitation.scaled(1 / 3) for p in own if p is not None and p.excitation.kind in ALSO_WEAK]
         feasible = [p for p in own if p is not None]
-        tailored = _tailored(feasible, rivals, weights, limits, rng)
-        looked_at = own + [_Prospect.of(choice, limits, rivals) for choice in (*weak, *tailored)]
+        tailored = _tailored(feasible, competing, weights, limits, rng)
+        looked_at = own + [_Prospect.of(choice, limits, competing) for choice in (*weak, *tailored)]
         choices = (*choices, *weak, *tailored)
     else:
-        looked_at = [_Prospect.of(choice, limits, rivals) for choice in choices]
+        looked_at = [_Prospect.of(choice, limits, competing) for choice in choices]
     prospects = sorted((p for p in looked_at if p is not None), key=lambda p: p.bound, reverse=True)
     if not prospects:
         raise ValueError(
@@ -172,7 +148,7 @@ def next_experiment(
         # Absorbing parameters only lessen a difference: what cannot win without them need not be computed.
         if best is not None and prospect.bound[0] <= best[0][0]:
             break
-        distance, _ = prospect.distances(rivals)
+        distance, _ = prospect.distances(competing)
         score = _score(distance, weights)
         prospect.score = score[0]
         if best is None or score > best[0]:
@@ -182,23 +158,23 @@ def next_experiment(
     _, chosen, distance = best
     left_out = [c for c, p in zip(choices, looked_at, strict=True) if p is None]
     considered = [p.considered() for p in sorted(prospects, key=lambda p: -(p.score or 0.0))]
-    considered += [Considered(c.kind, c.words, c.amplitude_V, False, 0.0, None) for c in left_out]
-    return _result(chosen, rivals, distance, weights, dt, tuple(considered))
+    considered += [Considered(c.kind, c.parameters, c.amplitude_V, False, 0.0, None) for c in left_out]
+    return _result(chosen, competing, distance, weights, dt, tuple(considered))
 
 
-def _check(rivals: Sequence[Rival]) -> None:
-    if len(rivals) < 2:
-        raise ValueError(f"an experiment separates at least two rivals; got {len(rivals)}")
-    first = rivals[0].rig
-    for rival in rivals:
-        if rival.rig.sampling != first.sampling or rival.rig.sensors != first.sensors:
-            raise ValueError("all rivals need the same sampling period and sensor noise")
+def _check(competing: Sequence[CompetingHypothesis]) -> None:
+    if len(competing) < 2:
+        raise ValueError(f"an experiment separates at least two hypotheses; got {len(competing)}")
+    first = competing[0].rig
+    for hypothesis in competing:
+        if hypothesis.rig.sampling != first.sampling or hypothesis.rig.sensors != first.sensors:
+            raise ValueError("all hypotheses need the same sampling period and sensor noise")
     if not (first.sensors.hub_angle_noise_rad > 0 and first.sensors.tip_noise_m > 0):
-        raise ValueError("sensors need a noise level above zero to tell rivals apart by")
+        raise ValueError("sensors need a noise level above zero to tell hypotheses apart by")
 
 
-def _pair_weights(rivals: Sequence[Rival]) -> Real:
-    p = np.array([a.probability * b.probability for a, b in combinations(rivals, 2)])
+def _pair_weights(competing: Sequence[CompetingHypothesis]) -> Real:
+    p = np.array([a.probability * b.probability for a, b in combinations(competing, 2)])
     return p / p.sum() if p.sum() > 0 else np.full(p.size, 1 / p.size)
 
 
@@ -208,51 +184,57 @@ def _score(distance: Real, weights: Real) -> tuple[float, float]:
 
 
 class _Prospect:
-    """An excitation within the limits with every rival's prediction."""
+    """An excitation within the limits with every hypothesis' prediction."""
 
-    def __init__(self, excitation: Excitation, outputs: Sequence[Real], rivals: Sequence[Rival]) -> None:
+    def __init__(
+        self, excitation: Excitation, outputs: Sequence[Real], competing: Sequence[CompetingHypothesis]
+    ) -> None:
         self.excitation = excitation
-        noise = noise_of(rivals[0].rig)
+        noise = noise_of(competing[0].rig)
         self._whitened = [np.asarray(y / noise).ravel() for y in outputs]
         self.hub = tuple(_range([y[:, 0] for y in outputs]))
-        self.deflection = tuple(_range([_deflection(r.rig, y) for r, y in zip(rivals, outputs, strict=True)]))
+        self.deflection = tuple(
+            _range([_deflection(r.rig, y) for r, y in zip(competing, outputs, strict=True)])
+        )
         self.score: float | None = None
         plain = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
-        self.bound = _score(plain, _pair_weights(rivals))
+        self.bound = _score(plain, _pair_weights(competing))
 
     @classmethod
-    def of(cls, choice: Excitation, limits: Limits, rivals: Sequence[Rival]) -> _Prospect | None:
+    def of(
+        cls, choice: Excitation, limits: Limits, competing: Sequence[CompetingHypothesis]
+    ) -> _Prospect | None:
         outputs: list[Real] = []
 
         def respond(voltage: Real) -> tuple[float, float]:
-            outputs[:] = [simulate(r.rig, voltage, r.effects).output for r in rivals]
+            outputs[:] = [simulate(r.rig, voltage, r.effects).output for r in competing]
             angle = max(float(np.max(np.abs(y[:, 0]))) for y in outputs)
             bend = max(
-                float(np.max(np.abs(_deflection(r.rig, y)))) for r, y in zip(rivals, outputs, strict=True)
+                float(np.max(np.abs(_deflection(r.rig, y)))) for r, y in zip(competing, outputs, strict=True)
             )
             return angle, bend
 
         excitation = within(choice, limits, respond)
-        return None if excitation is None else cls(excitation, outputs, rivals)
+        return None if excitation is None else cls(excitation, outputs, competing)
 
-    def distances(self, rivals: Sequence[Rival]) -> tuple[Real, list[Real]]:
-        return distances(rivals, self.excitation.voltage_V, self._whitened)
+    def distances(self, competing: Sequence[CompetingHypothesis]) -> tuple[Real, list[Real]]:
+        return distances(competing, self.excitation.voltage_V, self._whitened)
 
     def considered(self) -> Considered:
         x = self.excitation
-        return Considered(x.kind, x.words, x.amplitude_V, True, self.bound[0], self.score)
+        return Considered(x.kind, x.parameters, x.amplitude_V, True, self.bound[0], self.score)
 
 
 def _tailored(
     prospects: Sequence[_Prospect],
-    rivals: Sequence[Rival],
+    competing: Sequence[CompetingHypothesis],
     weights: Real,
     limits: Limits,
     rng: np.random.Generator,
 ) -> list[Excitation]:
-    """Multisine and binary signal at the lines where the rivals differ most for the voltage spent there.
+    """Multisine and binary signal at the lines where the hypotheses differ most for the voltage spent there.
 
-    Read from the first multisine among the prospects, the wide one; exact for linear rivals with nothing to
+    Read from the first multisine among the prospects, the wide one; exact for linear machines with nothing to
     absorb, a good guess otherwise, and judged by simulation like every other choice.
     """
     wide = [p for p in prospects if p.excitation.kind == "multisine"]
@@ -260,7 +242,7 @@ def _tailored(
         return []
     voltage = wide[0].excitation.voltage_V
     period = voltage.size // 2
-    _, remains = wide[0].distances(rivals)
+    _, remains = wide[0].distances(competing)
     last = [rest.reshape(-1, 2)[period : 2 * period] for rest in remains]
     power = sum(
         w * np.sum(np.abs(np.fft.rfft(rest, axis=0)) ** 2, axis=1)
@@ -270,7 +252,7 @@ def _tailored(
     driven = np.flatnonzero(drive > 1e-6 * drive.max())
     gain = np.asarray(power)[driven] / drive[driven]
     lines = np.sort(driven[np.argsort(-gain, kind="stable")[:_TAILORED_LINES]])
-    return tailored_excitations(lines, voltage.size, rivals[0].rig.sampling.dt_s, limits.voltage_V, rng)
+    return tailored_excitations(lines, voltage.size, competing[0].rig.sampling.dt_s, limits.voltage_V, rng)
 
 
 def _deflection(rig: Rig, output: Real) -> Real:
@@ -283,62 +265,28 @@ def _range(signals: Sequence[Real]) -> tuple[float, float]:
 
 def _result(
     chosen: _Prospect,
-    rivals: Sequence[Rival],
+    competing: Sequence[CompetingHypothesis],
     distance: Real,
     weights: Real,
     dt: float,
     considered: tuple[Considered, ...],
 ) -> NextExperiment:
     x = chosen.excitation
-    pairs = []
-    for (a, b), d in zip(combinations([r.name for r in rivals], 2), distance, strict=True):
-        words = (
-            f"would separate {a} from {b} by {_number(d)} standard deviations"
-            if d >= _SEPARATES
-            else f"would not separate {a} from {b} ({_number(d)} standard deviations)"
-        )
-        pairs.append(Separation((a, b), float(d), float(d**2 / 2), words))
-    separates = bool(np.max(distance) >= _SEPARATES)
-    duration = x.voltage_V.size * dt
-    first, second = sorted(rivals, key=lambda r: -r.probability)[:2]
-    decided = (
-        f"The records already decide for {first.name}; an experiment would only confirm it. "
-        if second.probability < _DECIDED * first.probability
-        else ""
-    )
-    if separates:
-        told = "; it ".join(s.sentence for s in pairs)
-        sentence = (
-            f"{decided}Run next: {x.words}, {duration:.3g} s. It {told}. The hub stays within "
-            f"{chosen.hub[0]:.2g} to {chosen.hub[1]:.2g} rad, the deflection within "
-            f"{1e3 * chosen.deflection[0]:.2g} to {1e3 * chosen.deflection[1]:.2g} mm."
-        )
-    else:
-        names = _listed([r.name for r in rivals])
-        sentence = (
-            f"{decided}None of the {len(considered)} experiments looked at separates {names}: the best, "
-            f"{x.words}, parts them by {np.max(distance):.2g} standard deviations at most."
-        )
+    names = combinations([r.name for r in competing], 2)
+    pairs = [Separation(two, float(d), float(d**2 / 2)) for two, d in zip(names, distance, strict=True)]
+    first, second = sorted((r.probability for r in competing), reverse=True)[:2]
     return NextExperiment(
-        x.kind,
-        dict(x.parameters),
-        x.amplitude_V,
-        float(duration),
-        dt,
-        x.voltage_V,
-        tuple(pairs),
-        _score(distance, weights)[1],
-        (chosen.hub[0], chosen.hub[1]),
-        (chosen.deflection[0], chosen.deflection[1]),
-        separates,
-        sentence,
-        considered,
+        kind=x.kind,
+        parameters=dict(x.parameters),
+        amplitude_V=x.amplitude_V,
+        duration_s=float(x.voltage_V.size * dt),
+        dt_s=dt,
+        voltage_V=x.voltage_V,
+        separations=tuple(pairs),
+        expected_log_bayes_factor=_score(distance, weights)[1],
+        hub_angle_range_rad=(chosen.hub[0], chosen.hub[1]),
+        deflection_range_m=(chosen.deflection[0], chosen.deflection[1]),
+        separates=any(pair.separated for pair in pairs),
+        decided=second < _DECIDED * first,
+        considered=considered,
     )
-
-
-def _number(value: float) -> str:
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}"

@@ -18,8 +18,8 @@ from scipy.stats import f as fisher
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.where.findings import SENSORS, FrequencyResponseBand, LineGroup, PeriodicFinding
 from diagnosis.where.where_energy import band_edges_Hz
-from diagnosis.where.where_records import SENSORS, FrequencyResponseBand, LineGroup, PeriodicFinding
 
 ComplexArray = npt.NDArray[np.complex128]
 _SHORTEST = 32
@@ -120,7 +120,6 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
         tuple(unrepeated),
         (low, high),
         separable,
-        _sentence(bands, shown, separable),
     )
 
 
@@ -152,24 +151,3 @@ def _p_value(mean: ComplexArray, rest: Real, chosen: npt.NDArray[np.bool_], coun
     by_stated = float(chi2.sf(repeated, 2 * n))
     by_periods = float(fisher.sf((repeated / (2 * n)) / max(varying / freedom, 1e-300), 2 * n, freedom))
     return max(by_stated, by_periods)
-
-
-def _sentence(bands: list[FrequencyResponseBand], groups: list[LineGroup], separable: bool) -> str:
-    parts = []
-    shown = [b for b in bands if b.found]
-    if shown:
-        worst = max(shown, key=lambda b: b.distance)
-        parts.append(
-            f"The measured frequency response leaves the model's most between {worst.low_Hz:g} and "
-            f"{worst.high_Hz:g} Hz in the {worst.sensor.replace('_', ' ')} sensor: "
-            f"{100 * worst.relative_error:.2g} % off, {worst.distance:.2g} times the 95 % noise radius."
-        )
-    strays = [g for g in groups if g.found]
-    if strays:
-        worst_group = max(strays, key=lambda g: g.repeated_rms)
-        kind = worst_group.group.rpartition(" ")[2] + " distortion" if separable else "distortion"
-        parts.append(
-            f"The machine answers at lines that were not excited ({worst_group.repeated_rms:.2g} noise "
-            f"deviations, the same in every period): {kind}, so it is not linear."
-        )
-    return " ".join(parts)

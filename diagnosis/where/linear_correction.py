@@ -1,7 +1,7 @@
 """Does any linear correction of the model, from voltage to sensors, take the gap away?
 
 Fitted to the residuals of the estimation records and judged on the held-out ones. What inertia, stiffness,
-lag, delay or gain leave is linear in the voltage; friction, play, clipping, disturbances and drifts are not.
+lag, delay or gain leave is linear in the voltage; friction, backlash, clipping, disturbances, drifts are not.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.where_records import LinearCorrection
+from diagnosis.where.findings import LinearCorrection
 from ident.basis.functions import regressor
 from ident.basis.poles import Poles
 from plant.modal import linear_arm
@@ -49,7 +49,7 @@ def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrec
     share = taken / gap
     # e = gap + noise: the energy taken, 2 e.p - p.p, moves with the noise by 2 |p|.
     half = _Z95 * 2 * np.sqrt(moved) / gap
-    return LinearCorrection(share, (float(share - half), float(share + half)), _sentence(share))
+    return LinearCorrection(share, (float(share - half), float(share + half)))
 
 
 def _clear(residuals: Mapping[str, Real], names: list[str]) -> bool:
@@ -73,19 +73,3 @@ def _columns(poles: Poles, voltage: Real) -> Real:
     once = np.concatenate([[0.0], np.cumsum(voltage)[:-1]])
     twice = np.concatenate([[0.0], np.cumsum(once)[:-1]])
     return np.column_stack([regressor(poles, voltage), once, twice])
-
-
-def _sentence(share: float) -> str:
-    percent = f"{100 * min(share, 1.0):.0f} %"
-    if share >= 0.9:
-        return (
-            f"A linear correction fitted to the other records takes {percent} of the gap energy away on the "
-            f"held-out ones: the cause is linear, like another inertia, stiffness, gain, lag or delay."
-        )
-    if share < 0.5:
-        return (
-            f"No linear correction helps: fitted to the other records it takes "
-            f"{'nothing' if share <= 0 else 'only ' + percent} of the gap energy away on the held-out ones. "
-            f"The cause is not linear, or does not come from the input."
-        )
-    return ""

@@ -22,8 +22,8 @@ from scipy.stats import chi2
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.where.findings import EquivalentCurve
 from diagnosis.where.regimes import Motion
-from diagnosis.where.where_records import EquivalentCurve
 from plant.simulate import simulate
 
 _SHIFTS = 39
@@ -43,19 +43,6 @@ _ROUTES = (
     ("hub_angle", ("angle", "speed", "time"), "rad"),
     ("tip", ("position", "speed", "time"), "m"),
 )
-_WORDS = {
-    "speed": "the hub speed",
-    "angle": "the hub angle",
-    "command": "the voltage",
-    "deflection": "the deflection of the link",
-    "position": "the tip position",
-    "time": "the time since the start",
-}
-_PLACES = {
-    "hub_torque": "a torque on the hub",
-    "hub_angle": "an error of the hub angle sensor",
-    "tip": "an error of the tip sensor",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +107,8 @@ def missing_functions(
                 by_chance,
                 float(p_value),
                 bool(beyond),
-                "",
             )
-            found.append(_with_sentence(curve) if beyond else curve)
+            found.append(curve)
     return tuple(found)
 
 
@@ -210,23 +196,3 @@ def _solve(gram: Real, moment: Real) -> tuple[float, int, Real, Real]:
     values[used] = inverse @ (moment[used] / scale[used]) / scale[used]
     errors[used] = np.sqrt(np.diag(inverse)) / scale[used]
     return explained, int(np.count_nonzero(kept)), values, errors
-
-
-def _with_sentence(curve: EquivalentCurve) -> EquivalentCurve:
-    share = f"{100 * min(curve.share, 1.0):.0f} %"
-    chance = f"{100 * max(curve.share_by_chance, 0.0):.0f} %"
-    # Half the samples of a side lie below its first node beside zero: the curve is best known there.
-    nodes = list(enumerate(curve.centres))
-    if curve.axis == "time":
-        points = [0, len(nodes) - 1]
-    else:
-        below, above = [i for i, v in nodes if v < 0], [i for i, v in nodes if v > 0]
-        points = below[-1:] + above[:1]
-    shape = " and ".join(
-        f"{curve.values[i]:.2g} {curve.value_unit} at {curve.centres[i]:.2g} {curve.unit}" for i in points
-    )
-    sentence = (
-        f"{_PLACES[curve.route].capitalize()} that depends on {_WORDS[curve.axis]} alone would explain "
-        f"{share} of the gap energy ({chance} by chance): {shape}."
-    )
-    return EquivalentCurve(**{**vars(curve), "sentence": sentence})

@@ -3,7 +3,7 @@
 Regime variables are those of the model (measured output minus residual times noise), not of the measurement:
 they do not depend on the noise whose energy is sorted by them. The test is by circular shifts in time of the
 energy against the regime, inside every experiment: exact when there is only noise, and for a coloured gap it
-keeps the colour, so that a slow residual is no finding just because its samples agree with each other.
+keeps the colour, so that a slow residual is not significant just because its samples agree with each other.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.where_records import SENSORS, RegimeBin, RegimeFinding
+from diagnosis.where.findings import SENSORS, RegimeBin, RegimeFinding, RegimePeak
 
 Integer = npt.NDArray[np.int64]
 _SHIFTS = 4999
@@ -257,21 +257,15 @@ def _finding(axis: RegimeAxis, sensor: str, sums: Real, counts: Integer, level: 
             axis.titles, axis.edges, counts, mean[0], low, high, strict=True
         )
     )
-    sentence = _sentence(axis, sensor, mean[0], centre, spread, p_value) if found else ""
-    return RegimeFinding(axis.name, axis.unit, sensor, bins, p_value, found, sentence, contrast)
+    peak = _peak(axis, mean[0], centre, spread) if found else None
+    return RegimeFinding(axis.name, axis.unit, sensor, bins, p_value, found, peak, contrast)
 
 
-def _sentence(axis: RegimeAxis, sensor: str, mean: Real, centre: Real, spread: Real, p_value: float) -> str:
+def _peak(axis: RegimeAxis, mean: Real, centre: Real, spread: Real) -> RegimePeak | None:
     excess = (mean - centre) / np.where(spread > 0, spread, np.inf)
     top = int(np.argmax(excess)) if excess.max() >= -excess.min() else int(np.argmin(excess))
     # Ratios of rms beyond the noise, which is what a person sees in a plot.
     here, usual = (float(np.sqrt(max(v - 1.0, 0.0))) for v in (mean[top], centre[top]))
     if max(here, usual) < _LEAST_RATIO * min(here, usual):
-        return ""
-    where = axis.titles[top]
-    odds = f"chance {'below 0.001' if p_value < 1e-3 else f'{p_value:.2g}'}"
-    word = "larger" if excess[top] > 0 else "smaller"
-    return (
-        f"The gap of the {sensor.replace('_', ' ')} sensor is {word} {where}: {here:.2g} noise deviations "
-        f"against {usual:.2g} expected there ({odds})."
-    )
+        return None
+    return RegimePeak(axis.titles[top], here, usual)

@@ -7,20 +7,18 @@ made them: as given, with refitted parameters, or repaired.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.distortion import periodic_findings
+from diagnosis.where.findings import Where
 from diagnosis.where.linear_correction import linear_correction
 from diagnosis.where.missing_function import missing_functions
 from diagnosis.where.regimes import motions, regime_axes, regime_findings
 from diagnosis.where.where_common import common_findings
 from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
-from diagnosis.where.where_records import Where
-from diagnosis.where.where_sentences import headline, sentences
 from diagnosis.where.where_trends import amplitude_finding, drift_findings
 from plant.effects import EFFECTS
 
@@ -64,8 +62,7 @@ def where(
     moved = motions(case, residuals)
     e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
     squares = Energy(sum(float(np.sum(v**2)) for v in e.values()), sum(v.size for v in e.values()))
-    found = Where(
-        headline="",
+    return Where(
         gap=part_gap(squares, squares, level),
         sensors=sensor_gaps(e, level),
         experiments=experiment_gaps(e, level),
@@ -78,10 +75,8 @@ def where(
         amplitude=amplitude_finding(case, e, level, rng),
         linear=linear_correction(case, e),
         subsystem=subsystem_mass(probabilities) if probabilities else {},
-        sentences={},
         level=level,
     )
-    return replace(found, sentences=sentences(found), headline=headline(found))
 
 
 def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:

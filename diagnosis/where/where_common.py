@@ -15,13 +15,11 @@ from scipy.stats import chi2
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.where_records import SENSORS, CommonFinding
+from diagnosis.where.findings import SENSORS, CommonFinding
 
 _LEAST_EXPERIMENTS, _MOST_EXPERIMENTS = 4, 8
 _LARGEST_CORRELATION = 0.5
 _LEAST_SHARE = 0.5
-# A straight drift has 7 % of its energy around its fourth line.
-_LINE = 0.2
 
 
 def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> tuple[CommonFinding, ...]:
@@ -52,10 +50,9 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
             p_value < level / len(SENSORS) and share[0] >= _LEAST_SHARE and share[0] > max(chance, 0.0)
         )
         peak_Hz, peak_share = _peak(e[:, :, s].mean(axis=0), dt)
-        finding = CommonFinding(
-            sensor, n, float(share[0]), max(chance, 0.0), peak_Hz, peak_share, p_value, yes, ""
+        found.append(
+            CommonFinding(sensor, n, float(share[0]), max(chance, 0.0), peak_Hz, peak_share, p_value, yes)
         )
-        found.append(CommonFinding(**{**vars(finding), "sentence": _sentence(finding)}) if yes else finding)
     return tuple(found)
 
 
@@ -86,13 +83,3 @@ def _peak(mean: Real, dt_s: float) -> tuple[float, float]:
     power[1:] *= 2.0  # both signs of a frequency; an offset has one
     top = int(np.argmax(power[3:])) + 3
     return float(top / (mean.size * dt_s)), float(power[top - 1 : top + 2].sum() / power.sum())
-
-
-def _sentence(finding: CommonFinding) -> str:
-    share = f"{100 * min(finding.share, 1.0):.0f} %"
-    tone = f", with a line near {finding.peak_Hz:.3g} Hz" if finding.peak_share >= _LINE else ""
-    return (
-        f"{share} of the gap energy of the {finding.sensor.replace('_', ' ')} sensor is the same in "
-        f"{finding.experiments} experiments with different inputs{tone}: it comes with the clock, not from "
-        f"the input."
-    )

@@ -16,7 +16,7 @@ from scipy.fft import dct
 from scipy.stats import chi2, norm
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.where_records import SENSORS, BandGap, ExperimentGap, PartGap, SensorGap
+from diagnosis.where.findings import SENSORS, BandGap, ExperimentGap, PartGap, SensorGap
 
 _Z95 = float(norm.ppf(0.975))
 # Half a decade a band: edges 1, 3.2, 10, ... Hz, rounded for reading aloud.
@@ -130,17 +130,3 @@ def band_gaps(residuals: Mapping[str, Real], dt_s: float, level: float) -> tuple
         for sensor, row in zip(SENSORS, energies, strict=True)
         for b, energy in enumerate(row)
     )
-
-
-def evenness(bands: Sequence[BandGap]) -> tuple[float, int]:
-    """Chi-square of the bands' gap energies against one even over all frequencies, and its freedom.
-
-    Bands are those of one sensor; energy is taken from gap_rms and the bands' widths, so that a negative band
-    counts as empty.
-    """
-    width = np.array([b.high_Hz - b.low_Hz for b in bands])
-    mean = np.array([b.gap.gap_rms**2 for b in bands])
-    # half the interval of gap_rms^2 over 1.96 is its standard deviation where the lower end is not cut at 0
-    sd = np.array([(b.gap.interval[1] ** 2 - b.gap.gap_rms**2) / _Z95 for b in bands])
-    even = float(np.sum(width * mean) / np.sum(width))
-    return float(np.sum(((mean - even) / np.maximum(sd, 1e-12)) ** 2)), len(bands) - 1

@@ -9,15 +9,13 @@ from scipy.stats import t as student
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.where_records import SENSORS, AmplitudeFinding, DriftFinding, Interval
+from diagnosis.where.findings import SENSORS, AmplitudeFinding, DriftFinding, Growth, Interval
 
 _UNITS = ("rad/s", "m/s")
 _DRAWS = 2000
 _BLOCK_S = 0.5
 # Two inputs closer in size than this say nothing about growth.
 _LEAST_RATIO = 1.3
-# A drift that explains less of a gap is left out of the sentences.
-_LEAST_SHARE = 0.1
 
 
 def drift_findings(case: Case, residuals: Mapping[str, Real], level: float) -> tuple[DriftFinding, ...]:
@@ -44,28 +42,13 @@ def drift_findings(case: Case, residuals: Mapping[str, Real], level: float) -> t
         gap = sum(float(np.sum(e[:, s] ** 2)) - e.shape[0] for e in residuals.values())
         share = float(min(mean[s] ** 2 * squares / gap, 1.0)) if gap > 0 else 0.0
         if w.size < 3:
-            found.append(DriftFinding(sensor, unit, rate, share, None, 1.0, False, ""))
+            found.append(DriftFinding(sensor, unit, rate, share, None, 1.0, False))
             continue
         error = float(np.sqrt(w @ (b[:, s] - mean[s]) ** 2 / ((w.size - 1) * w.sum()))) * scale
         p_value = float(2 * student.sf(abs(rate) / error, w.size - 1)) if error > 0 else 1.0
         half = float(student.ppf(0.975, w.size - 1)) * error
         beyond = bool(p_value < level / len(SENSORS))
-        sentence = (
-            f"The {sensor.replace('_', ' ')} sensor drifts away from the model by {rate:.3g} {unit} "
-            f"(95 % interval {rate - half:.3g} to {rate + half:.3g}), alike in all {w.size} experiments."
-        )
-        found.append(
-            DriftFinding(
-                sensor,
-                unit,
-                rate,
-                share,
-                (rate - half, rate + half),
-                p_value,
-                beyond,
-                sentence if beyond and share >= _LEAST_SHARE else "",
-            )
-        )
+        found.append(DriftFinding(sensor, unit, rate, share, (rate - half, rate + half), p_value, beyond))
     return tuple(found)
 
 
@@ -117,20 +100,7 @@ def amplitude_finding(
     interval = tuple(float(v) for v in np.quantile(spread, (level / 2, 1 - level / 2)))
     growth = _growth((interval[0] - 0.25, interval[1] + 0.25))
     gap_ratio = float(np.sqrt(gaps[1] / gaps[0]))
-    words = {
-        "offset": "it hardly grows with the input, as that of dry friction, an offset or a disturbance",
-        "saturating": "it grows less than the input",
-        "linear": "it grows with the input, as in a linear machine with other parameters",
-        "faster": "it grows faster than the input, as that of saturation or a hardening spring",
-        "undecided": "",
-    }[growth]
     ninety_five = tuple(float(v) for v in np.quantile(spread, (0.025, 0.975)))
-    sentence = (
-        f"With {ratio:.2g} times the voltage ({_short(pair[0])} to {_short(pair[1])}) the gap is "
-        f"{gap_ratio:.2g} times as large; {words}."
-        if words
-        else ""
-    )
     return AmplitudeFinding(
         (pair[0].name, pair[1].name),
         ratio,
@@ -139,11 +109,10 @@ def amplitude_finding(
         (ninety_five[0], ninety_five[1]),
         growth,
         growth in ("offset", "saturating", "faster"),
-        sentence,
     )
 
 
-def _growth(interval: Interval) -> str:
+def _growth(interval: Interval) -> Growth:
     low, high = interval
     if high < 0.5:
         return "offset"
@@ -152,7 +121,3 @@ def _growth(interval: Interval) -> str:
     if low > 1.0:
         return "faster"
     return "linear" if high - low < 1.2 else "undecided"
-
-
-def _short(experiment: Experiment) -> str:
-    return experiment.name.rsplit("/", 1)[-1].removesuffix(".csv")

@@ -58,6 +58,7 @@ __all__ = [
     "TipPayload",
     "TorqueRipple",
     "ViscousFriction",
+    "in_words",
     "make_machine",
     "parse_effect",
     "parse_effects",
@@ -99,6 +100,13 @@ def without(effects: Sequence[Effect], kind: type[Effect] | str) -> tuple[Effect
             raise ValueError(f"unknown effect {kind!r}; known effects: {', '.join(EFFECTS)}")
         return tuple(effect for effect in effects if type(effect).id != kind)
     return tuple(effect for effect in effects if not isinstance(effect, kind))
+
+
+def in_words(name: str) -> str:
+    """An effect, "none" or "unknown" in a sentence; an effect of one's own by its id without underscores."""
+    kind = EFFECTS.get(name) or LOOK_ALIKES.get(name)
+    answers = {"none": "no effect at all", "unknown": "a cause outside the list"}
+    return kind.words if kind else answers.get(name, name.replace("_", " "))
 
 
 def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:

@@ -49,7 +49,10 @@ def test_what_the_records_cannot_tell_apart_is_gravity_or_unknown(tmp_path, caus
     assert found.detail_verdict == "ambiguous"
     assert "unknown" in found.ambiguous_with
     # An experiment that tells them apart can be asked for.
-    assert {effect.id for rival in found.rivals for effect in rival.effects} >= {"gravity", "ground_spring"}
+    assert {effect.id for hypothesis in found.competing for effect in hypothesis.effects} >= {
+        "gravity",
+        "ground_spring",
+    }
     # Prior odds are 0.006 to 0.5/23.
     assert found.probabilities["gravity"] == pytest.approx(0.78, abs=0.06)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,8 +10,8 @@ from scipy.optimize import minimize_scalar
 
 from diagnosis import ResidualModel
 from diagnosis.fit.fit import fit
-from diagnosis.next_experiment.competing import rival_of_fit, rivals_of
-from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.competing import competing_hypotheses, competing_hypothesis
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Excitation, Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
 from plant import prbs, simulate
@@ -30,43 +29,43 @@ NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
 TOLERANT = RIG.model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05, "motor.resistance_ohm": 0.03}})
 
 
-def _rivals(*effects, rig=RIG):
-    return tuple(Rival(1 / len(effects), rig, () if e is None else (e,)) for e in effects)
+def _competing(*effects, rig=RIG):
+    return tuple(CompetingHypothesis(1 / len(effects), rig, () if e is None else (e,)) for e in effects)
 
 
 def test_what_differs_only_at_high_voltage_gets_high_voltage():
     limits = Limits(voltage_V=3.0)
-    chosen = next_experiment(_rivals(None, ActuatorSaturation(limit_V=2.0)), limits)
+    chosen = next_experiment(_competing(None, ActuatorSaturation(limit_V=2.0)), limits)
     assert chosen.amplitude_V > 2.0
     assert chosen.separates
     assert chosen.separations[0].standard_deviations > 10
-    assert "would separate no effect from actuator_saturation by" in chosen.sentence
-    below = next_experiment(_rivals(None, ActuatorSaturation(limit_V=2.0)), Limits(voltage_V=1.9))
+    assert chosen.separations[0].hypotheses == ("no effect", "actuator_saturation")
+    below = next_experiment(_competing(None, ActuatorSaturation(limit_V=2.0)), Limits(voltage_V=1.9))
     assert not below.separates
     assert below.separations[0].standard_deviations == pytest.approx(0.0, abs=1e-6)
 
 
 def test_what_the_records_decided_is_said():
-    first = Rival(0.97, RIG, (TipPayload(mass_kg=0.01),))
-    second = Rival(0.001, RIG)
-    assert next_experiment((first, second), Limits(1.0)).sentence.startswith(
-        "The records already decide for tip_payload"
-    )
+    first = CompetingHypothesis(0.97, RIG, (TipPayload(mass_kg=0.01),))
+    second = CompetingHypothesis(0.001, RIG)
+    assert next_experiment((first, second), Limits(1.0)).decided
 
 
-def test_identical_rivals_are_not_separated():
+def test_identical_hypotheses_are_not_separated():
     effect = CoulombFriction(torque_Nm=0.01)
-    chosen = next_experiment(_rivals(effect, effect), Limits(1.0))
+    chosen = next_experiment(_competing(effect, effect), Limits(1.0))
     assert not chosen.separates
     assert chosen.separations[0].standard_deviations == 0.0
-    assert chosen.sentence.startswith("None of the 15 experiments looked at separates coulomb_friction and")
+    assert len(chosen.considered) == 15
 
 
 def test_what_free_parameters_absorb_does_not_count():
     """Two sizes of one effect are one explanation; so are a nominal parameter and an effect that moves it."""
-    sizes = _rivals(TipPayload(mass_kg=0.010), TipPayload(mass_kg=0.011))
+    sizes = _competing(TipPayload(mass_kg=0.010), TipPayload(mass_kg=0.011))
     fixed = tuple(
-        Rival(r.probability, r.rig, r.effects, lambda v: np.zeros((2 * v.size, 0)), np.zeros((0, 0)))
+        CompetingHypothesis(
+            r.probability, r.rig, r.effects, lambda v: np.zeros((2 * v.size, 0)), np.zeros((0, 0))
+        )
         for r in sizes
     )
     free, held = next_experiment(sizes, Limits(1.0)), next_experiment(fixed, Limits(1.0))
@@ -78,14 +77,14 @@ def test_what_free_parameters_absorb_does_not_count():
 def test_tolerances_only_take_separation_away():
     effects = (InputDelay(delay_s=0.006), ActuatorLag(time_constant_s=0.006))
     choice = [Excitation("prbs", {}, prbs(9, 4, 1.0, 700))]
-    exact = next_experiment(_rivals(*effects), Limits(1.0), choices=choice)
-    tolerant = next_experiment(_rivals(*effects, rig=TOLERANT), Limits(1.0), choices=choice)
+    exact = next_experiment(_competing(*effects), Limits(1.0), choices=choice)
+    tolerant = next_experiment(_competing(*effects, rig=TOLERANT), Limits(1.0), choices=choice)
     d, less = (n.separations[0].standard_deviations for n in (exact, tolerant))
     assert 0 < less <= d * (1 + 1e-6)
 
 
-def _gain(voltage, truth, rival, seed):
-    """Chi-square that the best-fitting rival leaves more than the best-fitting truth on one noisy record."""
+def _gain(voltage, truth, hypothesis, seed):
+    """Chi-square that the best-fitting hypothesis leaves more than the best-fitting truth on a record."""
     record = simulate(RIG, voltage, (truth,), rng=np.random.default_rng(seed)).output
 
     def least(make, size):
@@ -95,14 +94,14 @@ def _gain(voltage, truth, rival, seed):
 
         return minimize_scalar(cost, bounds=(np.log(size / 3), np.log(3 * size)), method="bounded").fun
 
-    return least(rival, 0.006) - least(lambda s: InputDelay(delay_s=s), 0.006)
+    return least(hypothesis, 0.006) - least(lambda s: InputDelay(delay_s=s), 0.006)
 
 
 def test_chosen_experiment_separates_delay_from_lag_better_than_a_record_when_fitted():
     truth = InputDelay(delay_s=0.006)
     record = inputs()["prbs_high"]
     chosen = next_experiment(
-        _rivals(truth, ActuatorLag(time_constant_s=0.006)),
+        _competing(truth, ActuatorLag(time_constant_s=0.006)),
         Limits(float(np.max(record))),
         n_samples=record.size,
     )
@@ -117,12 +116,12 @@ def test_chosen_experiment_separates_delay_from_lag_better_than_a_record_when_fi
     assert promised / 2 < new < 2 * promised
 
 
-def test_limits_hold_for_every_rival():
-    rivals = _rivals(None, CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.01))
+def test_limits_hold_for_every_hypothesis():
+    competing = _competing(None, CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.01))
     limits = Limits(2.0, hub_angle_rad=0.5, deflection_m=0.02)
-    chosen = next_experiment(rivals, limits)
+    chosen = next_experiment(competing, limits)
     reach = RIG.hub.radius_m + RIG.link.length_m
-    outputs = [simulate(RIG, chosen.voltage_V, r.effects).output for r in rivals]
+    outputs = [simulate(RIG, chosen.voltage_V, r.effects).output for r in competing]
     hub = np.concatenate([y[:, 0] for y in outputs])
     deflection = np.concatenate([y[:, 1] - reach * y[:, 0] for y in outputs])
     assert np.max(np.abs(chosen.voltage_V)) <= 2.0 * (1 + 1e-9)
@@ -131,26 +130,25 @@ def test_limits_hold_for_every_rival():
     assert chosen.hub_angle_range_rad == pytest.approx((hub.min(), hub.max()))
     assert chosen.deflection_range_m == pytest.approx((deflection.min(), deflection.max()))
     assert chosen.voltage_V.size * DT == pytest.approx(chosen.duration_s)
-    assert json.loads(json.dumps(chosen.to_dict()))["kind"] == chosen.kind
 
 
 def test_every_pair_is_spoken_of_and_the_best_is_first():
-    rivals = _rivals(CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), None)
-    chosen = next_experiment(rivals, Limits(1.0))
-    assert [s.rivals for s in chosen.separations] == [
+    competing = _competing(CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), None)
+    chosen = next_experiment(competing, Limits(1.0))
+    assert [s.hypotheses for s in chosen.separations] == [
         ("coulomb_friction", "viscous_friction"),
         ("coulomb_friction", "no effect"),
         ("viscous_friction", "no effect"),
     ]
     scores = [c.score for c in chosen.considered if c.score is not None]
-    assert chosen.considered[0].description.startswith(chosen.kind)
+    assert chosen.considered[0].kind == chosen.kind
     assert scores[0] == max(scores)
     # What was not computed could not have won.
     assert all(c.at_most <= scores[0] * (1 + 1e-9) for c in chosen.considered if c.score is None)
 
 
 def test_records_sharpen_the_separation():
-    """Fitted rivals have sizes that both fit the same records, and know them: they part no less."""
+    """Fitted competing have sizes that both fit the same records, and know them: they part no less."""
     delay = InputDelay(delay_s=0.006)
     rng = np.random.default_rng(3)
     residuals = white(rng)
@@ -164,19 +162,19 @@ def test_records_sharpen_the_separation():
         candidate = next(c for c in case.machine.candidates(case.experiments) if c.effect == name)
         start = np.array([candidate.axes[0].coordinate(0.006)])
         fits.append(fit(model, (candidate,), (start,), np.zeros(0)))
-    known = [rival_of_fit(case, f, 0.5) for f in fits]
-    vague = [Rival(0.5, r.rig, r.effects) for r in known]
+    known = [competing_hypothesis(case, f, 0.5) for f in fits]
+    vague = [CompetingHypothesis(0.5, r.rig, r.effects) for r in known]
     limits = Limits.of_records(case)
     choice = [Excitation("prbs", {}, prbs(9, 4, limits.voltage_V / 2, 700))]
     d, less = (
         next_experiment(r, limits, choices=choice).separations[0].standard_deviations for r in (known, vague)
     )
     assert d > less * (1 - 1e-6)
-    ordered = rivals_of(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], {})
+    ordered = competing_hypotheses(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], {})
     assert [r.name for r in ordered] == ["input_delay", "actuator_lag"]
 
 
-def test_sets_that_name_the_same_cause_are_no_rivals():
+def test_sets_that_name_the_same_cause_do_not_compete():
     residuals = white(np.random.default_rng(0))
     case = made(residuals)
     chosen = {
@@ -192,9 +190,9 @@ def test_sets_that_name_the_same_cause_are_no_rivals():
 
     sets = {("input_delay",): 0.6, ("actuator_lag", "input_delay"): 0.3, ("actuator_lag",): 0.05, (): 0.05}
     fits = [fitted("input_delay"), fitted("actuator_lag", "input_delay"), fitted("actuator_lag"), fitted()]
-    rivals = rivals_of(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], sets)
-    assert rivals[0].name == "input_delay"
-    assert {r.name for r in rivals[1:]} == {"actuator_lag", "no effect"}
+    competing = competing_hypotheses(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], sets)
+    assert competing[0].name == "input_delay"
+    assert {r.name for r in competing[1:]} == {"actuator_lag", "no effect"}
 
 
 def test_effort_is_bounded(monkeypatch):
@@ -207,11 +205,11 @@ def test_effort_is_bounded(monkeypatch):
 
     for module in ("next_experiment", "discrimination"):
         monkeypatch.setattr(f"diagnosis.next_experiment.{module}.simulate", counted)
-    rivals = _rivals(
+    competing = _competing(
         CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), None, rig=TOLERANT
     )
-    next_experiment(rivals, Limits(1.0, 0.3, 0.05))
-    # At most five scalings of 15, and 2 tolerances and one size for every rival.
+    next_experiment(competing, Limits(1.0, 0.3, 0.05))
+    # At most five scalings of 15, and 2 tolerances and one size for every hypothesis.
     assert len(calls) <= 15 * 3 * 5 + 16 * 3 * 3
 
 
@@ -229,7 +227,7 @@ def test_excitations_fit_their_voltage_and_length():
     for x in found:
         assert x.voltage_V.shape == (1001,)
         # A sampled chirp or triangle misses its peak by at most a little.
-        assert 1.9 < x.amplitude_V <= 2.0 * (1 + 1e-12), x.words
+        assert 1.9 < x.amplitude_V <= 2.0 * (1 + 1e-12), x.kind
 
 
 @pytest.mark.parametrize(
@@ -237,12 +235,15 @@ def test_excitations_fit_their_voltage_and_length():
     [
         (lambda: Limits(0.0), "limit voltage_V must be positive"),
         (lambda: Limits(1.0, np.nan), "limit hub_angle_rad must be positive"),
-        (lambda: next_experiment(_rivals(None), Limits(1.0)), "at least two rivals; got 1"),
-        (lambda: Rival(1.5, RIG), "lies between 0 and 1; got"),
-        (lambda: Rival(0.5, RIG, precision=np.eye(1)), "a rival with directions needs their precision"),
+        (lambda: next_experiment(_competing(None), Limits(1.0)), "at least two hypotheses; got 1"),
+        (lambda: CompetingHypothesis(1.5, RIG), "lies between 0 and 1; got"),
+        (
+            lambda: CompetingHypothesis(0.5, RIG, precision=np.eye(1)),
+            "a hypothesis with directions needs their precision",
+        ),
         (lambda: excitations(1.0, 50, DT, np.random.default_rng(0)), "at least 100 samples; got 50"),
         (
-            lambda: next_experiment(_rivals(None, CoulombFriction(torque_Nm=0.01)), Limits(1.0, 1e-9)),
+            lambda: next_experiment(_competing(None, CoulombFriction(torque_Nm=0.01)), Limits(1.0, 1e-9)),
             "no experiment stays within",
         ),
     ],

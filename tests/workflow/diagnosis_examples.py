@@ -13,7 +13,7 @@ import numpy as np
 from diagnosis.diagnosis import Diagnosis, NamedEffect
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
-from diagnosis.next_experiment.discrimination import Rival
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects import Effect
 from plant.presets import paper_link
@@ -143,9 +143,11 @@ class KnownAnswer(Engine):
             residuals_after=after,
             simulations=model.simulations,
             unlisted=self.unlisted,
-            rivals=self._rivals(case, effects, sure),
+            competing=self._competing(case, effects, sure),
         )
 
-    def _rivals(self, case: Case, effects: tuple[Effect, ...], sure: float) -> tuple[Rival, ...]:
+    def _competing(
+        self, case: Case, effects: tuple[Effect, ...], sure: float
+    ) -> tuple[CompetingHypothesis, ...]:
         other = parse_effects([{"name": "viscous_friction", "coefficient_Nms": 2e-3}])
-        return (Rival(sure, case.rig, effects), Rival(1 - sure, case.rig, other))
+        return (CompetingHypothesis(sure, case.rig, effects), CompetingHypothesis(1 - sure, case.rig, other))

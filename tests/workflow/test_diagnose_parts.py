@@ -7,10 +7,11 @@ import pytest
 
 from diagnosis.machine.case import Case, Experiment
 from plant import EFFECTS, parse_effects, simulate
+from plant.effects import in_words
 from tests.workflow.diagnosis_examples import small_rig
 from workflow.diagnose.controller_check import check_controller
 from workflow.diagnose.linear_machine import sampled_linear_machine
-from workflow.diagnose.words import effect_words, parameter_words, probability_words, unit_of
+from workflow.diagnose.words import parameter_words, probability_words, unit_of
 
 LINEAR = {
     "nothing": [],
@@ -83,7 +84,7 @@ def test_a_delay_costs_margin_that_only_the_repaired_design_predicts():
 
 def test_every_effect_has_words_and_every_parameter_its_unit():
     for name, effect in EFFECTS.items():
-        assert effect_words(name) != name.replace("_", " "), name
+        assert in_words(name) != name.replace("_", " "), name
         for parameter in effect.model_fields:
             assert unit_of(parameter) or parameter in ("ratio", "cycles_per_rev"), parameter
     assert unit_of("stiffness_Nm_rad") == "N m/rad"

@@ -58,9 +58,7 @@ def diagnose_folder(folder: Path, with_baselines: bool) -> dict[str, Any]:
 
     loaded = load_case(folder)
     found = diagnose(loaded.case)
-    document = document_of(loaded, found, where={}, next_experiment={}, controller={})
-    for key in ("where", "next_experiment", "controller"):  # not asked for here
-        document.pop(key, None)
+    document = document_of(loaded, found)
     document["cpu_s"] = time.process_time()
     if with_baselines:
         start = time.process_time()

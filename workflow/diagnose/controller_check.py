@@ -61,13 +61,17 @@ class Run:
     margin: float
     settles: bool
 
+    @property
+    def peak_command_V(self) -> float:
+        return float(np.max(np.abs(self.command_V)))
+
     def row(self) -> dict[str, Any]:
         return {
             "design": self.design,
             "machine": self.machine,
             "cost_s": self.cost_s,
             "modulus_margin": self.margin,
-            "peak_command_V": float(np.max(np.abs(self.command_V))),
+            "peak_command_V": self.peak_command_V,
             "settles": self.settles,
         }
 
@@ -95,7 +99,10 @@ class ControllerCheck:
             },
             "step_rad": float(self.reference_rad[-1]),
             "disturbance_V": self.disturbance_V,
-            "certified_on_own_model": {"as stated": self.certified[0], "repaired": self.certified[1]},
+            "certified_on_own_model": {
+                "nominal parameters": self.certified[0],
+                "repaired": self.certified[1],
+            },
             "runs": [run.row() for run in self.runs],
         }
 
@@ -109,7 +116,7 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
 
     Raises NoControllerError where a plant allows no controller of this kind.
     """
-    plants = (_plant("as stated", case.rig, ()), _plant("repaired", rig, effects))
+    plants = (_plant("nominal parameters", case.rig, ()), _plant("repaired", rig, effects))
     specification = _specification(case, plants[0])
     designs = [_designed(plant, specification) for plant in plants]
     certificates = [certify(k, [p.uncertain], specification) for k, p in zip(designs, plants, strict=True)]

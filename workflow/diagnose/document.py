@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from diagnosis.diagnosis import Diagnosis
+from diagnosis.where.findings import Where
 from workflow.diagnose.case_files import LoadedCase
-from workflow.diagnose.findings import answer_probability, presence_of
+from workflow.diagnose.controller_check import ControllerCheck
+from workflow.diagnose.following import Following
 from workflow.engine import storage
-
-Real = npt.NDArray[np.float64]
 
 FORMAT = "flexlink-diagnosis-1"
 LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
@@ -24,9 +24,11 @@ def document_of(
     loaded: LoadedCase,
     found: Diagnosis,
     *,
-    where: Mapping[str, Any],
-    next_experiment: Mapping[str, Any],
-    controller: Mapping[str, Any],
+    where: Where | None = None,
+    remains: Where | None = None,
+    coming: Following | None = None,
+    check: ControllerCheck | None = None,
+    no_check: str = "",
 ) -> dict[str, Any]:
     """The answer as plain values.
 
@@ -39,20 +41,10 @@ def document_of(
         "case": loaded.case.name,
         "verdict": found.verdict,
         "detail_verdict": found.detail_verdict,
-        "effects": [
-            {
-                "name": effect.name,
-                "probability": effect.probability,
-                "presence": effect.presence,
-                "parameters": dict(effect.parameters),
-                "intervals": {key: list(pair) for key, pair in effect.intervals.items()},
-                "gap_after": effect.gap_after,
-            }
-            for effect in found.effects
-        ],
+        "effects": [asdict(effect) for effect in found.effects],
         "combination": list(found.combination),
         "ambiguous_with": list(found.ambiguous_with),
-        "probability": answer_probability(found),
+        "probability": found.probability,
         "probabilities": dict(found.probabilities),
         "sets": [
             {"effects": list(names), "probability": p}
@@ -67,10 +59,8 @@ def document_of(
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "gap_closed": found.gap_closed,
         "gap_closed_interval": list(found.gap_closed_interval),
-        "gap_by_experiment": gaps_by_experiment(found),
-        "where": dict(where),
-        "next_experiment": dict(next_experiment),
-        "controller": dict(controller),
+        "gap_by_experiment": found.gap_by_experiment,
+        **_beside(where, remains, coming, check, no_check),
         "deviations": dict(found.deviations),
         "repair": {
             "values": {
@@ -79,28 +69,30 @@ def document_of(
             },
             "effects": [effect.to_dict() for effect in found.repair],
         },
-        "suspected": {name: presence_of(found, name) for name in loaded.suspected},
+        "suspected": {name: found.presence(name) for name in loaded.suspected},
         "rig_file": loaded.rig_file,
         "simulations": found.simulations,
     }
 
 
-def gaps_by_experiment(found: Diagnosis) -> dict[str, dict[str, float]]:
-    """RMS of the residuals over noise of every experiment, both sensors together, for the three models."""
-    models = residuals_by_model(found).items()
-    return {
-        name: {model: float(np.sqrt(np.mean(residuals[name] ** 2))) for model, residuals in models}
-        for name in found.residuals_before
-    }
-
-
-def residuals_by_model(found: Diagnosis) -> dict[str, dict[str, Real]]:
-    """Residuals (T, 2) over noise of every experiment: rig as stated, values moved, effects added."""
-    return {
-        "stated": found.residuals_before,
-        "refit": found.residuals_refit,
-        "repaired": found.residuals_after,
-    }
+def _beside(
+    where: Where | None,
+    remains: Where | None,
+    coming: Following | None,
+    check: ControllerCheck | None,
+    no_check: str,
+) -> dict[str, Any]:
+    """What was looked at besides the cause."""
+    document: dict[str, Any] = {}
+    for key, place in (("where", where), ("remains", remains)):
+        if place is not None:
+            document[key] = asdict(place)
+    if coming is not None:
+        proposal = {} if coming.proposal is None else asdict(coming.proposal)
+        document["next_experiment"] = {"advice": coming.advice, **proposal}
+    if check is not None or no_check:
+        document["controller"] = {"skipped": no_check} if check is None else check.document()
+    return document
 
 
 def json_text(document: Mapping[str, Any]) -> str:

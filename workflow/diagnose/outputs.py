@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +10,10 @@ from diagnosis.diagnosis import Diagnosis, diagnose
 from diagnosis.machine.case import Case
 from diagnosis.where.where import where
 from workflow.diagnose.case_files import LoadedCase
-from workflow.diagnose.content import CasePage
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.document import document_of, json_text
 from workflow.diagnose.following import following
-from workflow.diagnose.page import case_page
+from workflow.diagnose.page import CasePage, case_page
 from workflow.diagnose.repaired_rig import effects_text, rig_text
 from workflow.engine import storage
 from workflow.engine.errors import naming
@@ -57,12 +56,12 @@ def files_of(
         report(_WHERE, "next experiment")
         coming = following(found)
         report(_NEXT, "controller")
-        check, control = _control(case, found, options)
+        check, no_check = _control(case, found, options)
     rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
     effects = effects_text(case.name, found.repair) if found.repair else ""
     rig = rig_text(case.name, case.rig, found.rig, found.deviations, effects_name if effects else "")
     html = case_page(
-        CasePage(loaded, found, place, remains, coming, control, check, rig, effects),
+        CasePage(loaded, found, place, remains, coming, check, no_check, rig, effects),
         lambda f, m: report(_CONTROLLER + (1 - _CONTROLLER) * f, f"drawing {m}"),
     )
     files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
@@ -71,9 +70,8 @@ def files_of(
     if coming.proposal is not None and coming.proposal.separates:
         files[f"{case.name}.next.csv"] = coming.csv_text().encode()
     document = document_of(
-        loaded, found, where=place.to_dict(), next_experiment=coming.document(), controller=control
+        loaded, found, where=place, remains=remains, coming=coming, check=check, no_check=no_check
     )
-    document["remains"] = remains.to_dict()
     document["made_from"] = made_from(loaded, options, code_sha256)
     document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
     return {**files, f"{case.name}.json": json_text(document).encode()}
@@ -84,26 +82,15 @@ def made_from(loaded: LoadedCase, options: Options, code_sha256: str) -> dict[st
     return {"input_sha256": loaded.input_sha256, "code_sha256": code_sha256, "options": options.document()}
 
 
-def _control(
-    case: Case, found: Diagnosis, options: Options
-) -> tuple[ControllerCheck | None, Mapping[str, Any]]:
-    reason = ""
+def _control(case: Case, found: Diagnosis, options: Options) -> tuple[ControllerCheck | None, str]:
+    """The check, or why there is none: a reason of ours (the page's templates know it) or of the design."""
     if not options.controller:
-        reason = "Not looked at: --no-controller was given."
-    elif found.verdict == "none":
-        reason = (
-            "Nothing is missing in the model, so a controller designed on it meets the machine it was made "
-            "for, as far as these records can tell."
-        )
-    elif found.verdict == "unknown" or found.detail_verdict == "not_converged":
-        reason = (
-            "The repaired model does not explain the machine, so no closed loop can be predicted with it: a "
-            "controller designed on either model has to be tried with care."
-        )
-    if reason:
-        return None, {"skipped": reason}
+        return None, "not_asked"
+    if found.verdict == "none":
+        return None, "no_gap"
+    if found.verdict == "unknown" or found.detail_verdict == "not_converged":
+        return None, "not_explained"
     try:
-        check = check_controller(case, found.rig, found.repair)
+        return check_controller(case, found.rig, found.repair), ""
     except NoControllerError as error:
-        return None, {"skipped": f"No controller to compare: {error}."}
-    return check, check.document()
+        return None, str(error)

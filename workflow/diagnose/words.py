@@ -1,25 +1,13 @@
-"""Effects, parameters and shares in words a person can read aloud."""
+"""Formats of a diagnosis: effects, parameters, probabilities; the filters of its templates."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from plant.effects import EFFECTS, LOOK_ALIKES
-from workflow.report.formats import number
-
-_OTHERS: Mapping[str, str] = {"none": "no effect at all", "unknown": "a cause outside the list"}
-
-GROUPS: Mapping[str, str] = {
-    "actuator": "actuator",
-    "joint": "joint and hub",
-    "link": "link",
-    "sensor": "tip sensor",
-    "environment": "from outside",
-    "none": "nothing missing",
-    "unknown": "outside the list",
-}
+from plant.effects import in_words
+from workflow.report.formats import MISSING, fixed, interval, number, si
 
 # Longest ending first: "stiffness_Nm_rad" is no "rad".
 _UNITS: Mapping[str, str] = {
@@ -43,40 +31,38 @@ _UNITS: Mapping[str, str] = {
     "_s": "s",
     "_m": "m",
 }
-
-
-def effect_words(name: str) -> str:
-    """An effect, "none" or "unknown" in words; a user's own effect by its id without underscores."""
-    known = EFFECTS.get(name) or LOOK_ALIKES.get(name)
-    return known.words if known else _OTHERS.get(name, name.replace("_", " "))
+_SURE = {0.99: "practically certain", 0.9: "very likely", 0.66: "likely", 0.33: "possible", 0.0: "unlikely"}
 
 
 def unit_of(parameter: str) -> str:
     """Unit from the ending of a parameter's name; empty for pure numbers."""
-    name = parameter.rpartition(".")[2]
-    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
+    return _UNITS.get(_ending(parameter), "")
 
 
-def parameter_name(parameter: str) -> str:
-    """`stribeck_velocity_rad_s` as "stribeck velocity"."""
-    name = parameter.rpartition(".")[2]
-    ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
-    return name.removesuffix(ending).replace("_", " ")
+def _ending(parameter: str) -> str:
+    return next((ending for ending in _UNITS if parameter.endswith(ending)), "")
 
 
-def parameter_words(parameter: str, value: float, interval: Sequence[float] | None) -> str:
+def parameter_words(parameter: str, value: float, bounds: Sequence[float] | None = None) -> str:
     """Name, value, unit and 95 % interval."""
-    text = f"{parameter_name(parameter)} {number(value, 4)} {unit_of(parameter)}".rstrip()
-    if interval is None:
-        return text
-    return f"{text} (95 %: {number(interval[0], 4)} to {number(interval[1], 4)})"
+    name = parameter.removesuffix(_ending(parameter)).replace("_", " ")
+    text = f"{name} {si(value, unit_of(parameter), 4)}"
+    return text if bounds is None else f"{text} (95 %: {interval(bounds, 4)})"
 
 
 def key_words(key: str) -> str:
-    """A dotted key of the rig file: "hub.inertia_kg_m2" as "inertia of the hub"."""
+    """A dotted key of the rig file: "hub.inertia_kg_m2" as "inertia (hub)"."""
     section, _, name = key.partition(".")
-    what = parameter_name(name)
+    what = name.removesuffix(_ending(name)).replace("_", " ")
     return what if re.search(rf"\b{section}\b", what) else f"{what} ({section})"
+
+
+def setting_words(name: str, value: float | int | str) -> str:
+    """up_to_Hz 35.0 as "up to 35 Hz"."""
+    what, _, unit = name.rpartition("_")
+    if not what or isinstance(value, str):
+        return f"{name.replace('_', ' ')} {value}"
+    return f"{what.replace('_', ' ')} {si(value, unit)}"
 
 
 def probability_words(p: float) -> str:
@@ -86,24 +72,26 @@ def probability_words(p: float) -> str:
         return "over 99.9 %"
     if percent < 0.1:
         return "under 0.1 %"
-    return f"{percent:.3g} %" if percent < 99 else f"{percent:.1f} %"
+    return f"{number(percent) if percent < 99 else fixed(percent)} %"
 
 
 def times_noise(rms: float) -> str:
     """A residual over noise, fine enough to tell 1.003 from 1."""
-    if math.isnan(rms):
-        return "–"
-    return f"{rms:.3f}" if rms < 10 else f"{rms:.1f}"
+    return MISSING if math.isnan(rms) else fixed(rms, 3 if rms < 10 else 1)
 
 
 def sureness(p: float) -> str:
     """How sure that is, in a word."""
-    for limit, word in (
-        (0.99, "practically certain"),
-        (0.9, "very likely"),
-        (0.66, "likely"),
-        (0.33, "possible"),
-    ):
-        if p >= limit:
-            return word
-    return "unlikely"
+    return next(word for limit, word in _SURE.items() if p >= limit)
+
+
+FILTERS: Mapping[str, Callable[..., str]] = {
+    "effect": in_words,
+    "unit": unit_of,
+    "parameter": parameter_words,
+    "rig_key": key_words,
+    "setting_of": setting_words,
+    "probability": probability_words,
+    "times_noise": times_noise,
+    "sureness": sureness,
+}

@@ -22,6 +22,6 @@ def code_digest(*, drawing: bool = False) -> str:
             if drawing or not name.startswith(_ONLY_DRAWING):
                 digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     if drawing:
-        for path in sorted((root / "workflow" / "templates").glob("*")):
+        for path in sorted(p for p in (root / "workflow" / "templates").rglob("*") if p.is_file()):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

@@ -3,48 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from workflow.figures import gap_style, style
+from workflow.figures.registry import drawing
 
 
-@dataclass(frozen=True)
-class CaseGap:
-    """One case: pooled RMS over noise with the rig as stated and with the effects added, and what it is."""
+class CaseGap(Protocol):
+    """A case: RMS over noise with the nominal parameters and with the effects added, and its answer."""
 
-    name: str
-    answer: str
-    stated: float
-    repaired: float
-    floor: float
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def answer(self) -> str: ...
+
+    @property
+    def gap_before(self) -> float: ...
+
+    @property
+    def gap_after(self) -> float: ...
+
+    @property
+    def noise_floor(self) -> float: ...
 
 
+@drawing("gap_overview")
 def draw_case_gaps(cases: Sequence[CaseGap]) -> Figure:
-    """One line per case, from the gap with the rig as stated to the gap with the effects added."""
+    """One line per case, from the gap with the nominal parameters to the gap with the effects added."""
+    at = np.arange(len(cases))
+    ends = {"stated": [c.gap_before for c in cases], "repaired": [c.gap_after for c in cases]}
     with style.house_style():
         figure = style.new_figure(1.5 + 0.32 * len(cases))
         axes = figure.subplots()
-        at = np.arange(len(cases))
-        for y, case in zip(at, cases, strict=True):
-            axes.plot([case.stated, case.repaired], [y, y], color="#999999", lw=1.0, zorder=1)
-        for name, marker in (("stated", "s"), ("repaired", "o")):
-            axes.plot(
-                [getattr(case, name) for case in cases],
-                at,
-                ls="none",
-                marker=marker,
-                ms=7,
-                color=gap_style.MODELS[name]["color"],
-                label=gap_style.WORDS[name],
-            )
-        floor = float(np.median([case.floor for case in cases]))
-        axes.axvline(floor, **gap_style.FLOOR, label=gap_style.WORDS["floor"], zorder=0)
+        axes.plot(list(ends.values()), [at, at], color="#999999", lw=1.0, zorder=1)
+        for (name, values), marker in zip(ends.items(), "so", strict=True):
+            colour, label = gap_style.MODELS[name]["color"], gap_style.WORDS[name]
+            axes.plot(values, at, ls="none", marker=marker, ms=7, color=colour, label=label)
+        floor = float(np.median([c.noise_floor for c in cases]))
+        axes.axvline(floor, **gap_style.FLOOR, zorder=0)
         axes.set_xscale("log")
-        axes.set_xlim(0.8 * floor, 1.3 * max(2 * floor, *(case.stated for case in cases)))
-        labels = [f"{style.plain(case.name, 34)}: {style.plain(case.answer, 44)}" for case in cases]
+        axes.set_xlim(0.8 * floor, 1.3 * max(2 * floor, *ends["stated"]))
+        labels = [f"{style.plain(c.name, 34)}: {style.plain(c.answer, 44)}" for c in cases]
         axes.set_yticks(at, labels)
         axes.set_ylim(len(cases) - 0.5, -0.5)
         axes.set_xlabel("held-out residual over noise, RMS [1]")

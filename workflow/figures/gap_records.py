@@ -2,56 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
+from diagnosis.diagnosis import Diagnosis
+from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import outline
+from workflow.figures.registry import drawing
 
 Real = npt.NDArray[np.float64]
 
 _SEGMENT = 512
 _TRACE_BINS = 250  # a panel is some 400 pixels wide
+_MODES = 3
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualRecord:
-    """One experiment: model ("stated", "refit", "repaired") -> residuals over noise (T, 2)."""
-
-    name: str
-    held_out: bool
-    residuals: Mapping[str, Real]
-
-
-def draw_residual_traces(records: Sequence[ResidualRecord], dt_s: float) -> Figure:
+@drawing("gap_traces")
+def draw_residual_traces(found: Diagnosis) -> Figure:
     """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise."""
+    case, models = found.case, dict.fromkeys(("stated", found.models[-1]))
     with style.house_style():
-        figure = style.new_figure(0.9 + 1.25 * len(records))
-        grid = figure.subplots(len(records), 2, sharex="row", squeeze=False)
-        for row, record in zip(grid, records, strict=True):
-            time = np.arange(len(record.residuals["stated"]), dtype=np.float64) * dt_s
+        figure = style.new_figure(0.9 + 1.25 * len(case.experiments))
+        grid = figure.subplots(len(case.experiments), 2, sharex="row", squeeze=False)
+        for row, experiment in zip(grid, case.experiments, strict=True):
+            residuals = {model: found.residuals[model][experiment.name] for model in models}
+            time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
+            role = " (held out)" if experiment.role == "held_out" else ""
             for column, axes in enumerate(row):
                 axes.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
-                for name, signal in record.residuals.items():
-                    look = {**gap_style.MODELS[name], "lw": 0.7, "ls": "-"}
-                    axes.plot(
-                        *outline(time, signal[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[name]
-                    )
-                largest = max(float(np.max(np.abs(e[:, column]))) for e in record.residuals.values())
+                for model, e in residuals.items():
+                    look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
+                    axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])
+                largest = max(float(np.max(np.abs(e[:, column]))) for e in residuals.values())
                 reach = max(4.0, 1.05 * largest)
                 axes.set_ylim(-reach, reach)
                 axes.margins(x=0.01)
-                role = " (held out)" if record.held_out else ""
-                axes.set_title(
-                    f"{style.plain(record.name, 30)}{role}: {gap_style.SENSOR_WORDS[column]}",
-                    fontsize=9,
-                    fontweight="normal",
-                )
+                title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.SENSOR_WORDS[column]}"
+                axes.set_title(title, fontsize=9, fontweight="normal")
             row[0].set_ylabel("residual\nover noise [1]", fontsize=8.5)
         for axes in grid[-1]:
             axes.set_xlabel("time [s]")
@@ -59,23 +51,24 @@ def draw_residual_traces(records: Sequence[ResidualRecord], dt_s: float) -> Figu
     return figure
 
 
-def draw_residual_spectra(
-    by_model: Mapping[str, Sequence[Real]], modes_Hz: Sequence[float], dt_s: float
-) -> Figure:
+@drawing("gap_spectra")
+def draw_residual_spectra(found: Diagnosis) -> Figure:
     """Spectra of the residuals over noise, all experiments together; white noise of the stated size is 1.
 
-    by_model: "stated", "refit", "repaired" -> residuals (T, 2) of every experiment. modes_Hz: flexible modes
-    of the rig as stated; the lowest three are marked.
+    The lowest flexible modes of the nominal rig are marked.
     """
+    dt_s = found.case.rig.sampling.dt_s
+    poles = linear_arm(found.case.rig).poles_rad_s()
+    modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
     with style.house_style():
         figure = style.new_figure(3.7)
         panels = figure.subplots(1, 2, sharey=True)
         for column, axes in enumerate(panels):
-            for name, residuals in by_model.items():
-                frequency, power = _spectrum([r[:, column] for r in residuals], dt_s)
-                axes.loglog(frequency, power, **gap_style.MODELS[name], label=gap_style.WORDS[name])
-            axes.axhline(1.0, **gap_style.FLOOR, label=gap_style.WORDS["floor"])
-            for number, mode in enumerate(modes_Hz[:3], 1):
+            for model in found.models:
+                frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)
+                axes.loglog(frequency, power, **gap_style.MODELS[model], label=gap_style.WORDS[model])
+            axes.axhline(1.0, **gap_style.FLOOR)
+            for number, mode in enumerate(modes_Hz[:_MODES], 1):
                 if mode < 0.5 / dt_s:
                     axes.axvline(mode, color="#999999", lw=0.8, ls=":")
                     style.tag_below(axes, mode, f"mode {number}")

@@ -1,4 +1,4 @@
-"""Colours of the gap pages: one per model, the same in every picture."""
+"""Colours and words of the gap pages: one per model, the same in every picture."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 from workflow.figures import style
 
 # The three models a gap is measured against, in the order of the waterfall, each with a line style.
-STATED: dict[str, Any] = {"color": "#CC79A7", "ls": (0, (3, 1.5)), "lw": 1.2}
-REFIT: dict[str, Any] = {"color": "#8C6D31", "ls": (0, (5, 1.5, 1, 1.5)), "lw": 1.3}
-REPAIRED: dict[str, Any] = {"color": style.MODEL, "ls": "-", "lw": 1.3}
-FLOOR: dict[str, Any] = {"color": style.REFERENCE, "ls": (0, (1, 1.5)), "lw": 1.1}
-
-WORDS: Mapping[str, str] = {
-    "stated": "rig as stated",
-    "refit": "values moved within tolerances",
-    "repaired": "effects added",
-    "floor": "sensor noise",
+MODELS: Mapping[str, Mapping[str, Any]] = {
+    "stated": {"color": "#CC79A7", "ls": (0, (3, 1.5)), "lw": 1.2},
+    "refit": {"color": "#8C6D31", "ls": (0, (5, 1.5, 1, 1.5)), "lw": 1.3},
+    "repaired": {"color": style.MODEL, "ls": "-", "lw": 1.3},
 }
-MODELS: Mapping[str, Mapping[str, Any]] = {"stated": STATED, "refit": REFIT, "repaired": REPAIRED}
+FLOOR: dict[str, Any] = {"color": style.REFERENCE, "ls": (0, (1, 1.5)), "lw": 1.1, "label": "sensor noise"}
+WORDS: Mapping[str, str] = {
+    "stated": "nominal parameters",
+    "refit": "nominal parameters, re-estimated",
+    "repaired": "effects added",
+}
 SENSOR_WORDS = ("hub angle", "tip position")
+SENSOR_COLOURS = (style.UNCERTAIN, style.HIGHLIGHT)
 # Of a share or probability bar that is not the first answer.
 PALE = "#b9c2cc"

@@ -3,87 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from diagnosis.where.where_records import (
-    BandGap,
-    EquivalentCurve,
-    ExperimentGap,
-    PartGap,
-    RegimeBin,
-    RegimeFinding,
-)
+from diagnosis.where.findings import SENSORS, RegimeBin, Where
 from workflow.figures import gap_style, style
+from workflow.figures.registry import drawing
 
-SENSOR_COLOURS = {"hub_angle": style.UNCERTAIN, "tip": style.HIGHLIGHT}
-_SENSOR_NAMES = {"hub_angle": "hub angle", "tip": "tip position"}
-_COLUMNS = 3
+_LOOKS = dict(zip(SENSORS, zip(gap_style.SENSOR_WORDS, gap_style.SENSOR_COLOURS, strict=True), strict=True))
+_COLUMNS, _MOST_REGIMES = 3, 6
 _FEW_BINS = 2
 _SMALLEST = 0.05  # noise deviations; less is drawn there
-
-
-def draw_bands_and_experiments(bands: Sequence[BandGap], experiments: Sequence[ExperimentGap]) -> Figure:
-    """Size of the gap, noise taken off, with 95 % intervals: by band and sensor, and by experiment and
-    sensor.
-
-    Parts in which nothing is found beyond chance are drawn pale. The frequency panel ends at 0.05 noise
-    deviations; less is drawn at its edge.
-    """
-    with style.house_style():
-        figure = style.new_figure(max(3.7, 1.7 + 0.36 * len(experiments)))
-        left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
-        for sensor, name in _SENSOR_NAMES.items():
-            for band in (band for band in bands if band.sensor == sensor):
-                middle = float(np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz))
-                middle *= 0.97 if sensor == "hub_angle" else 1.03
-                left.plot(
-                    [band.low_Hz, band.high_Hz],
-                    [max(band.gap.gap_rms, _SMALLEST)] * 2,
-                    color=SENSOR_COLOURS[sensor],
-                    alpha=1.0 if band.gap.found else 0.35,
-                    lw=4.0,
-                    solid_capstyle="butt",
-                )
-                _whisker(left, middle, band.gap, sensor, vertical=True)
-            left.plot([], [], color=SENSOR_COLOURS[sensor], lw=4.0, label=name)
-        left.set_xscale("log")
-        left.set_yscale("log")
-        left.set_ylim(bottom=_SMALLEST)
-        left.set_xlabel("frequency [Hz]")
-        left.set_ylabel("gap over noise, RMS [1]")
-        left.set_title("By frequency")
-        for row, entry in enumerate(experiments):
-            for sensor, part, offset in zip(_SENSOR_NAMES, entry.sensors, (-0.15, 0.15), strict=True):
-                right.barh(
-                    row + offset,
-                    part.gap_rms,
-                    height=0.27,
-                    color=SENSOR_COLOURS[sensor],
-                    alpha=1.0 if part.found else 0.35,
-                )
-                _whisker(right, row + offset, part, sensor, vertical=False)
-        right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-        right.set_ylim(len(experiments) - 0.5, -0.5)
-        right.grid(visible=False, axis="y")
-        right.set_xlabel("gap over noise, RMS [1]")
-        right.set_title("By experiment and sensor")
-        left.plot([], [], color="#444444", lw=1.0, label="95 % interval")
-        style.finish(figure, (left, right))
-    return figure
-
-
-def _whisker(axes: Axes, at: float, part: PartGap, sensor: str, *, vertical: bool) -> None:
-    look: dict[str, Any] = {"color": "#444444", "lw": 1.0}
-    if vertical:
-        axes.plot([at, at], np.maximum(part.interval, _SMALLEST), **look)
-    else:
-        axes.plot(part.interval, [at, at], **look)
-
-
+_WHISKER = {"color": "#444444", "lw": 1.0}
 _REGIMES = {
     "speed_sign": "sign of the hub speed",
     "speed_size": "size of the hub speed",
@@ -94,10 +27,100 @@ _REGIMES = {
     "command_size": "size of the command",
     "time": "time since start",
 }
+_ROUTES = {"hub_torque": "torque on the hub", "hub_angle": "hub angle reading", "tip": "tip reading"}
 
 
-def regime_words(axis: str) -> str:
-    return _REGIMES.get(axis, axis.replace("_", " "))
+@drawing("gap_bands")
+def draw_bands_and_experiments(where: Where) -> Figure:
+    """Size of the gap, noise taken off, with 95 % intervals: by band and sensor, by experiment and sensor.
+
+    Parts in which nothing is found beyond chance are drawn pale. The frequency panel ends at 0.05 noise
+    deviations; less is drawn at its edge.
+    """
+    experiments = where.experiments
+    with style.house_style():
+        figure = style.new_figure(max(3.7, 1.7 + 0.36 * len(experiments)))
+        left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+        for sensor, shift in zip(SENSORS, (0.97, 1.03), strict=True):
+            name, colour = _LOOKS[sensor]
+            for band in (band for band in where.bands if band.sensor == sensor):
+                middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
+                left.plot(
+                    [band.low_Hz, band.high_Hz],
+                    [max(band.gap.gap_rms, _SMALLEST)] * 2,
+                    color=colour,
+                    alpha=1.0 if band.gap.found else 0.35,
+                    lw=4.0,
+                    solid_capstyle="butt",
+                )
+                left.plot([middle, middle], np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
+            left.plot([], [], color=colour, lw=4.0, label=name)
+        left.set_xscale("log")
+        left.set_yscale("log")
+        left.set_ylim(bottom=_SMALLEST)
+        left.set_xlabel("frequency [Hz]")
+        left.set_ylabel("gap over noise, RMS [1]")
+        left.set_title("By frequency")
+        for row, entry in enumerate(experiments):
+            for sensor, part, offset in zip(SENSORS, entry.sensors, (-0.15, 0.15), strict=True):
+                pale = 1.0 if part.found else 0.35
+                right.barh(row + offset, part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
+                right.plot(part.interval, [row + offset] * 2, **_WHISKER)
+        right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
+        right.set_ylim(len(experiments) - 0.5, -0.5)
+        right.grid(visible=False, axis="y")
+        right.set_xlabel("gap over noise, RMS [1]")
+        right.set_title("By experiment and sensor")
+        left.plot([], [], **_WHISKER, label="95 % interval")
+        style.finish(figure, (left, right))
+    return figure
+
+
+@drawing("gap_regimes")
+def draw_regimes(where: Where) -> Figure | None:
+    """Residual energy over a regime variable where it depends on it, with what chance would give."""
+    findings = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
+    if not findings:
+        return None
+    with style.house_style():
+        figure, panels = _panels(len(findings))
+        for axes, finding in zip(panels, findings, strict=True):
+            at, count = np.arange(len(finding.bins)), len(finding.bins)
+            low, high = np.array([one.interval for one in finding.bins]).T
+            chance = "95 % of what chance gives"
+            axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label=chance)
+            name, colour = _LOOKS[finding.sensor]
+            axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
+            axes.set_xticks(at, [_bin_words(one, count) for one in finding.bins], fontsize=8)
+            axes.axhline(1.0, **gap_style.FLOOR)
+            axes.set_ylim(bottom=0)
+            axes.grid(visible=False, axis="x")
+            axes.set_xlabel(_with_unit(_REGIMES[finding.axis], finding.unit))
+            axes.set_ylabel("residual energy\nover that of the noise [1]")
+            axes.set_title(name, fontsize=9.5, fontweight="normal")
+        style.finish(figure, panels)
+    return figure
+
+
+@drawing("gap_curves")
+def draw_curves(where: Where) -> Figure | None:
+    """The gap read as one missing function of a variable, two standard errors either side."""
+    curves = [curve for curve in where.curves if curve.found]
+    if not curves:
+        return None
+    with style.house_style():
+        figure, panels = _panels(len(curves))
+        for axes, curve in zip(panels, curves, strict=True):
+            at, value = np.array(curve.centres), np.array(curve.values)
+            error = 2 * np.array(curve.standard_errors)
+            axes.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
+            axes.plot(at, value, "o-", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
+            axes.axhline(0, color="#555555", lw=0.8)
+            axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
+            axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
+            axes.set_title(f"{100 * curve.share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
+        style.finish(figure, panels)
+    return figure
 
 
 def _bin_words(one: RegimeBin, count: int) -> str:
@@ -105,70 +128,16 @@ def _bin_words(one: RegimeBin, count: int) -> str:
     return style.plain(one.label, 24) if count <= _FEW_BINS else f"{one.low:.2g}\nto {one.high:.2g}"
 
 
-def draw_regimes(findings: Sequence[RegimeFinding]) -> Figure:
-    """Residual energy over a regime variable where it depends on it, with what chance would give."""
-    count = len(findings)
-    rows, columns = _grid(count)
-    with style.house_style():
-        figure = style.new_figure(0.9 + 2.6 * rows)
-        grid = figure.subplots(rows, columns, squeeze=False)
-        for axes, finding in zip(grid.ravel(), findings, strict=False):
-            at = np.arange(len(finding.bins))
-            energy = [one.energy for one in finding.bins]
-            low, high = np.array([one.interval for one in finding.bins]).T
-            axes.bar(
-                at, high - low, bottom=low, width=0.8, color="#dddddd", label="95 % of what chance gives"
-            )
-            axes.plot(
-                at,
-                energy,
-                "o",
-                ms=6,
-                color=SENSOR_COLOURS[finding.sensor],
-                label=_SENSOR_NAMES[finding.sensor],
-            )
-            axes.set_xticks(at, [_bin_words(one, len(finding.bins)) for one in finding.bins], fontsize=8)
-            axes.axhline(1.0, **gap_style.FLOOR, label=gap_style.WORDS["floor"])
-            axes.set_ylim(bottom=0)
-            axes.grid(visible=False, axis="x")
-            unit = f" [{finding.unit}]" if finding.unit else ""
-            axes.set_xlabel(f"{regime_words(finding.axis)}{unit}")
-            axes.set_title(_SENSOR_NAMES[finding.sensor], fontsize=9.5, fontweight="normal")
-        for axes in grid.ravel()[count:]:
-            axes.set_axis_off()
-        for axes in grid[:, 0]:
-            axes.set_ylabel("residual energy\nover that of the noise [1]")
-        style.finish(figure, grid.ravel())
-    return figure
+def _with_unit(words: str, unit: str) -> str:
+    return f"{words} [{unit}]" if unit else words
 
 
-_ROUTES = {"hub_torque": "torque on the hub", "hub_angle": "hub angle reading", "tip": "tip reading"}
-
-
-def _grid(count: int) -> tuple[int, int]:
-    """Rows and columns for so many panels; a single one does not fill the page."""
+def _panels(count: int) -> tuple[Figure, Sequence[Axes]]:
+    """So many panels in rows; a single one does not fill the page."""
     columns = min(_COLUMNS, max(2, count))
-    return -(-count // columns), columns
-
-
-def draw_curves(curves: Sequence[EquivalentCurve]) -> Figure:
-    """The gap read as one missing function of a variable, two standard errors either side."""
-    count = len(curves)
-    rows, columns = _grid(count)
-    with style.house_style():
-        figure = style.new_figure(0.9 + 2.6 * rows)
-        grid = figure.subplots(rows, columns, squeeze=False)
-        for axes, curve in zip(grid.ravel(), curves, strict=False):
-            at, value = np.array(curve.centres), np.array(curve.values)
-            error = 2 * np.array(curve.standard_errors)
-            axes.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
-            axes.plot(at, value, "o-", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
-            axes.axhline(0, color="#555555", lw=0.8)
-            unit = f" [{curve.unit}]" if curve.unit else ""
-            axes.set_xlabel(f"{curve.axis.replace('_', ' ')}{unit}")
-            axes.set_ylabel(f"{_ROUTES.get(curve.route, curve.route)} [{curve.value_unit}]")
-            axes.set_title(f"{100 * curve.share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
-        for axes in grid.ravel()[count:]:
-            axes.set_axis_off()
-        style.finish(figure, grid.ravel())
-    return figure
+    rows = -(-count // columns)
+    figure = style.new_figure(0.9 + 2.6 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, list(grid[:count])

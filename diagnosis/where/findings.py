@@ -1,18 +1,33 @@
-"""What `diagnosis.where.where` answers: findings by frequency, regime, experiment, sensor, amplitude,
-subsystem.
+"""What `diagnosis.where.where` answers: findings by frequency, regime, experiment, sensor, size.
 
 Every finding carries its number, an interval, a p-value against chance and whether it is `found` (beyond
-chance at the level of its axis); the sentence of an axis only speaks of what is found.
+chance at the level of its axis). What is worth a sentence among them is decided here; the sentences stand in
+the templates.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2, norm
 
 Interval = tuple[float, float]
 # Sensors in the order of the output columns, as records name them.
 SENSORS = ("hub_angle", "tip")
+
+_Z95 = float(norm.ppf(0.975))
+# A statement about where "most" of the gap lies covers at least this share of it.
+_MOST = 0.8
+# A missing function is the answer in short if it explains at least this share of the gap.
+_MUCH = 0.5
+# From such a share of the gap on it is called linear in the voltage; below the other one it is not.
+_LINEAR, _NOT_LINEAR = 0.9, 0.5
+# A straight drift has 7 % of its energy around its fourth line.
+_LINE = 0.2
+# A drift that explains less of a gap is not worth a sentence.
+_LEAST_DRIFT = 0.1
 
 
 @dataclass(frozen=True)
@@ -86,13 +101,22 @@ class RegimeBin:
 
 
 @dataclass(frozen=True)
+class RegimePeak:
+    """The bin that stands out most: gap in noise deviations there, and what shifts in time give."""
+
+    label: str
+    gap_rms: float
+    usual: float
+
+
+@dataclass(frozen=True)
 class RegimeFinding:
     """Does the residual energy of a sensor depend on a regime variable?
 
     axis: speed_sign, speed_size, reversal, angle, angle_in_period, deflection, command_size or time.
     `p_value` is by circular shifts of the energy against the regime within every experiment, which keeps the
     colour of the residuals. `contrast`: the largest deviation of a bin from what shifts give, in their
-    standard deviations. A finding may be beyond chance and still too small to be worth a sentence.
+    standard deviations. `peak` is None where nothing is found, or too little to tell anybody.
     """
 
     axis: str
@@ -101,7 +125,7 @@ class RegimeFinding:
     bins: tuple[RegimeBin, ...]
     p_value: float
     found: bool
-    sentence: str
+    peak: RegimePeak | None
     contrast: float = 0.0
 
 
@@ -121,7 +145,10 @@ class DriftFinding:
     interval: Interval | None
     p_value: float
     found: bool
-    sentence: str
+
+    @property
+    def notable(self) -> bool:
+        return self.found and self.share >= _LEAST_DRIFT
 
 
 @dataclass(frozen=True)
@@ -149,7 +176,10 @@ class CommonFinding:
     peak_share: float
     p_value: float
     found: bool
-    sentence: str
+
+    @property
+    def has_line(self) -> bool:
+        return self.peak_share >= _LINE
 
 
 @dataclass(frozen=True)
@@ -182,7 +212,16 @@ class EquivalentCurve:
     share_by_chance: float
     p_value: float
     found: bool
-    sentence: str
+
+    @property
+    def points(self) -> tuple[tuple[float, float], ...]:
+        """Where the curve is best known: next to zero on both sides, or (over time) at both ends."""
+        nodes = list(zip(self.centres, self.values, strict=True))
+        if self.axis == "time":
+            return (nodes[0], nodes[-1])
+        # Half the samples of a side lie below its first node beside zero.
+        below, above = [n for n in nodes if n[0] < 0], [n for n in nodes if n[0] > 0]
+        return (*below[-1:], *above[:1])
 
 
 @dataclass(frozen=True)
@@ -234,7 +273,17 @@ class PeriodicFinding:
     unrepeated: tuple[float, ...]
     unrepeated_interval: Interval
     even_odd_separable: bool
-    sentence: str
+
+    @property
+    def worst_band(self) -> FrequencyResponseBand | None:
+        return max((b for b in self.bands if b.found), key=lambda b: b.distance, default=None)
+
+    @property
+    def worst_group(self) -> LineGroup | None:
+        return max((g for g in self.groups if g.found), key=lambda g: g.repeated_rms, default=None)
+
+
+Growth = Literal["offset", "saturating", "linear", "faster", "undecided"]
 
 
 @dataclass(frozen=True)
@@ -242,8 +291,6 @@ class AmplitudeFinding:
     """How the gap grows between two open-loop experiments of one kind at different amplitude.
 
     exponent: gap_rms proportional to amplitude^exponent (1 in a linear machine), 95 % interval by blocks.
-    linear_share: share of the gap energy that a linear correction of the model takes away on the held-out
-    experiments when fitted on the others; None if not found out.
     """
 
     experiments: tuple[str, str]
@@ -251,9 +298,8 @@ class AmplitudeFinding:
     gap_ratio: float
     exponent: float
     interval: Interval
-    growth: str
+    growth: Growth
     found: bool
-    sentence: str
 
 
 @dataclass(frozen=True)
@@ -265,7 +311,21 @@ class LinearCorrection:
 
     share: float
     interval: Interval
-    sentence: str
+
+    @property
+    def linear(self) -> bool | None:
+        """Whether the cause is linear in the voltage; None where the share leaves that open."""
+        return True if self.share >= _LINEAR else False if self.share < _NOT_LINEAR else None
+
+
+@dataclass(frozen=True)
+class Concentration:
+    """Share of a gap's energy between two frequencies, and half the width of its 95 % interval."""
+
+    low_Hz: float
+    high_Hz: float
+    share: float
+    half_width: float
 
 
 @dataclass(frozen=True)
@@ -274,7 +334,6 @@ class Where:
 
     Attributes
     ----------
-    headline : str
     gap : PartGap
         All records together.
     sensors, experiments, bands, regimes, drift, common, curves
@@ -283,14 +342,10 @@ class Where:
         None where the records do not allow it.
     subsystem : dict
         Probability of none, actuator, joint, link, sensor, environment, unknown; empty without probabilities.
-    sentences : dict
-        One per axis (sensors, experiments, frequency, regimes, time, common, amplitude, curves, linear,
-        periodic, subsystem); only axes that have something to say.
     level : float
         Chance of any finding of an axis when there is nothing.
     """
 
-    headline: str
     gap: PartGap
     sensors: tuple[SensorGap, ...]
     experiments: tuple[ExperimentGap, ...]
@@ -303,17 +358,86 @@ class Where:
     amplitude: AmplitudeFinding | None
     linear: LinearCorrection | None
     subsystem: dict[str, float]
-    sentences: dict[str, str]
     level: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dicts, lists, floats and strings; `json.dumps` takes it."""
-        return dict(_plain(asdict(self)))
+    @property
+    def is_gap(self) -> bool:
+        """Anything beyond noise in the records as a whole, a sensor, an experiment or a band."""
+        parts = [self.gap, *(s.gap for s in self.sensors), *(b.gap for b in self.bands)]
+        parts += [g for x in self.experiments for g in (x.gap, *x.sensors)]
+        return any(part.found for part in parts)
 
+    @property
+    def dominant_sensor(self) -> str | None:
+        """The sensor that alone shows the gap, if the other one shows none or next to none of it."""
+        shown = [s for s in self.sensors if s.gap.found]
+        for s in shown:
+            if s.gap.share_interval[0] > 0.95 or (len(shown) == 1 and s.gap.share > 0.9):
+                return s.sensor
+        return None
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    return value
+    @property
+    def best_curve(self) -> EquivalentCurve | None:
+        """The missing function that explains most, if it explains half of the gap and is beyond chance."""
+        usable = [c for c in self.curves if c.found and c.share >= _MUCH]
+        return max(usable, key=lambda c: c.share, default=None)
+
+    @property
+    def near_curves(self) -> tuple[EquivalentCurve, ...]:
+        """Others that explain nearly as much as the best one."""
+        best = self.best_curve
+        if best is None:
+            return ()
+        least = 0.8 * min(best.share, 1.0)
+        return tuple(c for c in self.curves if c.found and c is not best and c.share >= least)
+
+    @property
+    def telling_regimes(self) -> tuple[RegimeFinding, ...]:
+        """The clearest regime of every axis, at most three axes."""
+        best: dict[str, RegimeFinding] = {}
+        for r in self.regimes:
+            if r.peak is not None and (r.axis not in best or r.contrast > best[r.axis].contrast):
+                best[r.axis] = r
+        return tuple(sorted(best.values(), key=lambda r: -r.contrast)[:3])
+
+    @property
+    def common_found(self) -> tuple[CommonFinding, ...]:
+        """Largest share first."""
+        return tuple(sorted((c for c in self.common if c.found), key=lambda c: -c.share))
+
+    def concentration(self, sensor: str | None = None) -> Concentration | None:
+        """Narrowest run of bands with at least 80 % of the gap (of one sensor: of its own gap).
+
+        None if only the whole range has it, no band is found, or it may be less than half.
+        """
+        bands = [b for b in self.bands if sensor in (None, b.sensor)]
+        whole = sum(b.gap.share for b in bands) if sensor else 1.0
+        if not any(b.gap.found for b in bands):
+            return None
+        scale = whole if whole > 0 else 1.0
+        edges = sorted({b.low_Hz for b in bands} | {b.high_Hz for b in bands})
+        shares = [sum(b.gap.share / scale for b in bands if b.low_Hz == low) for low in edges[:-1]]
+        runs = [
+            (j - i, -sum(shares[i:j]), edges[i], edges[j])
+            for i in range(len(shares))
+            for j in range(i + 1, len(shares) + 1)
+            if sum(shares[i:j]) >= _MOST
+        ]
+        if not runs or min(runs)[0] == len(shares):
+            return None
+        _, share, low, high = min(runs)
+        halves = [np.ptp(b.gap.share_interval) / scale / 2 for b in bands if low <= b.low_Hz < high]
+        half = float(np.sqrt(np.sum(np.square(halves))))
+        return Concentration(low, high, -share, half) if min(-share, 1.0) - half >= 0.5 else None
+
+    def even(self, sensor: str) -> bool:
+        """Whether a sensor's gap is spread evenly over all frequencies, as more sensor noise would be."""
+        bands = [b for b in self.bands if b.sensor == sensor]
+        if not all(b.gap.found for b in bands):
+            return False
+        width = np.array([b.high_Hz - b.low_Hz for b in bands])
+        mean = np.array([b.gap.gap_rms**2 for b in bands])
+        # Half the interval of gap_rms^2 over 1.96 is its standard deviation where the lower end is not cut.
+        sd = np.array([(b.gap.interval[1] ** 2 - b.gap.gap_rms**2) / _Z95 for b in bands])
+        away = (mean - np.sum(width * mean) / np.sum(width)) / np.maximum(sd, 1e-12)
+        return bool(np.sum(away**2) < chi2.ppf(0.95, len(bands) - 1))
