@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import shlex
 import sys
 import traceback
 import warnings
@@ -19,18 +20,22 @@ from typing import Annotated, Any
 
 import typer
 
+from workflow.config.renamed_keys import RenamedKeyWarning
+from workflow.engine import interrupts
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL,
+    EXIT_INTERRUPTED,
     EXIT_NOT_CERTIFIED,
     EXIT_OK,
+    CommandInterruptedError,
     InputError,
     StageError,
     describe_os_error,
+    need,
     one_line,
 )
 
-_EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 _BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 app = typer.Typer(
@@ -84,6 +89,7 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
+    need(config)
     from workflow.console import TerminalProgress, print_summary
     from workflow.tasks.entry import run_from_files
 
@@ -106,6 +112,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate the experiments of a configuration and write them as CSV."""
+    need(config)
     from workflow.tasks.entry import simulate_to_csv
 
     files = simulate_to_csv(config, out)
@@ -189,6 +196,7 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
+    need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
     from workflow.config.settings import check
     from workflow.console import TerminalProgress, print_summary
@@ -244,15 +252,17 @@ def design(
             "--spec",
             "--specification",
             help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis], "
-            "[certificate], [yardstick], [prefilter] where needed; for a run directory its own if left out.",
+            "[certificate], [achievable_performance], [reference_filter] where needed; for a run directory "
+            "its own if left out.",
             show_default=False,
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99); "
-            "a prefilter beside it, as NAME_prefilter.",
+            help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99, "
+            "with its header); or into a directory, as controller.json, .c and .h; "
+            "a reference filter beside it, as NAME_reference_filter.",
             show_default=False,
         ),
     ] = None,
@@ -260,6 +270,7 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
+    need(*source, specification)
     from workflow.console import print_summary
     from workflow.tasks.entry import design_controller
 
@@ -312,6 +323,7 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
+    need(config)
     from workflow.console import TerminalProgress, print_summary
     from workflow.study.run import run_study
 
@@ -361,6 +373,8 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
+    if not any(place.exists() for place in case):
+        need(*case)
     from workflow.console import TerminalProgress, print_summary
     from workflow.diagnose.command import diagnose_cases
 
@@ -412,6 +426,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif argv is None:
         # An error is one line. Called from Python (tests!) warnings stay what the caller made of them.
         warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=RenamedKeyWarning)
+        warnings.showwarning = _warn
     if argv is None and not any(name in os.environ for name in _BLAS_THREADS):
         # Matrices here are small: threads would only wait for one another, beside another busy process for
         # most of the time. Read by the libraries when they load, which is after this line.
@@ -419,12 +435,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not arguments:
         arguments = ["--help"]
     try:
+        if argv is None:
+            interrupts.watch()
         _plug_in(arguments)
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         # typer turns Ctrl-C into a silent exit of this code.
-        return _interrupted(arguments) if code == _EXIT_INTERRUPTED else code
+        return _interrupted(arguments) if code == EXIT_INTERRUPTED else code
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(arguments)
+    except CommandInterruptedError as error:
+        return _interrupted(arguments, error.out)
     except BrokenPipeError:
         # Whoever read our output has left; there is nobody to tell, at the last flush neither.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -455,12 +475,24 @@ def _plug_in(arguments: Sequence[str]) -> None:
             app.command(point.name)(point.load())
 
 
-def _interrupted(arguments: Sequence[str]) -> int:
-    command = arguments[0]
-    called = _commands().get(command)
-    resumable = called is not None and "resume" in inspect.signature(called).parameters
-    hint = f"; `flexlink {command} --out DIR --resume` continues" if resumable else ""
-    return _complain(f"interrupted{hint}", _EXIT_INTERRUPTED)
+def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
+    """One line; with the call that continues, where something was written that can be continued."""
+    called = _commands().get(arguments[0])
+    hint = ""
+    if called is not None and "resume" in inspect.signature(called).parameters:
+        again = [text for text in arguments if text not in ("--replace", "--resume")]
+        given = next((at for at, text in enumerate(again) if text.partition("=")[0] == "--out"), None)
+        if given is not None:
+            out = Path(again[given].partition("=")[2] or again[given + 1])
+        elif out is not None:
+            again += ["--out", str(out)]
+        if out is not None and out.is_dir():
+            hint = f"; {shlex.join(['flexlink', *again, '--resume'])} continues"
+    return _complain(f"interrupted{hint}", EXIT_INTERRUPTED)
+
+
+def _warn(message: Warning | str, *about: object, **more: object) -> None:
+    print(f"flexlink: {one_line(message)}", file=sys.stderr)  # noqa: T201
 
 
 def _explain(error: Exception) -> tuple[str, int]:

@@ -30,7 +30,11 @@ from tests.workflow.report_examples import (
     posterior,
     sampled_responses,
 )
-from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.design_options import (
+    AchievableOptions,
+    CertificateOptions,
+    ReferenceFilterSettings,
+)
 from workflow.engine.errors import InputError
 from workflow.tasks.achievable_performance import (
     achievable_words,
@@ -48,11 +52,11 @@ from workflow.tasks.joint_coverage import (
 )
 from workflow.tasks.proportions import wilson_interval
 from workflow.tasks.reference_filter import (
+    filter_bytes,
+    filter_file,
     filter_words,
-    find_prefilter,
+    find_filter,
     model_answer,
-    prefilter_bytes,
-    prefilter_file,
 )
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -124,9 +128,9 @@ def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
 
 
 def test_achievable_performance_not_asked_for_or_impossible_says_why():
-    off = YardstickOptions.model_validate({"compute": False})
+    off = AchievableOptions.model_validate({"compute": False})
     assert "compute = false" in str(find_bracket([plant()], spec(), off).reason)
-    on = YardstickOptions.model_validate({})
+    on = AchievableOptions.model_validate({})
     impossible = find_bracket([plant()], spec(bandwidth_rad_s=1e4), on)
     assert impossible.bracket is None
     assert "Nyquist" in str(impossible.reason)
@@ -228,28 +232,30 @@ def test_options_that_contradict_themselves():
     with pytest.raises(ValidationError, match="calibrate needs joint_draws"):
         CertificateOptions.model_validate({"joint_draws": 0, "calibrate": True})
     with pytest.raises(ValidationError, match="either corner_rad_s or model"):
-        PrefilterSettings.model_validate({})
+        ReferenceFilterSettings.model_validate({})
     with pytest.raises(ValidationError, match="improper"):
-        PrefilterSettings.model_validate({"model": {"numerator": [1, 1], "denominator": [1]}})
+        ReferenceFilterSettings.model_validate({"model": {"numerator": [1, 1], "denominator": [1]}})
 
 
 def test_model_of_a_corner_is_a_power_of_a_lag():
-    settings = PrefilterSettings.model_validate({"corner_rad_s": 3.0, "model_order": 3})
+    settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "model_order": 3})
     s = 1j * np.array([0.1, 3.0, 20.0])
     assert settings.reference_model.at(s) == pytest.approx(1 / (s / 3 + 1) ** 3)
 
 
 def test_weight_of_a_prefilter_is_for_steps_unless_said():
-    steps = PrefilterSettings.model_validate({"corner_rad_s": 3.0}).error_weight
+    steps = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0}).error_weight
     assert steps is not None
     assert np.abs(steps.at(1j * np.array([0.0, 3e4]))) == pytest.approx([100.0, 1.0])
-    assert PrefilterSettings.model_validate({"corner_rad_s": 3.0, "weight": "flat"}).error_weight is None
+    assert (
+        ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "weight": "flat"}).error_weight is None
+    )
     # Of a model given as it is, the corner is where |1/(s/5 + 1)| has fallen by 3 dB: 5 rad/s.
     lag = {"numerator": [1.0], "denominator": [0.2, 1.0]}
-    weight = PrefilterSettings.model_validate({"model": lag}).error_weight
+    weight = ReferenceFilterSettings.model_validate({"model": lag}).error_weight
     assert weight is not None
     assert weight.numerator[1] == pytest.approx(5.0, rel=0.01)
-    given = PrefilterSettings.model_validate({"corner_rad_s": 3.0, "weight": lag}).error_weight
+    given = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "weight": lag}).error_weight
     assert given is not None
     assert given.denominator == (0.2, 1.0)
 
@@ -264,10 +270,10 @@ def test_answer_of_the_model_settles_as_it_should():
 
 @pytest.fixture(scope="module")
 def filtered() -> ReferenceFilterResult:
-    settings = PrefilterSettings.model_validate(
+    settings = ReferenceFilterSettings.model_validate(
         {"corner_rad_s": 1.0, "grid_points": 60, "mode_points": 20, "dense_points": 1000}
     )
-    return find_prefilter(controller(), [plant()], settings)
+    return find_filter(controller(), [plant()], settings)
 
 
 def test_prefilter_follows_the_model_better_than_none(filtered):
@@ -284,25 +290,25 @@ def test_prefilter_follows_the_model_better_than_none(filtered):
 
 
 def test_prefilter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
-    settings = PrefilterSettings.model_validate({"corner_rad_s": 1.0})
-    result = find_prefilter(controller(500.0), [plant()], settings)
+    settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0})
+    result = find_filter(controller(500.0), [plant()], settings)
     assert result.filter is None
     assert str(filter_words(result)).startswith("no reference filter: plant 'hub'")
-    assert find_prefilter(controller(), [plant()], None).reason is None
-    with pytest.raises(InputError, match=r"prefilter\.corner_rad_s: 1000 lies beyond the Nyquist"):
-        find_prefilter(controller(), [plant()], PrefilterSettings.model_validate({"corner_rad_s": 1e3}))
-    late = PrefilterSettings.model_validate({"corner_rad_s": 1.0, "poles_rad_s": [900.0]})
-    with pytest.raises(InputError, match=r"prefilter\.poles_rad_s: 900 is not between"):
-        find_prefilter(controller(), [plant()], late)
+    assert find_filter(controller(), [plant()], None).reason is None
+    with pytest.raises(InputError, match=r"reference_filter\.corner_rad_s: 1000 lies beyond the Nyquist"):
+        find_filter(controller(), [plant()], ReferenceFilterSettings.model_validate({"corner_rad_s": 1e3}))
+    late = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0, "poles_rad_s": [900.0]})
+    with pytest.raises(InputError, match=r"reference_filter\.poles_rad_s: 900 is not between"):
+        find_filter(controller(), [plant()], late)
 
 
-def test_prefilter_files(filtered, tmp_path):
+def test_filter_files(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
-    assert prefilter_file(Path("k.json")) == Path("k_prefilter.json")
-    again = Prefilter.from_json(prefilter_bytes(found, ".JSON").decode())
+    assert filter_file(Path("k.json")) == Path("k_reference_filter.json")
+    again = Prefilter.from_json(filter_bytes(found, ".JSON").decode())
     assert np.array_equal(again.A, found.A)
-    mat = scipy.io.loadmat(BytesIO(prefilter_bytes(found, ".mat")))
+    mat = scipy.io.loadmat(BytesIO(filter_bytes(found, ".mat")))
     assert np.array_equal(mat["B"], found.B)
     assert mat["dt_s"].item() == found.dt_s
 
@@ -311,15 +317,15 @@ def test_prefilter_files(filtered, tmp_path):
 def test_prefilter_in_c_agrees_to_1e_12(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
-    (tmp_path / "f.c").write_bytes(prefilter_bytes(found, ".c"))
+    (tmp_path / "f.c").write_bytes(filter_bytes(found, ".c"))
     flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Werror", "-shared", "-fPIC"]
     command = [str(_COMPILER), *flags, str(tmp_path / "f.c"), "-o", str(tmp_path / "f.so")]
     subprocess.run(command, check=True, capture_output=True)
     code = ctypes.CDLL(str(tmp_path / "f.so"))
-    code.prefilter_step.restype = ctypes.c_double
-    code.prefilter_step.argtypes = [ctypes.c_void_p, ctypes.c_double]
+    code.reference_filter_step.restype = ctypes.c_double
+    code.reference_filter_step.argtypes = [ctypes.c_void_p, ctypes.c_double]
     state = ctypes.create_string_buffer(8 * (found.order + 4))
-    code.prefilter_reset(state)
+    code.reference_filter_reset(state)
     reference = np.repeat(np.random.default_rng(5).standard_normal(40), 25)
-    answer = np.array([code.prefilter_step(state, value) for value in reference])
+    answer = np.array([code.reference_filter_step(state, value) for value in reference])
     assert np.max(np.abs(answer - found.filtered(reference))) < 1e-12

@@ -10,6 +10,7 @@ import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT
 from workflow.config.excitations import BangBang, Doublet, LogChirp, Multisine, Prbs
+from workflow.config.renamed_keys import RenamedKeyWarning
 from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
@@ -197,3 +198,15 @@ output = "y"
     (tmp_path / "own.toml").write_text(first.replace('output = "y"', 'output = "u"') % apart)
     with pytest.raises(InputError, match="input and output are the same column, 'u'"):
         load_config(tmp_path / "own.toml")
+
+
+def test_earlier_names_of_keys_are_read_and_the_new_one_is_told(tmp_path):
+    text = FAST_ARM.read_text()
+    path = tmp_path / "old.toml"
+    path.write_text(text + "\n[yardstick]\ncompute = false\n")
+    with pytest.warns(RenamedKeyWarning, match=r"old\.toml: yardstick is now called achievable_performance"):
+        config, _ = load_config(path)
+    assert not config.achievable_performance.compute
+    path.write_text(path.read_text() + "[achievable_performance]\ncompute = true\n")
+    with pytest.raises(InputError, match="yardstick is the earlier name of achievable_performance"):
+        load_config(path)

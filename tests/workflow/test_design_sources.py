@@ -127,7 +127,9 @@ def test_state_space_with_stated_uncertainty(flexlink, wish, tmp_path):
 
 def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexlink, wish, tmp_path):
     write_json(tmp_path / "arm.json", document(arm()))
-    more = "[uncertainty]\nmultiplicative = 0.1\n[prefilter]\ncorner_rad_s = 2.0\ndense_points = 1000\n"
+    more = (
+        "[uncertainty]\nmultiplicative = 0.1\n[reference_filter]\ncorner_rad_s = 2.0\ndense_points = 1000\n"
+    )
     out = tmp_path / "law.json"
     answer = flexlink("design", tmp_path / "arm.json", "--spec", wish(more), "--out", out, "--json")
     found = numbers(answer)
@@ -136,9 +138,10 @@ def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexl
     assert achievable["above_percent"] == pytest.approx(100 * (gamma / achievable["reached"] - 1))
     assert "a bound, not a distribution" in found["sampled_responses"]["reason"]
     filtered = found["reference_filter"]
-    assert filtered.error_after < filtered.error_before
-    assert found["reference_filter_file"] == str(tmp_path / "law_prefilter.json")
-    assert np.array_equal(Prefilter.from_json((tmp_path / "law_prefilter.json").read_text()).A, filtered["A"])
+    assert filtered["error_after"] < filtered["error_before"]
+    beside = tmp_path / "law_reference_filter.json"
+    assert found["files"] == [str(out), str(beside)]
+    assert np.array_equal(Prefilter.from_json(beside.read_text()).A, filtered["A"])
     table = {row["label"]: row["value"] for row in json.loads(answer.out)["table"]}
     assert "what a controller of any order is known to reach" in table["against any order"]
     assert "times smaller" in table["model matching"]
@@ -271,16 +274,16 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
         ("[uncertainty]\nmultiplicative = 0.1\nadditive = 0.1", "either multiplicative or additive"),
         ("[plant]\nintegrators = 1", "the model has 0 at z = 1"),
         ("[plant]\nfit = { integrators = 1 }", "say integrators in [plant] itself"),
-        ("[prefilter]\norder = 1", "either corner_rad_s or model"),
+        ("[reference_filter]\norder = 1", "either corner_rad_s or model"),
         (
-            "[prefilter]\ncorner_rad_s = 100.0",
-            "wish.toml: prefilter.corner_rad_s: 100 lies beyond the Nyquist",
+            "[reference_filter]\ncorner_rad_s = 100.0",
+            "wish.toml: reference_filter.corner_rad_s: 100 lies beyond the Nyquist",
         ),
-        ("[prefilter]\nmodel = { numerator = [1.0, 1.0], denominator = [1.0] }", "improper"),
-        ("[prefilter]\nmodel = { numerator = [1.0], denominator = [1.0, -1.0] }", "unstable"),
+        ("[reference_filter]\nmodel = { numerator = [1.0, 1.0], denominator = [1.0] }", "improper"),
+        ("[reference_filter]\nmodel = { numerator = [1.0], denominator = [1.0, -1.0] }", "unstable"),
         ("[certificate]\njoint_draws = 5", "joint_draws must be 0 or at least 100"),
         ("[certificate]\njoint_coverage = 1.0", "joint_coverage"),
-        ("[yardstick]\ncompute = true\nreal_pole = 3", "did you mean real_poles"),
+        ("[achievable_performance]\ncompute = true\nreal_pole = 3", "did you mean real_poles"),
         ("bandwidth_rad_s = nan", "bandwidth_rad_s: input should be a finite number"),
         ("controller_order = 0", "controller_order"),
         ("[specification]\nbandwidth_rad_s = 1.0\n[uncertanty]\nmultiplicative = 0.1", "uncertanty"),

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, start_flexlink
 from workflow.config.run_config import load_config
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.controller_files import write_controller
 from workflow.tasks.entry import run_from_files
 from workflow.tasks.results import ClosedLoopResult, RunResults
 from workflow.tasks.stages import STAGES
@@ -151,6 +153,48 @@ def test_missing_page_is_drawn_again(fast_run, tmp_path, plain_page):
 
 def test_resume_without_config_uses_the_one_in_the_directory(fast_run):
     assert run_from_files(None, fast_run[0], resume=True).numbers == fast_run[1].numbers
+
+
+@pytest.mark.parametrize(
+    ("appears", "pause_s"),
+    [
+        ("manifest.json", 0.0),
+        ("stages/identify.npz", 0.1),
+        ("stages/uncertainty.npz", 0.3),  # the optimiser
+        ("stages/design.npz", 0.1),
+        ("stages/reference_filter.json", 0.3),
+    ],
+)
+def test_interrupted_run_says_how_to_resume_and_ends_with_the_same_numbers(
+    reference, tmp_path, appears, pause_s
+):
+    out = tmp_path / "run"
+    process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
+    wait_for(out / appears, process)
+    time.sleep(pause_s)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error.decode()
+    call = f"flexlink run --config {FAST_ARM} --out {out} --resume"
+    assert error.decode() == f"flexlink: interrupted; {call} continues\n"
+    again = start_flexlink(*call.split()[1:])
+    _, error = again.communicate()
+    assert again.returncode == 0, error.decode()
+    assert_same_run(reference, out)
+
+
+def test_a_run_leaves_its_controller(reference):
+    law = Controller.from_json((reference / "controller.json").read_text())
+    stored = RunResults(RunDirectory.open(reference)).design.synthesis.controller
+    np.testing.assert_array_equal(law.A, stored.A)
+    assert "controller_step" in (reference / "controller.h").read_text()
+    assert "NOT CERTIFIED" not in (reference / "controller.c").read_text()
+
+
+def test_a_controller_that_is_not_certified_says_so(tmp_path, reference):
+    law = Controller.from_json((reference / "controller.json").read_text())
+    for path in write_controller(tmp_path, law, None, certified=False):
+        assert "NOT CERTIFIED" in path.read_text(), path.name
 
 
 def test_changed_stage_file_makes_the_later_stages_again(fast_run, tmp_path, plain_page):

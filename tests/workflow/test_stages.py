@@ -16,7 +16,7 @@ from ident.identify import identify
 from plant import linear_arm
 from plant.presets import paper_link
 from tests.workflow.command import FAST_ARM
-from workflow.config.design_options import PrefilterSettings
+from workflow.config.design_options import ReferenceFilterSettings
 from workflow.config.run_config import Channel, FileRecord, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
@@ -112,8 +112,8 @@ def test_prefilter_takes_the_reference_step_to_the_loop(run, tmp_path):
     shutil.copytree(run.run.path, tmp_path / "run")
     copy = RunResults(RunDirectory(tmp_path / "run"))
     corner = 0.3 * config_of(run.run).specification.bandwidth_rad_s
-    settings = PrefilterSettings.model_validate({"corner_rad_s": corner, "dense_points": 1000})
-    config = config_of(run.run).model_copy(update={"prefilter": settings})
+    settings = ReferenceFilterSettings.model_validate({"corner_rad_s": corner, "dense_points": 1000})
+    config = config_of(run.run).model_copy(update={"reference_filter": settings})
     stage = StageInput(config, copy, Silence())
     result = design_filter(stage)
     found = result.filter

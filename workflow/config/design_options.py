@@ -1,4 +1,5 @@
-"""What is asked about a design beyond its margins: any order's reach, whole responses, a prefilter."""
+"""What is asked about a design beyond its margins: any order's reach, sampled responses, a
+reference filter."""
 
 from __future__ import annotations
 
@@ -42,14 +43,14 @@ class CertificateOptions(BaseModel):
         return self
 
 
-class YardstickOptions(YoulaOptions):
-    """[yardstick]: what a controller of any order could reach (Youla bracket), how finely it is sought."""
+class AchievableOptions(YoulaOptions):
+    """[achievable_performance]: what a controller of any order could reach, and how finely it is sought."""
 
     compute: bool = Field(True, description="false: the design is not compared with other orders")
 
 
-class PrefilterSettings(PrefilterOptions):
-    """[prefilter]: second degree of freedom, u = K (F r - y), designed after K to follow a model."""
+class ReferenceFilterSettings(PrefilterOptions):
+    """[reference_filter]: second degree of freedom, u = K (F r - y), designed after K to follow a model."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -15,7 +15,11 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis import SynthesisOptions
 from ident.basis.options import IdentOptions
 from ident.uncertainty.embedding import EmbeddingOptions
-from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.design_options import (
+    AchievableOptions,
+    CertificateOptions,
+    ReferenceFilterSettings,
+)
 from workflow.config.excitations import Excitation
 from workflow.config.rig_settings import EffectTable, RigChoice
 from workflow.config.settings import InputPath, check, read_toml
@@ -247,8 +251,10 @@ class RunConfig(Section):
     specification: Specification
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
     certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
-    yardstick: YardstickOptions = Field(default_factory=lambda: YardstickOptions.model_validate({}))
-    prefilter: PrefilterSettings | None = Field(
+    achievable_performance: AchievableOptions = Field(
+        default_factory=lambda: AchievableOptions.model_validate({})
+    )
+    reference_filter: ReferenceFilterSettings | None = Field(
         None, description="second degree of freedom; none: the reference goes to the loop as it is"
     )
     closed_loop: ClosedLoopOptions = Field(default_factory=ClosedLoopOptions)

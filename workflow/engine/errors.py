@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 EXIT_OK = 0
 EXIT_INTERNAL = 1
 EXIT_BAD_INPUT = 2
 EXIT_NOT_CERTIFIED = 3
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
 def one_line(text: object) -> str:
@@ -37,6 +39,23 @@ class StageError(RuntimeError):
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(message))
+
+
+class CommandInterruptedError(RuntimeError):
+    """Ctrl-C; `out` is the directory in which what is finished is kept."""
+
+    exit_code = EXIT_INTERRUPTED
+
+    def __init__(self, out: Path) -> None:
+        super().__init__("interrupted")
+        self.out = out
+
+
+def need(*paths: Path | None) -> None:
+    """Refuse a path that is not there, before anything slow is loaded. Raises InputError."""
+    for path in paths:
+        if path is not None and not path.exists():
+            raise InputError(f"cannot read {path}: no such file or directory")
 
 
 @contextmanager

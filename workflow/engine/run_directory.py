@@ -6,6 +6,7 @@
     stages/<name>.npz | .json
     figures/
     report.html
+    controller.json .c .h     and those of the reference filter, where there is one
 
 A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the
 stage would be given now (its share of the configuration, its input files, the content of the stages before
@@ -39,7 +40,19 @@ _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba"
 
 
 # The manifest goes first when a run is deleted: what is left by a kill in between is then no run any more.
-_OWN_ENTRIES = ("manifest.json", "config.toml", "config.json", "stages", "figures", "report.html", "lock")
+CONTROLLER_FILES = tuple(
+    f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in (".json", ".c", ".h")
+)
+_OWN_ENTRIES = (
+    "manifest.json",
+    "config.toml",
+    "config.json",
+    "stages",
+    "figures",
+    "report.html",
+    *CONTROLLER_FILES,
+    "lock",
+)
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,7 @@ def whole_blocks(data: RunData) -> list[Block]:
 
 
 def _weight_words(data: RunData) -> str:
-    settings = data.config.prefilter
+    settings = data.config.reference_filter
     weight = None if settings is None else settings.error_weight
     if weight is None:
         return "W = 1."

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from workflow.config.renamed_keys import current_key
 from workflow.config.run_config import Section
 from workflow.config.settings import check, expand, read_toml
 from workflow.engine.errors import InputError
@@ -23,7 +24,7 @@ _DIGITS = 6  # of a number in a range: enough for any tuning, and short in names
 
 def _key(text: str) -> str:
     parse_key(text)
-    return text
+    return current_key(text)
 
 
 def _judged(name: str) -> str:

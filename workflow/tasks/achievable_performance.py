@@ -9,7 +9,7 @@ from typing import Any
 from control_design.convex.youla import YoulaOptions, youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
-from workflow.config.design_options import YardstickOptions
+from workflow.config.design_options import AchievableOptions
 from workflow.engine import codec
 from workflow.tasks.results import AchievablePerformance
 
@@ -28,7 +28,7 @@ UNKNOWN_TO_BRACKET = (
 def find_bracket(
     plants: Sequence[UncertainPlant],
     specification: Specification,
-    options: YardstickOptions,
+    options: AchievableOptions,
     progress: Callable[[float, str], None] | None = None,
 ) -> AchievablePerformance:
     """The bracket, or why there is none."""

@@ -30,7 +30,11 @@ from ident.basis.options import IdentOptions
 from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.design_options import (
+    AchievableOptions,
+    CertificateOptions,
+    ReferenceFilterSettings,
+)
 from workflow.config.run_config import RunConfig, Section
 from workflow.config.settings import InputPath, ModelT, check, read_toml
 from workflow.engine import codec, storage
@@ -123,8 +127,8 @@ class DesignFile:
     plant: PlantSection = field(default_factory=PlantSection)
     uncertainty: StatedUncertainty | None = None
     certificate: CertificateOptions | None = None
-    yardstick: YardstickOptions | None = None
-    prefilter: PrefilterSettings | None = None
+    achievable_performance: AchievableOptions | None = None
+    reference_filter: ReferenceFilterSettings | None = None
     path: Path | None = None
 
     @property
@@ -134,8 +138,8 @@ class DesignFile:
 
 def read_design_file(path: Path) -> DesignFile:
     """TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
-    [uncertainty], [synthesis], [certificate], [yardstick] and [prefilter]; of a run's configuration all of
-    these but the first two are taken. Raises InputError."""
+    [uncertainty], [synthesis], [certificate], [achievable_performance] and [reference_filter]; of a run's
+    configuration all of these but the first two are taken. Raises InputError."""
     _, document = read_toml(path)
     known = {
         "specification",
@@ -143,8 +147,8 @@ def read_design_file(path: Path) -> DesignFile:
         "uncertainty",
         "synthesis",
         "certificate",
-        "yardstick",
-        "prefilter",
+        "achievable_performance",
+        "reference_filter",
     }
     if "specification" not in document:
         wanted = {key: value for key, value in document.items() if key not in known}
@@ -166,8 +170,8 @@ def read_design_file(path: Path) -> DesignFile:
         plant=table("plant", PlantSection) or PlantSection.model_validate({}),
         uncertainty=table("uncertainty", StatedUncertainty),
         certificate=table("certificate", CertificateOptions),
-        yardstick=table("yardstick", YardstickOptions),
-        prefilter=table("prefilter", PrefilterSettings),
+        achievable_performance=table("achievable_performance", AchievableOptions),
+        reference_filter=table("reference_filter", ReferenceFilterSettings),
         path=path,
     )
 

@@ -3,39 +3,37 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
-from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from control_design.analysis.certificate import Certificate
-from control_design.controllers.c_code import c_source
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.data.record import Record
-from workflow.config.design_options import CertificateOptions, PrefilterSettings, YardstickOptions
+from workflow.config.design_options import (
+    AchievableOptions,
+    CertificateOptions,
+    ReferenceFilterSettings,
+)
 from workflow.config.run_config import RunConfig, SimulatedSource, load_config
 from workflow.engine import codec, storage
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import InputError, naming, need
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.engine.run_directory import RunDirectory, default_directory
 from workflow.tasks.achievable_performance import bracket_numbers, find_bracket, order_advice
+from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
 from workflow.tasks.design_source import DesignFile, DesignSource, load_sources, read_design_file
 from workflow.tasks.joint_coverage import certify_asked, joint_numbers, open_words
 from workflow.tasks.pipeline import config_of, run_pipeline
-from workflow.tasks.reference_filter import (
-    check_prefilter,
-    find_prefilter,
-    prefilter_bytes,
-    prefilter_file,
-)
+from workflow.tasks.reference_filter import check_filter, find_filter
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -147,21 +145,10 @@ def csv_text(record: Record) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _mat_bytes(controller: Controller) -> bytes:
-    stream = BytesIO()
-    controller.save_mat(stream)
-    return stream.getvalue()
-
-
 _NO_CONTROLLER = (
     "there is no controller and no certificate; lower bandwidth_rad_s, raise controller_order, or improve "
     "the model where its ellipses are widest"
 )
-_CONTROLLER_FILES: dict[str, Callable[[Controller], bytes]] = {
-    ".json": lambda controller: controller.to_json().encode(),
-    ".mat": _mat_bytes,
-    ".c": lambda controller: c_source(controller).encode("ascii"),
-}
 
 
 @dataclass(frozen=True)
@@ -171,8 +158,8 @@ class _Asked:
     specification: Specification
     synthesis: SynthesisOptions
     certificate: CertificateOptions
-    yardstick: YardstickOptions
-    prefilter: PrefilterSettings | None
+    achievable_performance: AchievableOptions
+    reference_filter: ReferenceFilterSettings | None
 
     @classmethod
     def of(cls, file: DesignFile, run: RunConfig | None, paths: Sequence[Path]) -> _Asked:
@@ -189,16 +176,16 @@ class _Asked:
                 specification,
                 file.synthesis or SynthesisOptions(),
                 file.certificate or CertificateOptions.model_validate({}),
-                file.yardstick or YardstickOptions.model_validate({}),
-                file.prefilter,
+                file.achievable_performance or AchievableOptions.model_validate({}),
+                file.reference_filter,
             )
         return cls(
             specification,
             file.synthesis or run.synthesis,
             file.certificate or run.certificate,
-            file.yardstick or run.yardstick,
-            # A design file without [prefilter] asks for none; it has no other way to.
-            run.prefilter if file.path is None else file.prefilter,
+            file.achievable_performance or run.achievable_performance,
+            # A design file without [reference_filter] asks for none; it has no other way to.
+            run.reference_filter if file.path is None else file.reference_filter,
         )
 
 
@@ -230,7 +217,7 @@ def _design(
         )
         if design.synthesis is None:
             return _Designed(replace(design, reason=f"specification not met: {design.reason}"))
-        achievable = find_bracket(plants, asked.specification, asked.yardstick)
+        achievable = find_bracket(plants, asked.specification, asked.achievable_performance)
         if not design.has_controller:
             return _Designed(design, achievable)
         controller = design.synthesis.controller
@@ -242,7 +229,9 @@ def _design(
             stage_rng(seed, "certify"),
             between_own_points=between_own_points,
         )
-        return _Designed(design, achievable, certified, find_prefilter(controller, plants, asked.prefilter))
+        return _Designed(
+            design, achievable, certified, find_filter(controller, plants, asked.reference_filter)
+        )
 
 
 def design_controller(
@@ -255,27 +244,28 @@ def design_controller(
     """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
 
     Without a design file the source must be a run directory, whose own specification is taken. With `out` the
-    controller is written, by its ending as JSON, MAT file or C source, and beside it a prefilter if there is
-    one; a controller that is not certified carries that in its name. A specification that no controller can
-    meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
+    controller is written, by its ending as JSON, MAT file or C source, and beside it a reference filter if
+    there is one; a controller that is not certified carries that in its name. A specification that no
+    controller can meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
     """
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(path) for path in sources]
     if not paths:
         raise InputError("nothing to design for: give at least one run directory or file with a plant")
     if out is not None:
         _check_out(out, paths)
-    for path in paths:
-        if not path.exists():
-            raise InputError(f"cannot read {path}: no such file or directory")
+    need(*paths)
     file = read_design_file(specification_path) if specification_path is not None else DesignFile()
-    found = load_sources(paths, file)
-    asked = _Asked.of(file, found[0].config, paths)
-    plants = [source.plant for source in found]
-    check_prefilter(asked.prefilter, plants[0].dt_s, str(file.path or paths[0]))
+    sources_found = load_sources(paths, file)
+    asked = _Asked.of(file, sources_found[0].config, paths)
+    plants = [source.plant for source in sources_found]
+    check_filter(asked.reference_filter, plants[0].dt_s, str(file.path or paths[0]))
     done = _design(plants, asked, file.plant.between_points, seed)
     certificate, order = done.certificate, asked.specification.controller_order
     certified = certificate is not None and certificate.certified
-    files = _write_controller(done, out) if out is not None and done.controller is not None else []
+    files: list[Path] = []
+    if out is not None and done.controller is not None:
+        found = done.reference_filter.filter
+        files = write_controller(out, done.controller, found, certified=certified)
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = order_advice(done.achievable, gamma, order)
@@ -285,12 +275,12 @@ def design_controller(
     names = [plant.name for plant in plants]
     about = [
         {"file": str(path), "plant": source.plant.name, "origin": source.origin, "remarks": source.remarks}
-        for path, source in zip(paths, found, strict=True)
+        for path, source in zip(paths, sources_found, strict=True)
     ]
     return RunSummary(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
         sections=(
-            Section("plants", tuple(row for source in found for row in _plant_rows(source))),
+            Section("plants", tuple(row for source in sources_found for row in _plant_rows(source))),
             Section(
                 "design",
                 (
@@ -316,7 +306,7 @@ def design_controller(
             "sampled_responses": joint_numbers(sampled),
             "reference_filter": codec.plain(done.reference_filter.filter),
             "file": str(files[0]) if files else None,
-            "reference_filter_file": str(files[1]) if len(files) > 1 else None,
+            "files": [str(path) for path in files],
         },
         certified=certified,
         verdict=reason,
@@ -325,27 +315,12 @@ def design_controller(
 
 def _check_out(out: Path, sources: Sequence[Path]) -> None:
     """Refuse a place for the controller before anything is computed."""
-    if out.suffix.lower() not in _CONTROLLER_FILES:
-        raise InputError(f"--out {out}: the ending must be one of {', '.join(_CONTROLLER_FILES)}")
-    storage.check_writable(out)
-    for path in (out, prefilter_file(out)):
+    if not out.is_dir() and out.suffix.lower() not in SUFFIXES:
+        raise InputError(f"--out {out}: the ending must be one of {', '.join(SUFFIXES)}, or a directory")
+    for path in (one for target in targets(out) for one in (target, filter_file(target))):
+        storage.check_writable(path)
         if path.absolute() in [source.absolute() for source in sources]:
             raise InputError(f"--out {out}: {path} is a source; give the controller a name of its own")
-
-
-def _write_controller(done: _Designed, out: Path) -> list[Path]:
-    """The controller, and beside it the prefilter; the files written."""
-    written, suffix = done.controller, out.suffix.lower()
-    assert written is not None
-    if done.certificate is None or not done.certificate.certified:
-        written = replace(written, name=f"{written.name} (NOT CERTIFIED)")
-    content = {out: _CONTROLLER_FILES[suffix](written)}
-    prefilter = done.reference_filter.filter
-    if prefilter is not None:
-        content[prefilter_file(out)] = prefilter_bytes(prefilter, suffix)
-    for path, data in content.items():
-        storage.write_bytes(path, data)
-    return list(content)
 
 
 def _reason(done: _Designed, advice: str | None) -> str:

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from workflow.config.run_config import RunConfig
-from workflow.engine import storage
+from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
-from workflow.engine.errors import InputError, one_line
+from workflow.engine.errors import CommandInterruptedError, InputError, one_line
 from workflow.engine.progress import Progress, Silence
-from workflow.engine.run_directory import LAYOUT_VERSION, RunDirectory, hash_of
+from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
+from workflow.tasks.controller_files import write_controller
 from workflow.tasks.results import RecordsResult, RunResults
 from workflow.tasks.stages import STAGES, Stage, StageInput
 from workflow.tasks.summary import RunSummary, summarise
@@ -64,7 +65,11 @@ def run_pipeline(
             for stage in STAGES:
                 before = (ready, ready_s) if stage is first else None
                 _perform(stage, config, results, progress, inputs, before)
+            _keep_controller(results)
             summary = summarise(results, config)
+        except KeyboardInterrupt:
+            run.record_status("interrupted")
+            raise CommandInterruptedError(out) from None
         except BaseException as error:
             _fail(run, error, created=not existed)
             raise
@@ -110,6 +115,7 @@ def _perform(
     result, before_s = ready if ready is not None else (None, 0.0)
     if result is None:
         result = stage.run(StageInput(config, results, progress))
+    interrupts.check()
     run.save_stage(stage.name, result, input_hash)
     # The stages after it see what is on the disk, as they would in a resumed run: to the last digit.
     results.forget(stage.name)
@@ -131,6 +137,18 @@ def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs:
             "after": {name: run.stage_digest(name) for name in stage.after},
         }
     )
+
+
+def _keep_controller(results: RunResults) -> None:
+    """controller.json, .c and .h in the run directory; none of an earlier design stay."""
+    design, certify = results.design, results.certify
+    written: list[Path] = []
+    if design.synthesis is not None and certify.certificate is not None:
+        law, found = design.synthesis.controller, results.reference_filter.filter
+        written = write_controller(results.run.path, law, found, certified=certify.certified)
+    for name in CONTROLLER_FILES:
+        if results.run.path / name not in written:
+            (results.run.path / name).unlink(missing_ok=True)
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:

@@ -1,38 +1,33 @@
-"""The prefilter of a design (u = K (F r - y)): designed after K, told, and written beside the controller."""
+"""The reference filter of a design (u = K (F r - y)): designed after K, and told."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from io import BytesIO
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-import scipy.io
 import scipy.signal
 
-from control_design.controllers.c_code import c_source
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import Prefilter, PrefilterOptions, design_prefilter
+from control_design.convex.reference_filter import PrefilterOptions, design_prefilter
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight
-from workflow.config.design_options import PrefilterSettings
+from workflow.config.design_options import ReferenceFilterSettings
 from workflow.engine.errors import InputError
 from workflow.tasks.results import ReferenceFilterResult
 
 
-def find_prefilter(
-    controller: Controller, plants: Sequence[UncertainPlant], settings: PrefilterSettings | None
+def find_filter(
+    controller: Controller, plants: Sequence[UncertainPlant], settings: ReferenceFilterSettings | None
 ) -> ReferenceFilterResult:
     """The filter, or why there is none.
 
     A loop that is not robustly stable has no worst-case error: a result, with the reason. Raises InputError:
-    see `check_prefilter`.
+    see `check_filter`.
     """
     if settings is None:
         return ReferenceFilterResult()
-    check_prefilter(settings, controller.dt_s)
+    check_filter(settings, controller.dt_s)
     own = {"corner_rad_s", "model_order", "model", "weight"}
     options = PrefilterOptions(**settings.model_dump(exclude=own))
     try:
@@ -44,14 +39,14 @@ def find_prefilter(
     return ReferenceFilterResult(found)
 
 
-def check_prefilter(settings: PrefilterSettings | None, dt_s: float, source: str = "") -> None:
+def check_filter(settings: ReferenceFilterSettings | None, dt_s: float, source: str = "") -> None:
     """Refuse frequencies that a sampling time does not allow, before anything is designed.
 
     source: the file, for the complaint. Raises InputError: one line naming the key.
     """
     if settings is None:
         return
-    nyquist, where = np.pi / dt_s, f"{source}: prefilter" if source else "prefilter"
+    nyquist, where = np.pi / dt_s, f"{source}: reference_filter" if source else "reference_filter"
     for rate in settings.poles_rad_s or ():
         if not 0 < rate < nyquist:
             raise InputError(
@@ -85,47 +80,3 @@ def model_answer(
     """Answer (T,) of the reference model, by Tustin's map as the design sees it, to a reference (T,)."""
     discrete = scipy.signal.bilinear(model.numerator, model.denominator, 1.0 / dt_s)
     return np.asarray(scipy.signal.lfilter(*discrete, reference), dtype=np.float64)
-
-
-def _mat(prefilter: Prefilter) -> bytes:
-    """What `Prefilter.save_mat` writes, in memory: files of ours appear whole or not at all."""
-    stream, data = BytesIO(), prefilter.to_dict()
-    target: Any = stream  # scipy takes any binary file; its annotations know of paths only
-    scipy.io.savemat(target, {key: data[key] for key in data if key not in ("format", "law")})
-    return stream.getvalue()
-
-
-def _c(prefilter: Prefilter) -> bytes:
-    """The controller's generator serves: a state space without limits, from reference to filtered one."""
-    as_law = Controller(
-        A=prefilter.A,
-        B=prefilter.B,
-        C=prefilter.C,
-        D=prefilter.D,
-        dt_s=prefilter.dt_s,
-        computational_delay_samples=0,
-        anti_windup_gain=np.zeros_like(prefilter.B),
-        name="prefilter",
-    )
-    note = (
-        "/* Prefilter F of u = K (F r - y): give each sample of the reference to prefilter_step as its\n"
-        "   argument `error`; what it returns, less the measurement, is the error for the controller. */\n"
-    )
-    return (note + c_source(as_law, "prefilter")).encode("ascii")
-
-
-_FILES: dict[str, Callable[[Prefilter], bytes]] = {
-    ".json": lambda prefilter: prefilter.to_json().encode(),
-    ".mat": _mat,
-    ".c": _c,
-}
-
-
-def prefilter_file(controller_file: Path) -> Path:
-    """Where the prefilter of a controller is written: beside it, by the same ending."""
-    return controller_file.with_name(f"{controller_file.stem}_prefilter{controller_file.suffix}")
-
-
-def prefilter_bytes(prefilter: Prefilter, suffix: str) -> bytes:
-    """The file's content, by the ending .json, .mat or .c."""
-    return _FILES[suffix.lower()](prefilter)

@@ -16,7 +16,7 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
     """Options, and of the specification what the bracket knows: another order leaves it as it is."""
     return {
         "specification": config.specification.model_dump(mode="json", exclude=set(UNKNOWN_TO_BRACKET)),
-        "yardstick": config.yardstick.model_dump(mode="json"),
+        "achievable_performance": config.achievable_performance.model_dump(mode="json"),
         "purposes": [config.purpose_of(index) for index in range(len(config.channels))],
         "levels": [channel.uncertainty.level for channel in config.channels],
     }
@@ -31,4 +31,4 @@ def find_achievable(stage: StageInput) -> AchievablePerformance:
     config = stage.config
     with naming("achievable performance"):
         plant = stage.results.uncertainty.plant(config)
-        return find_bracket([plant], config.specification, config.yardstick, report)
+        return find_bracket([plant], config.specification, config.achievable_performance, report)

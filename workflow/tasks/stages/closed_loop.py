@@ -84,8 +84,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             stage, controller, prefilter, plant, posterior, trial.reference[: trial.half]
         )
     model = None
-    if prefilter is not None and config.prefilter is not None:
-        model = model_answer(config.prefilter.reference_model, trial.reference, controller.dt_s)
+    if prefilter is not None and config.reference_filter is not None:
+        model = model_answer(config.reference_filter.reference_model, trial.reference, controller.dt_s)
     return ClosedLoopResult(
         check=LoopCheck(
             machine=config.machine,

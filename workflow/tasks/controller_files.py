@@ -1,0 +1,97 @@
+"""A controller as files, and its reference filter beside it; one that is not certified says so inside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from control_design.controllers.c_code import c_header, c_source
+from control_design.controllers.controller import Controller
+from control_design.convex.reference_filter import Prefilter
+from workflow.engine import codec, storage
+
+RUN_FILES = ("controller.json", "controller.c", "controller.h")
+"""What a run leaves in its directory; those of a reference filter are named after them (`filter_file`)."""
+
+_NOTE = (
+    "/* Reference filter F of u = K (F r - y): give each sample of the reference to\n"
+    "   reference_filter_step as its argument `error`; what it returns, less the measurement, is the error for the controller. */\n"
+)
+
+
+def _mat(controller: Controller) -> bytes:
+    stream = BytesIO()
+    controller.save_mat(stream)
+    return stream.getvalue()
+
+
+def _filter_mat(found: Prefilter) -> bytes:
+    stream: Any = BytesIO()  # scipy takes any binary file; its annotations know of paths only
+    scipy.io.savemat(stream, codec.plain(found))
+    return bytes(stream.getvalue())
+
+
+def _as_law(found: Prefilter) -> Controller:
+    """The controller's generator serves: a state space without limits, from reference to filtered one."""
+    return Controller(
+        A=found.A,
+        B=found.B,
+        C=found.C,
+        D=found.D,
+        dt_s=found.dt_s,
+        computational_delay_samples=0,
+        anti_windup_gain=np.zeros_like(found.B),
+        name="reference_filter",
+    )
+
+
+_CONTROLLER: Mapping[str, Callable[[Controller], bytes]] = {
+    ".json": lambda controller: controller.to_json().encode(),
+    ".mat": _mat,
+    ".c": lambda controller: c_source(controller).encode("ascii"),
+    ".h": lambda controller: c_header(controller).encode("ascii"),
+}
+_FILTER: Mapping[str, Callable[[Prefilter], bytes]] = {
+    ".json": lambda found: found.to_json().encode(),
+    ".mat": _filter_mat,
+    ".c": lambda found: (_NOTE + c_source(_as_law(found), "reference_filter")).encode("ascii"),
+    ".h": lambda found: (_NOTE + c_header(_as_law(found), "reference_filter")).encode("ascii"),
+}
+SUFFIXES = (".json", ".mat", ".c")
+
+
+def filter_file(controller_file: Path) -> Path:
+    """Where the reference filter of a controller is written: beside it, by the same ending."""
+    return controller_file.with_name(f"{controller_file.stem}_reference_filter{controller_file.suffix}")
+
+
+def filter_bytes(found: Prefilter, suffix: str) -> bytes:
+    """The file's content, by the ending."""
+    return _FILTER[suffix.lower()](found)
+
+
+def targets(out: Path) -> list[Path]:
+    """Files of a controller written to `out`: those of a run in a directory, C with its header."""
+    if out.is_dir():
+        return [out / name for name in RUN_FILES]
+    return [out, out.with_suffix(".h")] if out.suffix.lower() == ".c" else [out]
+
+
+def write_controller(
+    out: Path, controller: Controller, reference_filter: Prefilter | None, *, certified: bool
+) -> list[Path]:
+    """Write the `targets` of `out` where their content is not there already; the files there are now."""
+    law = controller if certified else replace(controller, name=f"{controller.name} (NOT CERTIFIED)")
+    content = {path: _CONTROLLER[path.suffix.lower()](law) for path in targets(out)}
+    if reference_filter is not None:
+        content |= {filter_file(path): filter_bytes(reference_filter, path.suffix) for path in targets(out)}
+    for path, data in content.items():
+        if not path.is_file() or path.read_bytes() != data:
+            storage.write_bytes(path, data)
+    return list(content)
