@@ -21,7 +21,8 @@ RUN_FILES = ("controller.json", "controller.c", "controller.h")
 
 _NOTE = (
     "/* Reference filter F of u = K (F r - y): give each sample of the reference to\n"
-    "   reference_filter_step as its argument `error`; what it returns, less the measurement, is the error for the controller. */\n"
+    "   reference_filter_step as its argument `error`; what it returns, less the measurement, is the error\n"
+    "   for the controller. */\n"
 )
 
 
