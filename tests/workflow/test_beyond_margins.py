@@ -42,6 +42,7 @@ from workflow.tasks.achievable_performance import (
     find_bracket,
     order_advice,
 )
+from workflow.tasks.controller_files import filter_bytes, filter_file
 from workflow.tasks.joint_coverage import (
     certify_asked,
     joint_numbers,
@@ -51,13 +52,7 @@ from workflow.tasks.joint_coverage import (
     undrawable,
 )
 from workflow.tasks.proportions import wilson_interval
-from workflow.tasks.reference_filter import (
-    filter_bytes,
-    filter_file,
-    filter_words,
-    find_filter,
-    model_answer,
-)
+from workflow.tasks.reference_filter import filter_words, find_filter, model_answer
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
