@@ -28,6 +28,7 @@ import numpy as np
 from benchmarks.harness import RESULTS, Print, main
 from control_design import (
     Controller,
+    LoopFunction,
     Specification,
     SynthesisOptions,
     UncertainPlant,
@@ -115,8 +116,8 @@ def nominal_cost(controller: Controller, plant: UncertainPlant, specification: S
     k = np.asarray(control.frequency_response(controller.to_control(include_delay=True), omega).complex)
     g = np.asarray(control.frequency_response(plant.nominal, omega).complex)
     sensitivity = 1 / np.abs(1 + g.reshape(-1) * k.reshape(-1))
-    w1 = specification.sensitivity_magnitude(omega, plant.dt_s)
-    w3 = specification.effort_magnitude(omega, plant.dt_s)
+    w1 = specification.magnitude(plant, omega, LoopFunction.SENSITIVITY)
+    w3 = specification.magnitude(plant, omega, LoopFunction.EFFORT)
     return float(np.max(np.maximum(w1, w3 * np.abs(k.reshape(-1))) * sensitivity))
 
 

@@ -1,7 +1,7 @@
 """From an uncertain frequency response to a certified controller."""
 
 from control_design.analysis.between_grid_points import AllFrequencies
-from control_design.analysis.certificate import Certificate, PlantVerdict, SpecificationItem, certify
+from control_design.analysis.certificate import Certificate, PlantVerdict, certify
 from control_design.analysis.closed_loop import (
     ClosedLoopTrajectory,
     LinearMachine,
@@ -20,6 +20,7 @@ from control_design.plants.ellipses import Ellipses
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import Channel, Mode, UncertainPlant
 from control_design.plants.weights import RationalWeight
+from control_design.requirement import LoopFunction, SpecificationItem
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.joint_synthesis import JointDesign, synthesise_jointly
 from control_design.synthesis.synthesis import SynthesisOptions, synthesise
@@ -44,6 +45,7 @@ __all__ = [
     "JointCoverage",
     "JointDesign",
     "LinearMachine",
+    "LoopFunction",
     "Margins",
     "Mode",
     "Outcome",

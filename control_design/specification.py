@@ -15,16 +15,25 @@ m^2), so that |W1| is at least sqrt 2 (-3 dB of S) up to the bandwidth.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from control_design.controllers.biquads import SectionKind, imaginary_axis
+from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, modes_of
 from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight
+from control_design.requirement import (
+    Findings,
+    LoopFunction,
+    Requirement,
+    SpecificationItem,
+    WeightedRequirement,
+    constant_weight,
+    tustin_zeros,
+)
 
 __all__ = ["RationalWeight", "Specification", "SpecificationError", "performance_modes"]
 
@@ -174,63 +183,32 @@ class Specification(BaseModel):
             return self.effort_weight
         return effort_limit_weight(self.effort_limit, self.effort_rolloff_rad_s)
 
-    def tracking_at(self, s: Complex, plant_integrators: int = 0) -> Complex:
-        """`tracking_weight` at complex s; the modulus margin where there is no tracking requirement."""
-        weight = self.tracking_weight(plant_integrators)
-        if weight is None:
-            return np.full(np.shape(s), self.modulus_margin, dtype=np.complex128)
-        return weight.at(np.asarray(s, dtype=np.complex128))
+    def requirements(self, plant: UncertainPlant) -> tuple[Requirement, ...]:
+        """Everything asked of one plant's loop."""
+        found = (kind.of(self, plant) for kind in REQUIREMENTS)
+        return tuple(each for each in found if each is not None)
 
-    def sensitivity_magnitude(self, omega_rad_s: Real, dt_s: float, plant_integrators: int = 0) -> Real:
-        """|W1| (F,): tracking and modulus margin together."""
-        s = imaginary_axis(omega_rad_s, dt_s)
-        return np.maximum(np.abs(self.tracking_at(s, plant_integrators)), self.modulus_margin)
+    def weighted(self, plant: UncertainPlant) -> tuple[WeightedRequirement, ...]:
+        """The requirements that bound a closed-loop function."""
+        return tuple(each for each in self.requirements(plant) if isinstance(each, WeightedRequirement))
 
-    def effort_magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
-        """|W3| (F,); zeros where effort is not limited."""
-        s = imaginary_axis(omega_rad_s, dt_s)
-        weight = self.limit_weight()
-        return np.zeros(s.shape) if weight is None else np.abs(weight.at(s))
+    def on_controller(self) -> tuple[Requirement, ...]:
+        """What is asked of the controller alone."""
+        found: list[Requirement] = []
+        if self.controller_damping is not None:
+            found.append(ControllerDamping(self.controller_damping))
+        if self.integrator:
+            found.append(ControllerIntegrator())
+        return tuple(found)
 
-    def mode_band(self, plant: UncertainPlant) -> tuple[float, float] | None:
-        """Band of the damping requirement for this plant, or None without one.
-
-        Raises
-        ------
-        SpecificationError
-            If damping is asked for and the plant has no flexible mode and no band is given.
-        """
-        if self.mode_peak_ratio is None:
-            return None
-        if self.mode_band_rad_s is not None:
-            return self.mode_band_rad_s
-        modes = performance_modes(plant)
-        if not modes:
-            raise SpecificationError(
-                f"mode_peak_ratio: plant {plant.name!r} has no lightly damped mode; give mode_band_rad_s"
-            )
-        return modes[0].omega_rad_s / 1.5, modes[0].omega_rad_s * 1.5
-
-    def mode_reference_peak(self, plant: UncertainPlant) -> float:
-        """Open-loop peak of the nominal |Gp| inside the band (the reference of mode_peak_ratio)."""
-        band = self.mode_band(plant)
-        assert band is not None
-        omega = np.geomspace(band[0], min(band[1], plant.nyquist_rad_s), 2000)
-        for mode in performance_modes(plant):
-            width = max(mode.zeta * mode.omega_rad_s, 1e-9)
-            omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
-        omega = omega[(omega >= band[0]) & (omega <= min(band[1], plant.nyquist_rad_s))]
-        channel = plant.channel if plant.performance is None else plant.performance
-        return float(np.max(np.abs(channel.nominal_response(np.unique(omega)))))
-
-    def damping_magnitude(self, omega_rad_s: Real, plant: UncertainPlant) -> Real:
-        """|W4| (F,); zeros outside the band or without a damping requirement."""
-        omega = np.asarray(omega_rad_s, dtype=np.float64)
-        band = self.mode_band(plant)
-        if band is None or self.mode_peak_ratio is None:
-            return np.zeros(omega.shape)
-        inside = (omega >= band[0]) & (omega <= band[1])
-        return np.where(inside, 1.0 / (self.mode_peak_ratio * self.mode_reference_peak(plant)), 0.0)
+    def magnitude(self, plant: UncertainPlant, omega_rad_s: Real, function: LoopFunction) -> Real:
+        """|W| (F,) on one closed-loop function, all requirements on it together; zeros where none is."""
+        sizes = [
+            each.magnitude(omega_rad_s, plant.dt_s)
+            for each in self.weighted(plant)
+            if each.function is function
+        ]
+        return np.max(sizes, axis=0) if sizes else np.zeros(np.shape(omega_rad_s))
 
     def check_against(self, plants: Sequence[UncertainPlant]) -> None:
         """Refuse, before optimising, what no controller can do.
@@ -251,91 +229,226 @@ class Specification(BaseModel):
         if len({plant.dt_s for plant in plants}) > 1:
             raise SpecificationError(f"the plants differ in sampling time: {[p.dt_s for p in plants]} s")
         for plant in plants:
-            self._check_frequencies(plant)
-            self._check_zeros(plant)
-            self._check_effort(plant)
-            self.mode_band(plant)
+            _refuse_frequencies(self, plant)
+            _refuse_zeros(self, plant)
+            _refuse_effort(self, plant)
+            self.requirements(plant)
 
-    def _check_frequencies(self, plant: UncertainPlant) -> None:
-        for name in ("bandwidth_rad_s", "effort_rolloff_rad_s"):
-            value = getattr(self, name)
-            if value is not None and not value < plant.nyquist_rad_s:
+
+class Tracking(WeightedRequirement):
+    """|W1 S| <= 1 where W1 asks for more than the modulus margin."""
+
+    name, caption, function = "tracking", "tracking, largest |W1 S|", LoopFunction.SENSITIVITY
+
+    @classmethod
+    def of(cls, spec: Specification, plant: UncertainPlant) -> Tracking | None:
+        weight = spec.tracking_weight(plant.n_integrators)
+        return None if weight is None else cls(weight, above=spec.modulus_margin)
+
+
+class ModulusMargin(WeightedRequirement):
+    """|m S| <= 1: the loop keeps the distance m from -1."""
+
+    name, caption, function = "modulus", "modulus margin, worst case", LoopFunction.SENSITIVITY
+
+    @classmethod
+    def of(cls, spec: Specification, plant: UncertainPlant) -> ModulusMargin:
+        return cls(constant_weight(spec.modulus_margin))
+
+    def check(self, found: Findings) -> SpecificationItem:
+        """In terms of the distance itself."""
+        wanted = self.weight.numerator[0]
+        achieved, omega = found.modulus
+        bound = None if found.bounds is None else wanted / found.bounds.get(self.name, np.inf)
+        met = bool(achieved >= wanted) and found.proved(self.name)
+        return SpecificationItem(self.caption, found.plant, wanted, achieved, "", met, omega, bound)
+
+
+class Effort(WeightedRequirement):
+    """|W3 K S| <= 1."""
+
+    name, caption, function = "effort", "effort, largest |W3 K S|", LoopFunction.EFFORT
+
+    @classmethod
+    def of(cls, spec: Specification, plant: UncertainPlant) -> Effort | None:
+        weight = spec.limit_weight()
+        return None if weight is None else cls(weight)
+
+
+class ModePeak(WeightedRequirement):
+    """|W4 Gp S| <= 1 in the band of the flexible mode, W4 = 1/(ratio x open-loop peak of the nominal Gp)."""
+
+    name, caption, function = (
+        "mode damping",
+        "damping of the mode, largest |W4 Gp S|",
+        LoopFunction.DISTURBANCE,
+    )
+
+    @classmethod
+    def of(cls, spec: Specification, plant: UncertainPlant) -> ModePeak | None:
+        """SpecificationError if the plant has no flexible mode and no band is given."""
+        if spec.mode_peak_ratio is None:
+            return None
+        band, modes = spec.mode_band_rad_s, performance_modes(plant)
+        if band is None:
+            if not modes:
                 raise SpecificationError(
-                    f"{name} = {value:.4g} rad/s lies beyond the Nyquist frequency "
-                    f"{plant.nyquist_rad_s:.4g} rad/s"
+                    f"mode_peak_ratio: plant {plant.name!r} has no lightly damped mode; give mode_band_rad_s"
                 )
-        if self.mode_band_rad_s is not None and not self.mode_band_rad_s[0] < plant.nyquist_rad_s:
-            raise SpecificationError(
-                f"mode_band_rad_s starts at {self.mode_band_rad_s[0]:.4g} rad/s, beyond the Nyquist "
-                "frequency "
-                f"{plant.nyquist_rad_s:.4g} rad/s"
-            )
-        if self.mode_band_rad_s is not None and plant.n_integrators and self.mode_band_rad_s[0] < 1e-3:
-            raise SpecificationError(
-                f"mode_band_rad_s starts at {self.mode_band_rad_s[0]:.4g} rad/s, where plant {plant.name!r} "
-                "integrates and has no finite peak"
-            )
-        if self.integrator and np.any(np.abs(plant.zeros - 1.0) < 1e-6):
-            raise SpecificationError(
-                f"integrator asked for, but plant {plant.name!r} has a zero at z = 1: the two would cancel"
-            )
+            band = modes[0].omega_rad_s / 1.5, modes[0].omega_rad_s * 1.5
+        high = min(band[1], plant.nyquist_rad_s)
+        omega = np.geomspace(band[0], high, 2000)
+        for mode in modes:
+            width = max(mode.zeta * mode.omega_rad_s, 1e-9)
+            omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
+        omega = np.unique(omega[(omega >= band[0]) & (omega <= high)])
+        channel = plant.channel if plant.performance is None else plant.performance
+        peak = float(np.max(np.abs(channel.nominal_response(omega))))
+        weight = constant_weight(1.0 / (spec.mode_peak_ratio * peak))
+        return cls(weight, band, channel=plant.performance)
 
-    def _check_zeros(self, plant: UncertainPlant) -> None:
-        dt = plant.dt_s
-        zeros = plant.zeros
-        outside = zeros[np.abs(zeros) > 1.0 + 1e-9]
-        w = 2.0 / dt * (outside - 1.0) / (outside + 1.0) if outside.size else np.zeros(0, complex)
-        d0 = float(np.asarray(plant.nominal.D)[0, 0])
-        if d0 == 0.0 or self.computational_delay_samples > 0:
-            w = np.append(w, 2.0 / dt)
-        if not w.size:
-            return
-        bound = np.abs(self.tracking_at(w, plant.n_integrators))
-        worst = int(np.argmax(bound))
-        if bound[worst] <= 1.0:
-            return
-        last = worst == w.size - 1 and w[worst] == 2.0 / dt
-        where = (
-            "the sampling delay" if last else f"the non-minimum-phase zero at {np.abs(w[worst]):.4g} rad/s"
-        )
-        message = (
-            f"plant {plant.name!r}: {where} makes the tracking requirement "
-            f"impossible by a factor {bound[worst]:.3g}"
-        )
-        if self.bandwidth_rad_s is not None:
-            low, high = 0.0, self.bandwidth_rad_s
-            for _ in range(60):
-                mid = 0.5 * (low + high)
-                trial = self.model_copy(update={"bandwidth_rad_s": max(mid, 1e-300)})
-                low, high = (
-                    (mid, high)
-                    if np.all(np.abs(trial.tracking_at(w, plant.n_integrators)) <= 1.0)
-                    else (low, mid)
-                )
-            message += (
-                f": bandwidth_rad_s = {self.bandwidth_rad_s:.4g}, at most {low:.4g} with modulus_margin "
-                f"{self.modulus_margin:.3g}"
-            )
-        raise SpecificationError(message)
 
-    def _check_effort(self, plant: UncertainPlant) -> None:
-        omega = np.geomspace(1e-4, plant.nyquist_rad_s, 4000)
-        effort = self.effort_magnitude(omega, plant.dt_s)
-        if not np.any(effort > 0):
-            return
-        gain = np.abs(plant.channel.nominal_response(omega))
-        tracking = self.sensitivity_magnitude(omega, plant.dt_s, plant.n_integrators)
-        with np.errstate(divide="ignore", over="ignore"):
-            bound = 1.0 / (1.0 / tracking + gain / np.maximum(effort, 1e-300))
-        worst = int(np.argmax(bound))
-        if bound[worst] > 1.0:
-            needed = (1.0 - 1.0 / tracking[worst]) / gain[worst]
+@dataclass(frozen=True)
+class DelayMargin(Requirement):
+    """The loop stands this much more delay; the synthesis carries a delayed copy of every plant."""
+
+    delay_s: float
+    caption = "delay margin, worst case"
+
+    @classmethod
+    def of(cls, spec: Specification, plant: UncertainPlant) -> DelayMargin | None:
+        return None if spec.delay_margin_s is None else cls(spec.delay_margin_s)
+
+    def check(self, found: Findings) -> SpecificationItem:
+        met = bool(found.delay_s >= self.delay_s)
+        return SpecificationItem(self.caption, found.plant, self.delay_s, found.delay_s, "s", met)
+
+
+@dataclass(frozen=True)
+class ModeDamping(Requirement):
+    """Least damped mode of the nominal closed loop in a band; without one there, damping is no issue."""
+
+    zeta: float
+    band: tuple[float, float]
+    caption = "damping ratio of the nominal closed loop's modes"
+
+    @classmethod
+    def of(cls, spec: Specification, plant: UncertainPlant) -> ModeDamping | None:
+        if spec.mode_damping is None or spec.mode_band_rad_s is None:
+            return None
+        return cls(spec.mode_damping, spec.mode_band_rad_s)
+
+    def check(self, found: Findings) -> SpecificationItem:
+        inside = [mode for mode in found.modes if self.band[0] <= mode.omega_rad_s <= self.band[1]]
+        least = min(inside, key=lambda mode: mode.zeta, default=None)
+        achieved, omega = (1.0, None) if least is None else (least.zeta, least.omega_rad_s)
+        met = least is None or achieved >= self.zeta
+        return SpecificationItem(self.caption, found.plant, self.zeta, achieved, "", met, omega)
+
+
+@dataclass(frozen=True)
+class ControllerDamping(Requirement):
+    """Damping ratio of the controller's own pole pairs, a bound on parameters in the synthesis."""
+
+    zeta: float
+    caption = "damping ratio of the controller's own poles"
+
+    def check(self, found: Findings) -> SpecificationItem:
+        # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.
+        poles = found.controller.poles
+        w = 2 / found.controller.dt_s * (poles - 1) / (poles + 1)
+        pairs = w[np.imag(w) > 0]
+        zeta = -np.real(pairs) / np.abs(pairs)
+        least = int(np.argmin(zeta)) if pairs.size else None
+        achieved, omega = (1.0, None) if least is None else (float(zeta[least]), float(np.abs(pairs[least])))
+        met = achieved >= self.zeta * (1 - SOLVER_SLACK)
+        return SpecificationItem(self.caption, "controller", self.zeta, achieved, "", met, omega)
+
+
+@dataclass(frozen=True)
+class ControllerIntegrator(Requirement):
+    """A pole of the controller at z = 1, part of its structure in the synthesis."""
+
+    caption = "integrators in the controller"
+
+    def check(self, found: Findings) -> SpecificationItem:
+        own = count_integrators(found.controller.poles)
+        return SpecificationItem(self.caption, "controller", 1.0, float(own), "", bool(own >= 1))
+
+
+REQUIREMENTS = (ModulusMargin, Tracking, Effort, ModePeak, DelayMargin, ModeDamping)
+"""What may be asked of a plant's loop; each has `of(specification, plant)`, None where it is not asked."""
+
+
+def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
+    nyquist = plant.nyquist_rad_s
+    for name in ("bandwidth_rad_s", "effort_rolloff_rad_s"):
+        value = getattr(spec, name)
+        if value is not None and not value < nyquist:
             raise SpecificationError(
-                f"plant {plant.name!r}: at {omega[worst]:.4g} rad/s tracking needs |K S| of at "
-                f"least {needed:.4g}, the effort "
-                f"limit there is {1.0 / effort[worst]:.4g}; the two contradict each other by a "
-                f"factor {bound[worst]:.3g}"
+                f"{name} = {value:.4g} rad/s lies beyond the Nyquist frequency {nyquist:.4g} rad/s"
             )
+    low = np.inf if spec.mode_band_rad_s is None else spec.mode_band_rad_s[0]
+    if spec.mode_band_rad_s is not None and not low < nyquist:
+        raise SpecificationError(
+            f"mode_band_rad_s starts at {low:.4g} rad/s, beyond the Nyquist frequency {nyquist:.4g} rad/s"
+        )
+    if plant.n_integrators and low < 1e-3:
+        raise SpecificationError(
+            f"mode_band_rad_s starts at {low:.4g} rad/s, where plant {plant.name!r} integrates and has no "
+            "finite peak"
+        )
+    if spec.integrator and np.any(np.abs(plant.zeros - 1.0) < 1e-6):
+        raise SpecificationError(
+            f"integrator asked for, but plant {plant.name!r} has a zero at z = 1: the two would cancel"
+        )
+
+
+def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
+    w = tustin_zeros(plant, spec.computational_delay_samples)
+    weight = spec.tracking_weight(plant.n_integrators)
+    bound = np.zeros(0) if weight is None else np.abs(weight.at(w))
+    if not np.any(bound > 1.0):
+        return
+    worst = int(np.argmax(bound))
+    last = worst == w.size - 1 and w[worst] == 2.0 / plant.dt_s
+    where = "the sampling delay" if last else f"the non-minimum-phase zero at {np.abs(w[worst]):.4g} rad/s"
+    message = (
+        f"plant {plant.name!r}: {where} makes the tracking requirement impossible by a factor "
+        f"{bound[worst]:.3g}"
+    )
+    if spec.bandwidth_rad_s is not None:
+        low, high = 0.0, spec.bandwidth_rad_s
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            trial = spec.model_copy(update={"bandwidth_rad_s": max(middle, 1e-300)})
+            weight = trial.tracking_weight(plant.n_integrators)
+            possible = weight is not None and bool(np.all(np.abs(weight.at(w)) <= 1.0))
+            low, high = (middle, high) if possible else (low, middle)
+        message += (
+            f": bandwidth_rad_s = {spec.bandwidth_rad_s:.4g}, at most {low:.4g} with modulus_margin "
+            f"{spec.modulus_margin:.3g}"
+        )
+    raise SpecificationError(message)
+
+
+def _refuse_effort(spec: Specification, plant: UncertainPlant) -> None:
+    omega = np.geomspace(1e-4, plant.nyquist_rad_s, 4000)
+    effort = spec.magnitude(plant, omega, LoopFunction.EFFORT)
+    if not np.any(effort > 0):
+        return
+    gain = np.abs(plant.channel.nominal_response(omega))
+    tracking = spec.magnitude(plant, omega, LoopFunction.SENSITIVITY)
+    with np.errstate(divide="ignore", over="ignore"):
+        bound = 1.0 / (1.0 / tracking + gain / np.maximum(effort, 1e-300))
+    worst = int(np.argmax(bound))
+    if bound[worst] > 1.0:
+        needed = (1.0 - 1.0 / tracking[worst]) / gain[worst]
+        raise SpecificationError(
+            f"plant {plant.name!r}: at {omega[worst]:.4g} rad/s tracking needs |K S| of at least "
+            f"{needed:.4g}, the effort limit there is {1.0 / effort[worst]:.4g}; the two contradict each "
+            f"other: both would have to be relaxed by a factor of {bound[worst]:.3g}"
+        )
 
 
 def performance_modes(plant: UncertainPlant) -> tuple[Mode, ...]:
@@ -343,5 +456,5 @@ def performance_modes(plant: UncertainPlant) -> tuple[Mode, ...]:
     if plant.performance is None:
         return plant.modes
     nominal = plant.performance.nominal
-    poles: npt.NDArray[np.complex128] = np.asarray(nominal.poles(), dtype=np.complex128)
+    poles: Complex = np.asarray(nominal.poles(), dtype=np.complex128)
     return tuple(m for m in modes_of(poles, plant.dt_s) if m.omega_rad_s < plant.nyquist_rad_s)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.analysis.stability import loop_integrators
-from control_design.analysis.worst_case import KINDS, WorstCase
+from control_design.analysis.worst_case import WorstCase
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import (
     Complex,
@@ -33,6 +33,7 @@ from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import ExpandableSet, OwnGridSet, SetExpansion, expandable
+from control_design.requirement import WeightedRequirement
 from control_design.specification import Specification
 
 _EXCESS = 0.002  # asked of every bound over the dense maximum; 0.005 is promised
@@ -66,7 +67,7 @@ class AllFrequencies:
     def nothing(cls, reason: str) -> AllFrequencies:
         """No proof."""
         none = float("inf")
-        return cls(False, False, none, dict.fromkeys(KINDS, none), 0.0, 0.0, 0, reason)
+        return cls(False, False, none, {}, 0.0, 0.0, 0, reason)
 
     @classmethod
     def refuted(cls, reason: str) -> AllFrequencies:
@@ -98,6 +99,15 @@ class _Bounds:
 
 
 @dataclass(frozen=True, eq=False)
+class _Asked:
+    """One weighted requirement, its weight as a rational response, its independent channel."""
+
+    requirement: WeightedRequirement
+    weight: RationalResponse
+    channel: ExpandableSet | None
+
+
+@dataclass(frozen=True, eq=False)
 class _Loop:
     """Everything rational of one plant, controller and specification."""
 
@@ -105,20 +115,15 @@ class _Loop:
     specification: Specification
     controller: RationalResponse  # without delay
     members: ExpandableSet
-    performance: ExpandableSet | None
-    tracking: RationalResponse | None
-    effort: RationalResponse | None
-    band: tuple[float, float] | None
-    damping_weight: float
+    asked: tuple[_Asked, ...]
 
     def bounds(self, intervals: Intervals) -> _Bounds:
         """Upper bounds on every interval."""
-        spec = self.specification
         own, i_plant = self.controller.integrators, self.plant.n_integrators
-        k = self.controller.expand(intervals, own)
-        delayed = self.controller.delayed(spec.computational_delay_samples).expand(intervals, own)
-        members = self.members.expand(intervals, i_plant)
-        loop = members.times(delayed)
+        delay = self.specification.computational_delay_samples
+        loop = self.members.expand(intervals, i_plant).times(
+            self.controller.delayed(delay).expand(intervals, own)
+        )
         clear = cleared_integrators(own + i_plant, intervals)
         loop = SetExpansion(clear + loop.centre, loop.groups)
         normal = _normal(loop.centre.value, loop.gram())
@@ -128,53 +133,58 @@ class _Loop:
             for side in (-1, 1)
         }
         at_middle = np.real(np.conj(normal) * loop.centre.value) - loop.support(normal, 0)
-        low = np.minimum(ends[-1], ends[1])
-        upper = {kind: np.zeros(low.size) for kind in KINDS}
-        middle = {kind: np.zeros(low.size) for kind in KINDS}
-        margin = clear.scaled(spec.modulus_margin)
-        upper["modulus"] = _quotient(margin, ends)
-        middle["modulus"] = _ratio(np.abs(margin.value), at_middle)
-        if self.tracking is not None:
-            weight = self.tracking.expand(intervals, own + i_plant)
-            # Where the modulus margin asks for more, it is the modulus that is bounded.
-            asked = self.tracking.expand(intervals, self.tracking.integrators).largest() > (
-                spec.modulus_margin * _least(cleared_integrators(self.tracking.integrators, intervals))
-            )
-            upper["tracking"] = np.where(asked, _quotient(weight, ends), 0.0)
-            middle["tracking"] = np.where(asked, _ratio(np.abs(weight.value), at_middle), 0.0)
-        if self.effort is not None:
-            weight = self.effort.expand(intervals, i_plant).times(k)
-            upper["effort"] = _quotient(weight, ends)
-            middle["effort"] = _ratio(np.abs(weight.value), at_middle)
-        if self.band is not None:
+        upper: dict[str, Real] = {}
+        middle: dict[str, Real] = {}
+        for each in self.asked:
+            name, band = each.requirement.name, each.requirement.band or (-np.inf, np.inf)
             h = intervals.half_width
-            use = (intervals.centre - h < self.band[1]) & (intervals.centre + h > self.band[0])
+            use = (intervals.centre - h < band[1]) & (intervals.centre + h > band[0])
+            upper[name], middle[name] = np.zeros(h.size), np.zeros(h.size)
             if np.any(use):
                 within = replace(intervals, centre=intervals.centre[use], half_width=h[use])
-                upper["mode damping"][use], middle["mode damping"][use] = self._damping(
-                    within, {side: value[use] for side, value in ends.items()}, at_middle[use]
-                )
+                below = {side: value[use] for side, value in ends.items()}
+                bound = self._with_member if each.requirement.of_member.of_plant else self._alone
+                upper[name][use], middle[name][use] = bound(each, within, below, at_middle[use])
         reach = np.maximum(np.abs(clear.end(-1)), np.abs(clear.end(1))) + clear.remainder
+        low = np.minimum(ends[-1], ends[1])
         distance = np.where(low > 0, low / reach, 0.0)
         return _Bounds(intervals, upper, middle, distance, loop.centre.end(-1), loop.centre.end(1))
 
-    def _damping(self, intervals: Intervals, ends: dict[int, Real], at_middle: Real) -> tuple[Real, Real]:
-        """Upper bounds and the values at the middles."""
+    def _alone(
+        self, each: _Asked, intervals: Intervals, ends: dict[int, Real], at_middle: Real
+    ) -> tuple[Real, Real]:
+        """Upper bounds and the values at the middles of |W S| or |W K S|, times |Gp| of an independent
+        channel."""
+        own, i_plant, weight = self.controller.integrators, self.plant.n_integrators, each.weight
+        if each.requirement.function.of_controller:
+            numerator = weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
+        else:
+            numerator = weight.expand(intervals, own + i_plant)
+        upper, middle = _quotient(numerator, ends), _ratio(np.abs(numerator.value), at_middle)
+        if each.channel is not None:
+            channel = each.channel.expand(intervals, 0)
+            largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
+            upper, middle = largest * upper, _farthest(channel, 0) * middle
+        if each.requirement.above > 0:  # where it asks for less, another requirement is bounded instead
+            least = each.requirement.above * _least(cleared_integrators(weight.integrators, intervals))
+            more = weight.expand(intervals, weight.integrators).largest() > least
+            upper, middle = np.where(more, upper, 0.0), np.where(more, middle, 0.0)
+        return upper, middle
+
+    def _with_member(
+        self, each: _Asked, intervals: Intervals, ends: dict[int, Real], at_middle: Real
+    ) -> tuple[Real, Real]:
+        """The same of |W G S| and |W T|, G the member; for a weight that is finite at zero frequency.
+
+        Members G, G0 of the ellipses at omega and at the middle, g = G/(1 + G K):
+        g - g0 = (G - G0 + G G0 (K0 - K))/((1 + G K)(1 + G0 K0)), hence with the largest |G - G0| = e
+        M <= M0 + e/(d d0) + M M0 |K - K0|.
+        """
         own, i_plant = self.controller.integrators, self.plant.n_integrators
         clear = cleared_integrators(own + i_plant, intervals)
-        if self.performance is not None:
-            channel = self.performance.expand(intervals, 0)
-            largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
-            bound = self.damping_weight * largest * _quotient(clear, ends)
-            here = self.damping_weight * _farthest(channel, 0) * _ratio(np.abs(clear.value), at_middle)
-            return bound, here
-        # Members G, G0 of the ellipses at omega and at the middle, g = G/(1 + G K):
-        # g - g0 = (G - G0 + G G0 (K0 - K))/((1 + G K)(1 + G0 K0)), hence with the largest |G - G0| = e
-        # M <= M0 + e/(d d0) + M M0 |K - K0|.
         k = self.controller.delayed(self.specification.computational_delay_samples).expand(intervals)
         members = self.members.expand(intervals, 0)
-        middle = _ellipses(intervals, members)
-        most = largest_disturbance_gain(k.value, middle)
+        most = largest_disturbance_gain(k.value, _ellipses(intervals, members))
         h = intervals.half_width
         moved = np.abs(members.centre.slope) * h + members.remainder()
         for group in members.groups:
@@ -186,7 +196,10 @@ class _Loop:
         with np.errstate(divide="ignore", invalid="ignore"):
             # d0 >= nearest as well: the middle belongs to the interval.
             bound = (most + moved / nearest**2) / (1.0 - turn)
-        return np.where(good, self.damping_weight * bound, np.inf), self.damping_weight * most
+        factor = each.weight.expand(intervals)
+        if each.requirement.function.of_controller:
+            factor = factor.times(k)
+        return np.where(good, factor.largest() * bound, np.inf), np.abs(factor.value) * most
 
 
 def _least(factor: FirstOrder) -> Real:
@@ -292,33 +305,31 @@ def bound_all_frequencies(
             if plant.own_grid is not None
             else "the uncertainty does not say how it changes between frequencies"
         )
-    band = specification.mode_band(plant)
-    performance = None
-    if plant.performance is not None and band is not None:
-        performance = expandable(plant.performance, 0, between_own_points)
-        if performance is None:
-            return AllFrequencies.nothing("the performance channel is known on its own frequencies only")
-    tracking, effort = (
-        None if weight is None else RationalResponse.from_weight(weight, plant.dt_s)
-        for weight in (specification.tracking_weight(plant.n_integrators), specification.limit_weight())
-    )
-    infinite = tracking is not None and tracking.integrators > own + plant.n_integrators
+    asked: list[_Asked] = []
+    for requirement in specification.weighted(plant):
+        channel = None
+        if requirement.channel is not None:
+            channel = expandable(requirement.channel, 0, between_own_points)
+            if channel is None:
+                return AllFrequencies.nothing("the performance channel is known on its own frequencies only")
+        asked.append(
+            _Asked(requirement, RationalResponse.from_weight(requirement.weight, plant.dt_s), channel)
+        )
+    # Towards zero frequency such a weight grows without limit and the loop gain does not.
+    infinite = [each for each in asked if each.weight.integrators > own + plant.n_integrators]
     loop = _Loop(
         plant,
         specification,
         RationalResponse.from_state_space(controller.to_control(), own),
         members,
-        performance,
-        None if infinite else tracking,
-        effort,
-        band,
-        0.0 if band is None else float(specification.damping_magnitude(np.array([band[0]]), plant)[0]),
+        tuple(each for each in asked if each not in infinite),
     )
+    bands = [edge for each in asked for edge in each.requirement.band or ()]
     edges = starting_edges(
         plant.nyquist_rad_s,
         modes,
         omega_min_rad_s=omega_min_rad_s,
-        extra=(*(() if plant.own_grid is None else plant.own_grid), *(band or ())),
+        extra=(*(() if plant.own_grid is None else plant.own_grid), *bands),
     )
     difference = _model_error(loop, controller, edges[1:])
     if difference > _MODEL_ERROR:
@@ -326,19 +337,19 @@ def bound_all_frequencies(
             f"zeros, poles and generators reproduce responses and ellipses only to {difference:.1e}"
         )
     targets = {}
-    for kind in KINDS:
-        most = worst.peak(kind)[0]
+    for each in loop.asked:
+        most = worst.peak(each.requirement.name)[0]
         target = most * (1.0 + _EXCESS)
         if most <= 1.0 < target:
             target = max(1.0, most * (1.0 + _LEAST_EXCESS))
-        targets[kind] = target if np.isfinite(most) else np.inf
+        targets[each.requirement.name] = target if np.isfinite(most) else np.inf
     found, used = _bisect(loop.bounds, edges, plant.dt_s, targets)
     result = _verdict(found, used, own + plant.n_integrators, unstable)
     if result.distance > 0:  # the modulus was bisected, the distance only came along
         nearest = specification.modulus_margin / result.bounds["modulus"]
         result = replace(result, distance=max(result.distance, nearest))
-    if infinite:  # towards zero frequency the weight grows without limit and the loop gain does not
-        bounds = result.bounds | {"tracking": float("inf")}
+    if infinite:
+        bounds = result.bounds | {each.requirement.name: float("inf") for each in infinite}
         result = replace(result, gamma=float("inf"), bounds=bounds)
     return result
 
@@ -347,8 +358,12 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
     """Largest relative difference at omega (F,) of the forms used here from the state spaces and from the
     ellipses the dense check uses (centre by its size, shape by its trace and the centre)."""
     largest = _difference(loop.controller.at(omega), frequency_response(controller.to_control(), omega))
-    for members, channel in ((loop.members, loop.plant.channel), (loop.performance, loop.plant.performance)):
-        if members is None or channel is None or isinstance(members, OwnGridSet):
+    sets = [(loop.members, loop.plant.channel)]
+    for each in loop.asked:
+        if each.channel is not None and each.requirement.channel is not None:
+            sets.append((each.channel, each.requirement.channel))
+    for members, channel in sets:
+        if isinstance(members, OwnGridSet):
             continue
         given = channel.at(omega)
         expansion = members.expand(Intervals(omega, np.zeros(omega.size), loop.plant.dt_s), 0)
@@ -381,7 +396,7 @@ def _bisect(
         found = evaluate(Intervals(0.5 * (low + high), 0.5 * (high - low), dt_s))
         used += low.size
         wide = ~(found.distance > 0)
-        for kind in KINDS:
+        for kind in targets:
             seen = found.middle[kind][np.isfinite(found.middle[kind])]
             targets[kind] = max(targets[kind], (1.0 + _EXCESS) * float(np.max(seen, initial=0.0)))
             wide |= found.upper[kind] > targets[kind]
@@ -400,7 +415,9 @@ def _bisect(
 def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -> AllFrequencies:
     centre = np.concatenate([part.intervals.centre for part in found])
     order = np.argsort(centre, kind="stable")
-    bounds = {kind: float(np.max(np.concatenate([part.upper[kind] for part in found]))) for kind in KINDS}
+    bounds = {
+        name: float(np.max(np.concatenate([part.upper[name] for part in found]))) for name in found[0].upper
+    }
     distances = np.concatenate([part.distance for part in found])[order]
     start = np.concatenate([part.start for part in found])[order]
     end = np.concatenate([part.end for part in found])[order]

@@ -13,43 +13,15 @@ from control_design.analysis.joint_coverage import JointCoverage, at_level
 from control_design.analysis.joint_coverage import joint_coverage as calibrate
 from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
 from control_design.analysis.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
-from control_design.analysis.worst_case import WorstCase, worst_case
-from control_design.controllers.biquads import SOLVER_SLACK
+from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import frequency_grid, plant_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.requirement import Findings, SpecificationItem
 from control_design.specification import Specification
 
-_PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
 _NOT_LOOKED_AT = AllFrequencies.nothing("not looked at")
-
-
-@dataclass(frozen=True)
-class SpecificationItem:
-    """One requirement on one plant: met or not, with the number that decides it and where.
-
-    bound: what was proved of `achieved` for all frequencies, where that was possible.
-    """
-
-    requirement: str
-    plant: str
-    required: float
-    achieved: float
-    unit: str
-    met: bool
-    omega_rad_s: float | None = None
-    bound: float | None = None
-
-    def sentence(self) -> str:
-        """One line for a report."""
-        where = "" if self.omega_rad_s is None else f" at {self.omega_rad_s:.4g} rad/s"
-        verdict = "met" if self.met else "NOT met"
-        unit = f" {self.unit}" if self.unit else ""
-        numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
-        known = self.met and self.bound is not None
-        proved = f" ({self.bound:.4g} proved for all frequencies)" if known else ""
-        return f"{self.plant}: {self.requirement}: {numbers}{proved}: {verdict}"
 
 
 @dataclass(frozen=True)
@@ -223,10 +195,8 @@ def certify(
         )
         verdicts.append(verdict)
         items += found
-    if specification.controller_damping is not None:
-        items.append(_controller_damping_item(controller, specification.controller_damping))
-    if specification.integrator:
-        items.append(_integrator_item(controller, plants[0]))
+    nothing = Findings("controller", {}, None, (np.inf, 0.0), np.inf, (), controller)
+    items += [requirement.check(nothing) for requirement in specification.on_controller()]
     if joint is not None:
         items.append(_stable_share_item(joint, plants, joint_stable_share))
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
@@ -284,8 +254,9 @@ def _check_plant(
     distance = worst.values["distance"]
     margins = ellipse_margins(worst.loop_factor, worst.ellipses, distance).worse(nominal)
     at = int(np.argmin(distance))
-    kinds = [(*worst.peak(kind), kind) for kind in ("tracking", "modulus", "effort", "mode damping")]
-    weighted, where, kind = max(kinds, key=lambda entry: entry[0])
+    peaks = {name: worst.peak(name) for name in worst.names}
+    kind = max(peaks, key=lambda name: peaks[name][0])
+    weighted, where = peaks[kind]
     stable = bool(radius < 1.0)
     below = np.flatnonzero(distance < np.sqrt(2.0))
     bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
@@ -321,10 +292,16 @@ def _check_plant(
         else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
         all_frequencies=proof,
     )
-    items = _items(plant, specification, worst, margins, float(worst.omega_rad_s[at]), proof)
-    if specification.mode_damping is not None:
-        items.append(_mode_damping_item(plant.name, loop_modes, specification))
-    return verdict, items
+    found = Findings(
+        plant.name,
+        peaks,
+        proof.bounds if proof.possible else None,
+        (margins.modulus, float(worst.omega_rad_s[at])),
+        margins.delay_s,
+        loop_modes,
+        controller,
+    )
+    return verdict, [requirement.check(found) for requirement in specification.requirements(plant)]
 
 
 def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
@@ -334,98 +311,6 @@ def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
     outside = wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
     inside = own[own > 0]
     return np.asarray(np.unique(np.concatenate([inside, outside])), dtype=np.float64)
-
-
-def _items(
-    plant: UncertainPlant,
-    specification: Specification,
-    worst: WorstCase,
-    margins: Margins,
-    omega: float,
-    proof: AllFrequencies,
-) -> list[SpecificationItem]:
-    wanted = specification.modulus_margin
-    items = [
-        SpecificationItem(
-            "modulus margin, worst case",
-            plant.name,
-            wanted,
-            margins.modulus,
-            "",
-            bool(margins.modulus >= wanted) and _proved(proof, "modulus"),
-            omega,
-            wanted / proof.bounds["modulus"] if proof.possible else None,
-        )
-    ]
-    asked = {
-        "tracking": specification.bandwidth_rad_s is not None or specification.sensitivity_weight is not None,
-        "effort": specification.effort_limit is not None or specification.effort_weight is not None,
-        "mode damping": specification.mode_peak_ratio is not None,
-    }
-    words = {
-        "tracking": "tracking, largest |W1 S|",
-        "effort": "effort, largest |W3 K S|",
-        "mode damping": "damping of the mode, largest |W4 Gp S|",
-    }
-    for kind in asked:
-        if asked[kind]:
-            value, place = worst.peak(kind)
-            met = bool(value <= 1.0) and _proved(proof, kind)
-            bound = proof.bounds[kind] if proof.possible else None
-            items.append(SpecificationItem(words[kind], plant.name, 1.0, value, "", met, place, bound))
-    if specification.delay_margin_s is not None:
-        items.append(
-            SpecificationItem(
-                "delay margin, worst case",
-                plant.name,
-                specification.delay_margin_s,
-                margins.delay_s,
-                "s",
-                bool(margins.delay_s >= specification.delay_margin_s),
-            )
-        )
-    return items
-
-
-def _proved(proof: AllFrequencies, kind: str) -> bool:
-    """Whether a kind is shown to meet its limit for all frequencies, where that can be shown at all."""
-    return not proof.possible or proof.bounds[kind] <= 1.0 + _PROOF_SLACK
-
-
-def _mode_damping_item(plant: str, modes: Sequence[Mode], specification: Specification) -> SpecificationItem:
-    """Least damped mode of the nominal closed loop in the band; without one there, damping is no issue."""
-    assert specification.mode_damping is not None
-    assert specification.mode_band_rad_s is not None
-    low, high = specification.mode_band_rad_s
-    inside = [mode for mode in modes if low <= mode.omega_rad_s <= high]
-    least = min(inside, key=lambda mode: mode.zeta, default=None)
-    return SpecificationItem(
-        "damping ratio of the nominal closed loop's modes",
-        plant,
-        specification.mode_damping,
-        1.0 if least is None else least.zeta,
-        "",
-        least is None or least.zeta >= specification.mode_damping,
-        None if least is None else least.omega_rad_s,
-    )
-
-
-def _controller_damping_item(controller: Controller, required: float) -> SpecificationItem:
-    # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.
-    w = 2 / controller.dt_s * (controller.poles - 1) / (controller.poles + 1)
-    pairs = w[np.imag(w) > 0]
-    zeta = -np.real(pairs) / np.abs(pairs)
-    least = int(np.argmin(zeta)) if pairs.size else None
-    achieved = 1.0 if least is None else float(zeta[least])
-    return SpecificationItem(
-        "damping ratio of the controller's own poles",
-        "controller",
-        required,
-        achieved,
-        "",
-        achieved >= required * (1 - SOLVER_SLACK),
-        None if least is None else float(np.abs(pairs[least])),
-    )
 
 
 def _stable_share_item(
@@ -439,13 +324,6 @@ def _stable_share_item(
         joint.stable_share,
         "",
         bool(joint.stable_share >= required),
-    )
-
-
-def _integrator_item(controller: Controller, plant: UncertainPlant) -> SpecificationItem:
-    own = loop_integrators(controller, plant)[0] - plant.n_integrators
-    return SpecificationItem(
-        "integrators in the controller", "controller", 1.0, float(own), "", bool(own >= 1)
     )
 
 

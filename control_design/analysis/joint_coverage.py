@@ -176,8 +176,7 @@ class _Sampled:
     controller: Controller
     data: PlantData
     unit: Ellipses
-    unit_performance: Ellipses | None
-    used: npt.NDArray[np.bool_]
+    unit_performance: dict[str, Ellipses]
     loop: Complex
     integrators: int
     unstable: int
@@ -199,10 +198,12 @@ class _Sampled:
             plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=500, n_mode=80 * len(light)
         )
         data = PlantData.build(plant, specification, grid)
-        used = data.w4 > 0
-        performance = None
-        if plant.performance is not None and np.any(used):
-            performance = _scaled(plant.performance.at(grid[used]), 1 / _radius(plant.performance.level))
+        performance: dict[str, Ellipses] = {}
+        for each in data.weightings:
+            channel = each.requirement.channel
+            if channel is not None and np.any(each.own > 0):
+                asked = channel.at(grid[each.own > 0])
+                performance[each.requirement.name] = _scaled(asked, 1 / _radius(channel.level))
         integrators, unstable = loop_integrators(controller, plant)
         return cls(
             plant,
@@ -210,7 +211,6 @@ class _Sampled:
             data,
             _scaled(data.ellipses, 1 / _radius(plant.level)),
             performance,
-            used,
             controller.response(grid, with_delay=False),
             integrators,
             unstable,
@@ -218,24 +218,32 @@ class _Sampled:
 
     def worst(self, radius: float) -> float:
         """Largest weighted worst case over ellipses of a radius in standard deviations."""
-        gp_max = self.data.gp_max
-        if self.unit_performance is not None and gp_max is not None:
-            gp_max = gp_max.copy()
-            gp_max[self.used] = _scaled(self.unit_performance, radius).farthest()
-        data = replace(self.data, ellipses=_scaled(self.unit, radius), gp_max=gp_max)
+        weightings = []
+        for each in self.data.weightings:
+            ellipses, channel = self.unit_performance.get(each.requirement.name), each.channel
+            if ellipses is not None and channel is not None:
+                channel = channel.copy()
+                channel[each.own > 0] = _scaled(ellipses, radius).farthest()
+            weightings.append(replace(each, channel=channel))
+        data = replace(self.data, ellipses=_scaled(self.unit, radius), weightings=tuple(weightings))
         return float(np.max(worst_of(data.weighted(self.loop))))
 
-    def gamma_of(self, members: Complex, performance: Complex | None) -> Real:
-        """Largest weighted value (D,) of responses (D, F) of the measured and (D, F') of the performance
-        channel."""
-        data = self.data
+    def gamma_of(self, members: Complex, performance: Responses | None) -> Real:
+        """Largest weighted value (D,) of responses (D, F) of the measured channel, and of the performance
+        channel's draws."""
+        data, size = self.data, np.abs(self.loop)
         inverse = 1.0 / np.maximum(np.abs(1.0 + members * (self.loop * data.delay)), 1e-300)
-        weight = np.maximum(np.maximum(data.w1, data.modulus), data.w3 * np.abs(self.loop))
-        largest = np.max(weight * inverse, axis=1)
-        if np.any(self.used):
-            moved = members[:, self.used] if performance is None else performance
-            damping = np.max(data.w4[self.used] * np.abs(moved) * inverse[:, self.used], axis=1)
-            largest = np.maximum(largest, damping)
+        largest = np.zeros(members.shape[0])
+        for each in data.weightings:
+            use = each.own > 0
+            if not np.any(use):
+                continue
+            weight = (each.own * size if each.requirement.function.of_controller else each.own)[use]
+            if each.channel is not None and performance is not None:
+                weight = weight * np.abs(performance(self.unit.omega_rad_s[use]))
+            elif each.function.of_plant:
+                weight = weight * np.abs(members[:, use])
+            largest = np.maximum(largest, np.max(weight * inverse[:, use], axis=1))
         return np.asarray(largest, dtype=np.float64)
 
     def distance_of(self, members: Complex) -> Real:
@@ -273,8 +281,8 @@ def sampled_gamma(loop: _Sampled, rng: np.random.Generator, draws: int) -> Sampl
         responses = _responses(loop.plant.channel, rng, count)
         members = responses(omega)
         performance = None
-        if loop.plant.performance is not None and np.any(loop.used):
-            performance = _responses(loop.plant.performance, rng, count)(omega[loop.used])
+        if loop.plant.performance is not None and loop.unit_performance:
+            performance = _responses(loop.plant.performance, rng, count)
         stable[here] = loop.stable_of(responses, members)
         gamma[here] = np.where(stable[here], loop.gamma_of(members, performance), np.inf)
         distance[here] = loop.distance_of(members)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,92 +17,122 @@ from control_design.plants.ellipses import (
 )
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.plant_set import UncertainPlant
+from control_design.requirement import LoopFunction, WeightedRequirement
 from control_design.specification import Specification
 
-KINDS = ("tracking", "modulus", "effort", "mode damping")
+
+@dataclass(frozen=True, eq=False)
+class Weighting:
+    """A weighted requirement on a grid: own (F,) its |W|, 0 = not asked; channel (F,) the largest |Gp| of an
+    independent channel where asked, or None."""
+
+    requirement: WeightedRequirement
+    own: Real
+    channel: Real | None
+
+    @cached_property
+    def size(self) -> Real:
+        """Everything that multiplies the closed-loop function of the member, (F,)."""
+        return self.own if self.channel is None else self.own * self.channel
+
+    @property
+    def function(self) -> LoopFunction:
+        """The closed-loop function of the member."""
+        return self.requirement.of_member
 
 
 @dataclass(frozen=True, eq=False)
 class PlantData:
-    """One plant on one grid with everything that does not depend on the controller; all arrays (F,).
-
-    delay = e^{-j omega (dt samples)}; w1, modulus, w3, w4 the weight magnitudes (w1 without the modulus
-    margin); gp_max the largest |Gp| of an independent performance channel where w4 > 0, or None if Gp = G.
-    """
+    """One plant on one grid with everything that does not depend on the controller; delay (F,) = e^{-j omega
+    (dt samples)}."""
 
     plant: UncertainPlant
     ellipses: Ellipses
     delay: Complex
-    w1: Real
-    modulus: Real
-    w3: Real
-    w4: Real
-    gp_max: Real | None
+    weightings: tuple[Weighting, ...]
 
     @classmethod
     def build(cls, plant: UncertainPlant, specification: Specification, omega_rad_s: Real) -> PlantData:
         """Evaluate plant and weights at omega (F,)."""
-        dt = plant.dt_s
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        samples = specification.computational_delay_samples
-        w4 = specification.damping_magnitude(omega, plant)
-        gp_max: Real | None = None
-        if plant.performance is not None:
-            gp_max = np.zeros(omega.size)
-            use = w4 > 0
-            if np.any(use):
-                gp_max[use] = plant.performance.at(omega[use]).farthest()
-        total = specification.sensitivity_magnitude(omega, dt, plant.n_integrators)
-        return cls(
-            plant=plant,
-            ellipses=plant.at(omega),
-            delay=np.exp(-1j * omega * dt * samples),
-            w1=np.where(total > specification.modulus_margin, total, 0.0),
-            modulus=np.full(omega.size, specification.modulus_margin),
-            w3=specification.effort_magnitude(omega, dt),
-            w4=w4,
-            gp_max=gp_max,
-        )
+        weightings = []
+        for requirement in specification.weighted(plant):
+            own, channel = requirement.magnitude(omega, plant.dt_s), None
+            if requirement.channel is not None:
+                channel, use = np.zeros(omega.size), own > 0
+                if np.any(use):
+                    channel[use] = requirement.channel.at(omega[use]).farthest()
+            weightings.append(Weighting(requirement, own, channel))
+        delay = np.exp(-1j * omega * plant.dt_s * specification.computational_delay_samples)
+        return cls(plant, plant.at(omega), delay, tuple(weightings))
+
+    def largest(self, function: LoopFunction) -> Real:
+        """Largest weight (F,) on a closed-loop function of the members; zeros where none is asked."""
+        sizes = [each.size for each in self.weightings if each.function is function]
+        return np.max(sizes, axis=0) if sizes else np.zeros(self.delay.size)
+
+    @property
+    def sensitivity(self) -> Real:
+        """Largest weight (F,) on S itself: tracking and modulus margin."""
+        own = [each.own for each in self.weightings if each.requirement.function is LoopFunction.SENSITIVITY]
+        return np.asarray(np.max(own, axis=0), dtype=np.float64)
+
+    def of(self, kind: type[WeightedRequirement]) -> Real:
+        """Weight (F,) of one kind of requirement; zeros where it is not asked."""
+        found = [each.size for each in self.weightings if isinstance(each.requirement, kind)]
+        return found[0] if found else np.zeros(self.delay.size)
+
+    @property
+    def open_loop_disturbance(self) -> Real:
+        """Largest |W Gp| (F,) of the requirements on disturbances without a controller, at the centre."""
+        found = [np.zeros(self.delay.size)]
+        for each in self.weightings:
+            if each.requirement.function is LoopFunction.DISTURBANCE:
+                size = np.abs(self.ellipses.centre) if each.channel is None else each.channel
+                found.append(each.own * size)
+        return np.asarray(np.max(found, axis=0), dtype=np.float64)
+
+    def row_weights(self) -> tuple[tuple[LoopFunction, Real], ...]:
+        """Weights (F,) by function of the members, as rows of the optimisers: all that are asked at every
+        frequency together, those of a band by themselves."""
+        rows: list[tuple[LoopFunction, Real]] = []
+        whole = [w for w in self.weightings if w.requirement.band is None]
+        for function in LoopFunction:
+            everywhere = [w.size for w in whole if w.function is function]
+            if everywhere:
+                rows.append((function, np.asarray(np.max(everywhere, axis=0), dtype=np.float64)))
+        return (*rows, *((w.function, w.size) for w in self.weightings if w not in whole))
 
     def weighted(self, k: Complex) -> dict[str, Real]:
         """Worst case over the ellipses of each weighted closed-loop function for controller values k (F,)
         without delay.
 
-        Keys `KINDS` plus "distance" = dist(-1, K E); inf where a member of the ellipse puts the loop on -1.
+        By name of the requirement, and "distance" = dist(-1, K E); inf where a member of the ellipse puts the
+        loop on -1.
         """
         loop = k * self.delay
         distance = distance_to_minus_one(loop, self.ellipses)
-        safe = np.maximum(distance, 1e-300)
         with np.errstate(over="ignore"):
-            inverse = np.where(distance > 0, 1.0 / safe, np.inf)
+            inverse = np.where(distance > 0, 1.0 / np.maximum(distance, 1e-300), np.inf)
+        values: dict[str, Real] = {}
+        for each in self.weightings:
             # An infinite weight (integrator asked of the loop) at an infinite loop gain never occurs: the
             # grid starts above 0.
-            values = {
-                "tracking": _product(self.w1, inverse),
-                "modulus": _product(self.modulus, inverse),
-                "effort": _product(self.w3 * np.abs(k), inverse),
-            }
-        damping = np.zeros(loop.size)
-        use = self.w4 > 0
-        if np.any(use):
-            if self.gp_max is not None:
-                damping[use] = _product((self.w4 * self.gp_max)[use], inverse[use])
-            else:
-                damping[use] = self.w4[use] * largest_disturbance_gain(loop[use], self.ellipses.subset(use))
-        values["mode damping"] = damping
-        values["distance"] = distance
-        return values
-
-
-def _product(weight: Real, inverse: Real) -> Real:
-    """weight * inverse with 0 * inf = 0: no requirement there."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(weight > 0, weight * inverse, 0.0), dtype=np.float64)
+            weight = each.size * np.abs(k) if each.function.of_controller else each.size
+            value, use = np.zeros(loop.size), each.own > 0
+            if each.function.of_plant and np.any(use):
+                value[use] = weight[use] * largest_disturbance_gain(loop[use], self.ellipses.subset(use))
+            elif not each.function.of_plant:
+                with np.errstate(invalid="ignore"):  # 0 * inf: no requirement there
+                    value = np.where(weight > 0, weight * inverse, 0.0)
+            values[each.requirement.name] = value
+        return values | {"distance": distance}
 
 
 def worst_of(values: dict[str, Real]) -> Real:
     """Largest weighted value per frequency, (F,)."""
-    return np.asarray(np.max([values[kind] for kind in KINDS], axis=0), dtype=np.float64)
+    weighted = [value for name, value in values.items() if name != "distance"]
+    return np.asarray(np.max(weighted, axis=0), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +144,11 @@ class WorstCase:
     ellipses: Ellipses
     loop_factor: Complex
     values: dict[str, Real]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weighted requirements."""
+        return tuple(name for name in self.values if name != "distance")
 
     def peak(self, kind: str) -> tuple[float, float]:
         """(largest value, its frequency) of one kind."""
@@ -143,10 +179,10 @@ def worst_case(
         rounds = 0
     for _ in range(rounds):
         wanted: list[Real] = []
-        for kind in KINDS:
-            if not np.any(values[kind] > 0):
+        for name, value in values.items():
+            if name == "distance" or not np.any(value > 0):
                 continue
-            for index in local_maxima(values[kind])[:peaks]:
+            for index in local_maxima(value)[:peaks]:
                 low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
                 wanted.append(np.linspace(low, high, inserted + 2)[1:-1])
         extra = np.setdiff1d(np.concatenate(wanted), omega) if wanted else np.zeros(0)

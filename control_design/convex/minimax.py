@@ -10,7 +10,8 @@ m(y))/m(y_j), a convex programme, by an interior point. gamma falls in every ste
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -41,14 +42,11 @@ class PlaneRows:
     C: Real
     c: Real
 
-    def stacked(self, other: PlaneRows) -> PlaneRows:
-        """Both sets of rows."""
-        return PlaneRows(
-            *(
-                np.concatenate([getattr(self, name), getattr(other, name)])
-                for name in ("at", "A", "a", "e", "E", "C", "c")
-            )
-        )
+    @classmethod
+    def stacked(cls, parts: Sequence[PlaneRows]) -> PlaneRows:
+        """All of them together."""
+        names = (field.name for field in fields(cls))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def numerator(self, y: Real) -> Real:
         """|A y + a| for y (F, 2): (R,)."""

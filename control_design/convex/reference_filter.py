@@ -408,9 +408,7 @@ class _Matching:
             )
             bases.append(basis)
             count += omega.size
-        rows = parts[0]
-        for part in parts[1:]:
-            rows = rows.stacked(part)
+        rows = PlaneRows.stacked(parts)
         whole = np.concatenate(bases)
         if whole.shape[1] == 0:
             nothing = np.zeros(whole.shape[0], complex)

@@ -38,6 +38,7 @@ from control_design.convex.youla_hull import hull_bound
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.plant_set import UncertainPlant
+from control_design.requirement import LoopFunction
 from control_design.specification import Specification
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -167,10 +168,10 @@ def youla_bracket(
 ) -> YoulaBracket:
     """Bracket of the smallest possible worst case over the ellipses, whatever the controller's order.
 
-    Of the specification count tracking, modulus margin, effort and damping of the modes; structure, order,
-    controller damping and the delay margin do not, so the values stay lower bounds for designs that are asked
-    for these as well. Damping (W4 G S of the measured output) enters the inscribed value by the centre alone
-    and the other two by the largest |G|: on its safe side in each.
+    Of the specification count the weighted requirements; structure, order, controller damping and the delay
+    margin do not, so the values stay lower bounds for designs that are asked for these as well. Functions
+    with the member as a factor (G S, T) enter the inscribed value by the centre alone and the other two by
+    the largest |G|: on its safe side in each.
 
     Raises
     ------
@@ -334,54 +335,27 @@ class BracketProblem:
         level = np.real(turn * (1.0 + offset * loop.effort))
         slope = np.stack([lift.real, -lift.imag], axis=-1)
         at = np.arange(size)
-        w1 = np.maximum(data.w1, data.modulus)
-        own_damping: Real | None = None
-        if np.any(data.w4 > 0):
-            if data.gp_max is not None:
-                w1 = np.maximum(w1, data.w4 * data.gp_max)
-            elif region == "inscribed":
-                own_damping = data.w4 * np.abs(e.centre)
-            else:
-                w1 = np.maximum(
-                    w1, data.w4 * (np.abs(e.centre) + major if region == "enclosing" else e.farthest())
-                )
-        tracking = PlaneRows(
-            at,
-            turning(w1 * loop.sensitivity_slope),
-            plane(w1 * loop.sensitivity),
-            level,
-            slope,
-            reach,
-            reach_0,
-        )
-        rows = tracking
-        if np.any(data.w3 > 0):
-            use = data.w3 > 0
-            rows = rows.stacked(
-                PlaneRows(
-                    at[use],
-                    turning(data.w3 * loop.effort_slope)[use],
-                    plane(data.w3 * loop.effort)[use],
-                    level[use],
-                    slope[use],
-                    reach[use],
-                    reach_0[use],
-                )
-            )
-        if own_damping is not None:
-            use = own_damping > 0
-            rows = rows.stacked(
-                PlaneRows(
-                    at[use],
-                    turning(own_damping * loop.sensitivity_slope)[use],
-                    plane(own_damping * loop.sensitivity)[use],
-                    level[use],
-                    slope[use],
-                    0.0 * reach[use],
-                    0.0 * reach_0[use],
-                )
-            )
-        return rows
+        far = {"inscribed": np.abs(e.centre), "enclosing": np.abs(e.centre) + e.semi_major}
+        rows_of, extra = [], []  # weight, value, change with Q, share of the ellipse that moves
+        for own, with_member, value, change in (
+            (LoopFunction.SENSITIVITY, LoopFunction.DISTURBANCE, loop.sensitivity, loop.sensitivity_slope),
+            (LoopFunction.EFFORT, LoopFunction.COMPLEMENTARY, loop.effort, loop.effort_slope),
+        ):
+            weight, still = data.largest(own), data.largest(with_member)
+            if np.any(still > 0):
+                still = still * (far[region] if region in far else e.farthest())
+                if region == "inscribed":  # by the centre alone: at no distance from the others
+                    extra.append((still, value, change, 0.0))
+                else:
+                    weight = np.maximum(weight, still)
+            rows_of.append((weight, value, change, 1.0))
+        parts: list[PlaneRows] = []
+        for weight, value, change, moved in rows_of + extra:
+            use = weight > 0
+            numerator = turning(weight * change)[use], plane(weight * value)[use]
+            below = level[use], slope[use], moved * reach[use], moved * reach_0[use]
+            parts.append(PlaneRows(at[use], *numerator, *below))
+        return PlaneRows.stacked(parts)
 
     def _dense_values(self, x: Real, region: Region) -> Real:
         """Worst case per frequency of the dense grid: exact geometry for the ellipse, the rows for discs."""

@@ -16,6 +16,7 @@ from scipy.optimize import linprog
 from control_design.analysis.worst_case import PlantData
 from control_design.convex.youla_basis import AffineLoop
 from control_design.plants.ellipses import Complex, Real, nearest_distance
+from control_design.requirement import LoopFunction
 
 _DIRECTIONS = 24  # half-planes of every hull
 _ANGLES, _RADII = 300, 60  # samples of the disc that is known to contain R
@@ -27,20 +28,21 @@ def hull_bound(data: PlantData, loop: AffineLoop, basis: Complex, floor: float, 
     """Largest gamma in [floor, ceiling] known to be out of reach (floor if none), on the grid of `data`.
 
     basis (F, n): Q on the grid; floor, ceiling: gammas between which to look, e.g. of inscribed disc and
-    ellipse. Tracking, modulus and effort count; damping of modes does not, so that the bound holds with it
-    too.
+    ellipse. Requirements on S and K S count; what is asked of disturbances does not, so that the bound
+    holds with it too.
     """
     g = loop.base
-    w1 = np.maximum(data.w1, data.modulus)
+    w1, w3 = data.sensitivity, data.largest(LoopFunction.EFFORT)
     # The base plant itself is a member (or close to one): |q| <= gamma/W3 and |1 - G q| <= gamma/W1 contain
     # R.
     with np.errstate(divide="ignore"):
-        by_effort = np.where(data.w3 > 0, ceiling / np.where(data.w3 > 0, data.w3, 1.0), np.inf)
+        by_effort = np.where(w3 > 0, ceiling / np.where(w3 > 0, w3, 1.0), np.inf)
     by_tracking = ceiling / (w1 * np.abs(g))
     centre = np.where(by_tracking < by_effort, 1.0 / g, 0.0)
     radius = np.minimum(by_tracking, by_effort)
     pattern, spacing = _disc_samples()
-    worst = np.stack([_worst(data, loop, w1, centre, radius, pattern, i) for i in range(g.size)])
+    samples = [centre[i] + radius[i] * pattern for i in range(g.size)]
+    worst = np.stack([_worst(data, loop, w1[i], w3[i], q, i) for i, q in enumerate(samples)])
     turn = np.exp(-2j * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS)
     projected = np.real(turn[:, None] * pattern)  # (directions, samples)
     slope = (loop.effort_slope / radius)[:, None] * basis
@@ -68,19 +70,16 @@ def _disc_samples() -> tuple[Complex, float]:
     return points.ravel(), max(0.5 / (_RADII - 1), np.pi / _ANGLES)
 
 
-def _worst(
-    data: PlantData, loop: AffineLoop, w1: Real, centre: Complex, radius: Real, pattern: Complex, i: int
-) -> Real:
-    """Smallest gamma that lets q = centre + radius pattern into R at frequency i, (samples,)."""
+def _worst(data: PlantData, loop: AffineLoop, w1: float, w3: float, q: Complex, i: int) -> Real:
+    """Smallest gamma that lets q (samples,) into R at frequency i with its weights, (samples,)."""
     e = data.ellipses
-    q = centre[i] + radius[i] * pattern
     size = np.abs(q)
     direction = e.direction[i] * data.delay[i]
     moved = 1.0 + (e.centre[i] * data.delay[i] - loop.base[i]) * q
     turned = moved * np.conj(q * direction) / np.maximum(size, 1e-300)
     turned = np.where(size > 0, turned, 1.0)
     distance = nearest_distance(turned, size * e.semi_major[i], size * e.semi_minor[i])
-    asked = np.maximum(w1[i] * np.abs(1.0 - loop.base[i] * q), data.w3[i] * size)
+    asked = np.maximum(w1 * np.abs(1.0 - loop.base[i] * q), w3 * size)
     with np.errstate(over="ignore"):
         return np.asarray(np.where(distance > 0, asked / np.maximum(distance, 1e-300), np.inf))
 

@@ -3,8 +3,8 @@ IPOPT.
 
 Distance from -1 to the convex set K E is the largest value over unit normals e^{jt} of
     m(t) = Re(e^{-jt} c) - sqrt(s1^2 Re(q)^2 + s2^2 Im(q)^2 + eps),   c = 1 + G K,  q = e^{-jt} K u1,
-so |W1 S| <= 1/g for every G in E  <=>  there is t with m(t) >= g |W1|, likewise g |W3 K| and g |W4 Gp| with
-an independent Gp. W4 of the measured output itself (Gp = G) has no row here: the descent takes it up.
+so |W S| <= 1/g for every G in E  <=>  there is t with m(t) >= g |W|, likewise g |W K| for K S and g |W Gp|
+for an independent Gp. Functions with the member itself as a factor have no row: the descent takes them up.
 Variables: controller parameters, g, one t per frequency. Maximise log g.
 """
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.requirement import LoopFunction
 from control_design.synthesis.interrupts import interrupts_kept
 
 Symbol = Any  # casadi.SX; its stubs disagree with its own arithmetic on numpy arrays
@@ -30,17 +31,14 @@ _EPS = 1e-10  # under the root, relative to the row: errs on the safe side by at
 class Rows:
     """Everything the programme needs of one plant (or delayed copy) on its grid; all arrays (F,).
 
-    delay : z^-d times a delay copy, multiplies K. w1, w3, w4 : weight magnitudes, 0 = no row. gp_max :
-    largest |Gp| of an independent performance channel; None with w4 > 0 means Gp = G, a row of the descent
-    only. start_window : range of the first angle for a stable loop.
+    delay : z^-d times a delay copy, multiplies K. weights : magnitude (F,) of the weights on functions of the
+    members, 0 = no row; those with the member as a factor are rows of the descent only. start_window : range
+    of the first angle for a stable loop.
     """
 
     ellipses: Ellipses
     delay: Complex
-    w1: Real
-    w3: Real
-    w4: Real
-    gp_max: Real | None
+    weights: tuple[tuple[LoopFunction, Real], ...]
     row_scale: Real
     start_window: tuple[float, float]
     reaches_nyquist: bool
@@ -122,14 +120,14 @@ class AngleProgram:
             eps = _EPS / scale**2
             reach = ca.sqrt(e.semi_major**2 * q_re**2 + e.semi_minor**2 * q_im**2 + eps)
             margin = scale * (cos_t * c_re + sin_t * c_im - reach)
-            add(margin - g * (scale * plant.w1), 0.0, np.inf)
-            if np.any(plant.w3 > 0):
-                use = np.flatnonzero(plant.w3 > 0).tolist()
-                size = ca.sqrt(k_re**2 + k_im**2 + 1e-16)
-                add((margin - g * (scale * plant.w3) * size)[use], 0.0, np.inf)
-            if plant.gp_max is not None and np.any(plant.w4 > 0):
-                use = np.flatnonzero(plant.w4 > 0).tolist()
-                add((margin - g * (scale * plant.w4 * plant.gp_max))[use], 0.0, np.inf)
+            for function, weight in plant.weights:
+                use = np.flatnonzero(weight > 0).tolist()
+                if function.of_plant or not use:
+                    continue
+                row = g * (scale * weight)
+                if function.of_controller:
+                    row = row * ca.sqrt(k_re**2 + k_im**2 + 1e-16)
+                add((margin - row)[use], 0.0, np.inf)
         nlp: dict[str, Any] = {
             "x": ca.vertcat(*variables),
             "f": -ca.log(g),

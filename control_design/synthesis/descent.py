@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.plants.ellipses import Complex, Real
+from control_design.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows, parameter_bounds
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
 
@@ -165,12 +166,21 @@ class _Local:
     unit: Real
 
 
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Rows of one closed-loop function: positions of its frequencies and weights there, (D,) each."""
+
+    function: LoopFunction
+    index: npt.NDArray[np.int64]
+    weight: Real
+
+
 class _Boundary:
     """Members of every ellipse of one plant, fixed once."""
 
     def __init__(self, cascade: Cascade, rows: Rows) -> None:
         e = rows.ellipses
-        self._cascade, self._rows, self._ellipses = cascade, rows, e
+        self._cascade, self._ellipses = cascade, e
         self._omega, self._delay = e.omega_rad_s, rows.delay
         angle = 2 * np.pi * np.arange(_BOUNDARY) / _BOUNDARY
         self._members = (
@@ -180,13 +190,13 @@ class _Boundary:
         )
         self._powers = 1j * tustin_frequency(self._omega, cascade.dt_s) / cascade.scale_rad_s
         self._powers = np.where(np.abs(self._powers) > 1e6, 1e6j, self._powers)
-        joint = rows.w1
-        if rows.gp_max is not None:
-            joint = np.maximum(joint, rows.w4 * rows.gp_max)
-        with np.errstate(divide="ignore"):
-            self._log_joint, self._log_w3 = np.log(joint), np.log(rows.w3)
-        self._effort = np.flatnonzero(rows.w3 > 0)
-        self._damped = np.flatnonzero(rows.w4 > 0) if rows.gp_max is None else np.zeros(0, dtype=np.int64)
+        self._blocks: list[_Block] = []
+        for function in LoopFunction:
+            sizes = [size for of, size in rows.weights if of is function]
+            weight = np.max(sizes, axis=0) if sizes else np.zeros(0)
+            if np.any(weight > 0):
+                index = np.flatnonzero(weight > 0)
+                self._blocks.append(_Block(function, index, weight[index]))
 
     def covers_minus_one(self, x: Real) -> bool:
         """Whether some ellipse contains -1/K; its boundary alone would not show it."""
@@ -198,28 +208,31 @@ class _Boundary:
         return bool(np.any(np.hypot(major, minor) < size * e.semi_major * e.semi_minor))
 
     def rows(self, x: Real, *, gradient: bool) -> tuple[Real, Real]:
-        """Logarithms (R,) of all weighted values and, if asked, their slopes (R, n)."""
+        """Logarithms (R,) of all weighted values, block by block, and, if asked, their slopes (R, n)."""
         bare = self._cascade.response(x, self._omega)
         k = bare * self._delay
-        at, _, _ = self._nearest(k)
-        back = 1.0 + at * k
+        nearest, _, _ = self._nearest(k)
+        back = 1.0 + nearest * k
         distance = -np.log(np.maximum(np.abs(back), 1e-300))
-        effort = self._effort
-        size = np.log(np.maximum(np.abs(bare[effort]), 1e-300))
-        logs = [self._log_joint + distance, self._log_w3[effort] + size + distance[effort]]
-        damped = self._damped
-        worst = np.zeros(0, dtype=np.complex128)
-        if damped.size:
-            worst, _, _ = self._loudest(k[damped])
-            gain = np.abs(worst) / np.maximum(np.abs(1.0 + worst * k[damped]), 1e-300)
-            logs.append(np.log(self._rows.w4[damped] * gain))
-        if not gradient:
-            return np.concatenate(logs), np.zeros((0, 0))
-        relative = self._relative_slope(x)  # dK/K
-        turned = -(at * k / back)[:, None] * relative
-        slopes = [turned.real, (turned[effort] + relative[effort]).real]
-        if damped.size:
-            slopes.append((-(worst * k[damped] / (1.0 + worst * k[damped]))[:, None] * relative[damped]).real)
+        size = np.log(np.maximum(np.abs(bare), 1e-300))
+        relative = self._relative_slope(x) if gradient else np.zeros((k.size, 0))  # dK/K
+        turned = -(nearest * k / back)[:, None] * relative
+        logs, slopes = [], []
+        for block in self._blocks:
+            at = block.index
+            of_k = size[at] if block.function.of_controller else 0.0
+            if block.function.of_plant:
+                worst, _, _ = self._loudest(k[at], at)
+                here = 1.0 + worst * k[at]
+                gain = np.abs(worst) / np.maximum(np.abs(here), 1e-300)
+                log = np.log(block.weight * gain) + of_k
+                slope = -(worst * k[at] / here)[:, None] * relative[at]
+            else:
+                log, slope = np.log(block.weight) + of_k + distance[at], turned[at]
+            if block.function.of_controller:
+                slope = slope + relative[at]
+            logs.append(log)
+            slopes.append(slope.real)
         return np.concatenate(logs), np.concatenate(slopes)
 
     def curvature(self, x: Real, multipliers: Real) -> Real:
@@ -229,25 +242,24 @@ class _Boundary:
         psi_xa psi_xa' / psi_aa: a long ellipse bends the row although its worst member moves only along it.
         """
         k = self._cascade.response(x, self._omega) * self._delay
-        count, effort, damped = self._omega.size, self._effort, self._damped
-        shared = multipliers[:count].copy()
-        shared[effort] += multipliers[count : count + effort.size]
-        of_effort = np.zeros(count)
-        of_effort[effort] = multipliers[count : count + effort.size]
         relative = self._relative_slope(x)
-        total, second = self._bent(relative, k, shared, self._nearest(k), np.zeros(count))
-        second = second + of_effort
-        if damped.size:
-            more, own = self._bent(
-                relative[damped],
-                k[damped],
-                multipliers[count + effort.size :],
-                self._loudest(k[damped]),
-                np.ones(damped.size),
-            )
-            total = total + more
-            second[damped] += own
-        return total + self._section_curvature(x, relative, second)
+        shared, of_controller = np.zeros(k.size), np.zeros(k.size)
+        total, second = np.zeros((x.size, x.size)), np.zeros(k.size, dtype=np.complex128)
+        start = 0
+        for block in self._blocks:
+            at, own = block.index, multipliers[start : start + block.index.size]
+            start += at.size
+            if block.function.of_controller:
+                of_controller[at] += own
+            if block.function.of_plant:
+                more, factor = self._bent(
+                    relative[at], k[at], own, self._loudest(k[at], at), np.ones(at.size)
+                )
+                total, second[at] = total + more, second[at] + factor
+            else:
+                shared[at] += own
+        more, factor = self._bent(relative, k, shared, self._nearest(k), np.zeros(k.size))
+        return total + more + self._section_curvature(x, relative, second + factor + of_controller)
 
     @staticmethod
     def _bent(
@@ -279,9 +291,9 @@ class _Boundary:
 
         return self._worst(everywhere, -np.abs(1.0 + self._members * k[:, None]), newton)
 
-    def _loudest(self, k: Complex) -> tuple[Complex, Complex, Complex]:
-        """The same for the largest |g/(1 + g K)| at the damped frequencies; k (D,)."""
-        members = self._members[self._damped]
+    def _loudest(self, k: Complex, at: npt.NDArray[np.int64]) -> tuple[Complex, Complex, Complex]:
+        """The same for the largest |g/(1 + g K)| at some of the frequencies; k (D,)."""
+        members = self._members[at]
         ratio = np.abs(members) / np.maximum(np.abs(1.0 + members * k[:, None]), 1e-300)
 
         def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
@@ -291,7 +303,7 @@ class _Boundary:
             second = (g2 / safe - (g1 / safe) ** 2 - g2 * k / back + (g1 * k / back) ** 2).real
             return np.abs(g) / np.abs(back), first, second
 
-        return self._worst(self._damped, ratio, newton)
+        return self._worst(at, ratio, newton)
 
     def _worst(
         self,

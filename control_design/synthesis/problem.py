@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from control_design.analysis.stability import closed_loop_poles
-from control_design.analysis.worst_case import KINDS, PlantData, worst_of
+from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real, scale_to_minus_one
+from control_design.plants.ellipses import Complex, Ellipses, Real, scale_to_minus_one
 from control_design.plants.frequency_grid import frequency_grid, local_maxima, mode_points, plant_grid
 from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant, winds
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.requirement import LoopFunction
 from control_design.specification import Specification, performance_modes
 from control_design.synthesis.angle_program import NlpPoint, Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -41,7 +42,7 @@ class Problem:
         self.dense: list[PlantData] = []
         for plant in plants:
             modes = _grid_modes(plant, specification)
-            extra = () if (band := specification.mode_band(plant)) is None else band
+            extra = [edge for asked in specification.weighted(plant) for edge in asked.band or ()]
             lean = frequency_grid(
                 plant.nyquist_rad_s,
                 modes,
@@ -85,16 +86,26 @@ class Problem:
         """Rows of the optimisers on the lean grids, as they are now or as given."""
         rows: list[Rows] = []
         for data in self.lean(grids):
-            rows.append(self._rows(data, data.delay))
+            plant, ellipses, asked = data.plant, data.ellipses, data.sensitivity
+            rows.append(self._rows(plant, ellipses, data.delay, data.row_weights(), asked))
             if self.spec.delay_margin_s is not None:
-                late = data.delay * np.exp(-1j * data.ellipses.omega_rad_s * self.spec.delay_margin_s)
-                rows.append(self._delay_copy(data, late))
-        grids = self.grids if grids is None else grids
-        return rows + [self._guard_rows(guard, grids[guard.plant]) for guard in self.guards]
+                late = data.delay * np.exp(-1j * ellipses.omega_rad_s * self.spec.delay_margin_s)
+                modulus = _modulus(_DELAY_COPY_MODULUS, ellipses)
+                # A fractional delay makes the loop complex at Nyquist: its phase there is not tied to zero.
+                rows.append(self._rows(plant, ellipses, late, modulus, asked, reaches_nyquist=False))
+        for guard in self.guards:
+            plant = self.plants[guard.plant]
+            points = guard.ellipses((self.grids if grids is None else grids)[guard.plant])
+            omega = points.omega_rad_s
+            delay = np.exp(-1j * omega * self.dt_s * self.spec.computational_delay_samples)
+            asked = self.spec.magnitude(plant, omega, LoopFunction.SENSITIVITY)
+            rows.append(self._rows(plant, points, delay, _modulus(GUARD_MODULUS, points), asked))
+        return rows
 
-    def gamma(self, cascade: Cascade, parameters: Real, *, kinds: Sequence[str] = KINDS) -> float:
+    def gamma(self, cascade: Cascade, parameters: Real, *, eased: bool = False) -> float:
         """Weighted worst case on the dense grids; inf if some nominal loop is unstable, an ellipse
-        reaches -1 or the controller rings by itself more than it may."""
+        reaches -1 or the controller rings by itself more than it may. eased: without what is asked of
+        disturbances at the input."""
         asked = self.spec.controller_damping
         if asked is not None and not cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
             return float("inf")  # a start that IPOPT left infeasible
@@ -103,7 +114,9 @@ class Problem:
         worst = 0.0
         for _, data in self.checks(cascade, parameters):
             values = data.weighted(cascade.response(parameters, data.ellipses.omega_rad_s))
-            worst = max(worst, float(np.max([np.max(values[kind]) for kind in kinds])))
+            weighted = [each.requirement for each in data.weightings]
+            names = [each.name for each in weighted if not (eased and each.function.of_plant)]
+            worst = max(worst, float(np.max([np.max(values[name]) for name in names])))
         return worst
 
     def checks(self, cascade: Cascade, parameters: Real) -> list[tuple[int, PlantData]]:
@@ -221,70 +234,26 @@ class Problem:
         self.grids[position] = np.union1d(self.grids[position], new)
         return int(new.size)
 
-    def _rows(self, data: PlantData, delay: Complex) -> Rows:
-        return Rows(
-            ellipses=data.ellipses,
-            delay=delay,
-            w1=np.maximum(data.w1, data.modulus),
-            w3=data.w3,
-            w4=data.w4,
-            gp_max=data.gp_max,
-            row_scale=self._row_scale(data),
-            start_window=self._start_window(data.plant),
-            reaches_nyquist=True,
-        )
-
-    def _delay_copy(self, data: PlantData, delay: Complex) -> Rows:
-        zero = np.zeros(data.ellipses.omega_rad_s.size)
-        return Rows(
-            ellipses=data.ellipses,
-            delay=delay,
-            w1=zero + _DELAY_COPY_MODULUS,
-            w3=zero,
-            w4=zero,
-            gp_max=None,
-            row_scale=self._row_scale(data),
-            start_window=self._start_window(data.plant),
-            # A fractional delay makes the loop complex at Nyquist: its phase there is not tied to zero.
-            reaches_nyquist=False,
-        )
-
-    def _guard_rows(self, guard: Guard, wanted: Real) -> Rows:
-        plant, points = self.plants[guard.plant], guard.ellipses(wanted)
-        omega = points.omega_rad_s
-        zero = np.zeros(omega.size)
-        data = PlantData(
-            plant=plant,
-            ellipses=points,
-            delay=np.exp(-1j * omega * self.dt_s * self.spec.computational_delay_samples),
-            w1=self.spec.sensitivity_magnitude(omega, self.dt_s, plant.n_integrators),
-            modulus=zero,
-            w3=zero,
-            w4=zero,
-            gp_max=None,
-        )
-        return Rows(
-            ellipses=points,
-            delay=data.delay,
-            w1=zero + GUARD_MODULUS,
-            w3=zero,
-            w4=zero,
-            gp_max=None,
-            row_scale=self._row_scale(data),
-            start_window=self._start_window(plant),
-            reaches_nyquist=True,
-        )
-
-    def _row_scale(self, data: PlantData) -> Real:
-        """Positive factors that keep rows of one size where 1 + L grows: integrators and steep tracking
-        weights.
+    def _rows(
+        self,
+        plant: UncertainPlant,
+        ellipses: Ellipses,
+        delay: Complex,
+        weights: tuple[tuple[LoopFunction, Real], ...],
+        sensitivity: Real,
+        *,
+        reaches_nyquist: bool = True,
+    ) -> Rows:
+        """Rows scaled by positive factors that keep them of one size where 1 + L grows: integrators and steep
+        tracking weights.
 
         A positive factor on |D_L + N_L| instead of |1 + L| leaves the angles alone; (omega/scale)^i is |D_L|
         of i integrators.
         """
-        integrators = data.plant.n_integrators + int(self.spec.integrator)
-        slope = np.minimum(1.0, data.ellipses.omega_rad_s / self.scale) ** integrators
-        return np.asarray(np.minimum(slope, 1.0 / np.maximum(data.w1, 1.0)), dtype=np.float64)
+        integrators = plant.n_integrators + int(self.spec.integrator)
+        slope = np.minimum(1.0, ellipses.omega_rad_s / self.scale) ** integrators
+        scale = np.asarray(np.minimum(slope, 1.0 / np.maximum(sensitivity, 1.0)), dtype=np.float64)
+        return Rows(ellipses, delay, weights, scale, self._start_window(plant), reaches_nyquist)
 
     def _start_window(self, plant: UncertainPlant) -> tuple[float, float]:
         """Range of the first angle: arg(1 + L) of a stable loop starts at -pi (P + i/2), see
@@ -297,6 +266,11 @@ class Problem:
         integrators = plant.n_integrators + int(self.spec.integrator)
         centre = -np.pi * (plant.unstable_poles + integrators / 2.0)
         return (centre - 1.4, centre + 1.4) if integrators == 0 else (centre - 0.63, centre + 1.87)
+
+
+def _modulus(value: float, ellipses: Ellipses) -> tuple[tuple[LoopFunction, Real], ...]:
+    """Nothing but a distance from -1 asked for."""
+    return ((LoopFunction.SENSITIVITY, np.full(ellipses.omega_rad_s.size, value)),)
 
 
 class _Loop:

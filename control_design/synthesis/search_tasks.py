@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from control_design.analysis.worst_case import KINDS
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Real
 from control_design.synthesis.angle_program import AngleProgram
@@ -79,7 +78,7 @@ class Workshop:
         start, stages = task.parameters, []
         if task.eased:
             program = self._eased_program(task)
-            gamma = self.problem.gamma(task.cascade, start, kinds=KINDS[:3])
+            gamma = self.problem.gamma(task.cascade, start, eased=True)
             point = program.solve(self.problem.at(task.cascade, start, program.plants, gamma))
             stages.append(Stage(point.status, point.iterations, 1.0 / point.g))
             if np.isfinite(descent.value(point.parameters)):

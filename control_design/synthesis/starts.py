@@ -17,6 +17,8 @@ from control_design.analysis.worst_case import PlantData
 from control_design.controllers.biquads import Cascade, SectionKind, tustin_frequency
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import local_maxima
+from control_design.requirement import LoopFunction
+from control_design.specification import ModulusMargin
 
 _DECADES_OF_TRACKING = 1.5  # below the crossover, in which the integrator-like loop is wished for
 _HIGHEST = 0.95  # of Nyquist: the Tustin frequency has its pole there
@@ -122,12 +124,12 @@ class StartMaker:
         grid = data.ellipses.omega_rad_s
         usable = grid < _HIGHEST * data.plant.nyquist_rad_s
         plant = data.ellipses.centre * data.delay
-        peak = data.w4 * (np.abs(data.ellipses.centre) if data.gp_max is None else data.gp_max)
+        peak = data.open_loop_disturbance
         omega: list[Real] = []
         wanted: list[Complex] = []
         weight: list[Real] = []
         lowest = 0.0
-        tracked = np.flatnonzero(data.w1 > 1.0)
+        tracked = np.flatnonzero(data.sensitivity > 1.0)
         if tracked.size:
             crossover = grid[tracked[-1]] * self.rng.uniform(0.7, 2.0)
             lowest = crossover
@@ -147,7 +149,8 @@ class StartMaker:
         strength = 10 ** self.rng.uniform(-1.5, 0.0)
         omega.append(grid[quiet])
         wanted.append(np.zeros(int(np.sum(quiet)), dtype=np.complex128))
-        weight.append(strength * np.maximum(data.w3, data.modulus * np.minimum(np.abs(plant), 1e3))[quiet])
+        small_loop = data.of(ModulusMargin) * np.minimum(np.abs(plant), 1e3)
+        weight.append(strength * np.maximum(data.largest(LoopFunction.EFFORT), small_loop)[quiet])
         if peak.max(initial=0.0) > 1.0:  # where the mode is to be damped, a large L is no harm
             weight[-1] = weight[-1] / np.maximum(1.0, peak[quiet]) ** 2
         return np.concatenate(omega), np.concatenate(wanted), np.concatenate(weight)
@@ -157,7 +160,7 @@ class StartMaker:
         spoken: list[float] = [self.cascade.scale_rad_s]
         for data in self.data:
             spoken += [m.omega_rad_s for m in data.plant.modes[:1]]
-            band = data.ellipses.omega_rad_s[data.w4 > 0]
+            band = data.ellipses.omega_rad_s[data.open_loop_disturbance > 0]
             spoken += [] if band.size == 0 else [float(band[0]), float(band[-1])]
         ceiling = 0.9 * self.data[0].plant.nyquist_rad_s
         high = float(tustin_frequency(np.array([min(max(spoken), ceiling)]), self.cascade.dt_s)[0])

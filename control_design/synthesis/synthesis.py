@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from control_design.analysis.worst_case import KINDS
 from control_design.controllers.biquads import Cascade, SectionKind
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Real
@@ -155,9 +154,9 @@ def _blocking(problem: Problem, cascade: Cascade, best: Candidate) -> tuple[Bloc
     for _, data in problem.checks(cascade, best.parameters):
         omega = data.ellipses.omega_rad_s
         values = data.weighted(cascade.response(best.parameters, omega))
-        for kind in KINDS:
-            for index in local_maxima(values[kind])[:10]:
-                value = float(values[kind][index])
+        for name in (each.requirement.name for each in data.weightings):
+            for index in local_maxima(values[name])[:10]:
+                value = float(values[name][index])
                 if value >= _STILL_BLOCKING * best.gamma:
-                    points.append(BlockingPoint(data.plant.name, kind, float(omega[index]), value))
+                    points.append(BlockingPoint(data.plant.name, name, float(omega[index]), value))
     return tuple(sorted(points, key=lambda p: -p.value))

@@ -10,6 +10,7 @@ from scipy.signal import bilinear
 
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Ellipses
+from control_design.requirement import LoopFunction
 from control_design.synthesis.angle_program import AngleProgram, Rows
 
 _SECTIONS = [
@@ -56,7 +57,9 @@ def test_symbolic_and_numeric_response_agree(sections):
     omega = np.array([1e-4, 0.3, 6.0, 8.0, 250.0, np.pi / 0.01])
     zero = np.zeros(omega.size)
     ellipses = Ellipses(omega, zero + 0j, zero, zero, zero + 1 + 0j)
-    rows = Rows(ellipses, zero + 1 + 0j, zero + 0.5, zero, zero, None, zero + 1, (-1.4, 1.4), True)
+    rows = Rows(
+        ellipses, zero + 1 + 0j, ((LoopFunction.SENSITIVITY, zero + 0.5),), zero + 1, (-1.4, 1.4), True
+    )
     program = AngleProgram(cascade, [rows])
     x = ca.SX.sym("x", cascade.parameters)
     value = np.random.default_rng(7).standard_normal(cascade.parameters)

@@ -8,7 +8,15 @@ import control
 import numpy as np
 import pytest
 
-from control_design import Certificate, Channel, Controller, Specification, UncertainPlant, certify
+from control_design import (
+    Certificate,
+    Channel,
+    Controller,
+    LoopFunction,
+    Specification,
+    UncertainPlant,
+    certify,
+)
 from validation.example_plants import ResponseRecord
 
 from .plants import RelativeDisc, hub_arm, tip_acceleration
@@ -118,11 +126,12 @@ def test_damping_number_is_the_sampled_worst_case_of_the_measured_output():
     plant, spec = _arm(0.05), Specification(mode_peak_ratio=0.5)
     certificate = certify(_gain(0.3), [plant], spec)
     (item,) = [i for i in certificate.items if i.requirement.startswith("damping")]
-    low, high = spec.mode_band(plant)
+    (asked,) = [each for each in spec.weighted(plant) if each.function is LoopFunction.DISTURBANCE]
+    low, high = asked.band
     omega = np.unique(np.append(np.linspace(low, high, 4001), item.omega_rad_s))
     e = plant.at(omega)
     loop = 0.3 * np.exp(-1j * omega * _DT)
-    w4 = 1 / (0.5 * spec.mode_reference_peak(plant))
+    w4 = asked.weight.numerator[0]
     worst = 0.0
     for f in np.linspace(0, 2 * np.pi, 721):
         g = e.points(np.cos(f), np.sin(f))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from control_design import Channel, RationalWeight, Specification
+from control_design import Channel, LoopFunction, RationalWeight, Specification, UncertainPlant
 from control_design.plants.first_order import (
     FirstOrder,
     Intervals,
@@ -146,19 +146,22 @@ def test_weights_as_rational_functions_are_those_of_the_specification(integrator
         # a zero of the weight at 2/dt, which s = (2/dt) (z - 1)/(z + 1) sends to infinity
         Specification(sensitivity_weight=RationalWeight(numerator=(-0.5, 200.0), denominator=(1.0, 0.1))),
     ]
+    plant = UncertainPlant("any", control.ss(1.0 if integrators else 0.5, 1, 1, 0, _DT))
     for specification in specifications:
         weight = specification.tracking_weight(integrators)
         assert weight is not None
         tracking = RationalResponse.from_weight(weight, _DT)
         total = np.maximum(np.abs(tracking.at(omega)), specification.modulus_margin)
         np.testing.assert_allclose(
-            total, specification.sensitivity_magnitude(omega, _DT, integrators), rtol=1e-9
+            total, specification.magnitude(plant, omega, LoopFunction.SENSITIVITY), rtol=1e-9
         )
         limit = specification.limit_weight()
         if limit is not None:
             effort = RationalResponse.from_weight(limit, _DT)
             np.testing.assert_allclose(
-                np.abs(effort.at(omega)), specification.effort_magnitude(omega, _DT), rtol=1e-9
+                np.abs(effort.at(omega)),
+                specification.magnitude(plant, omega, LoopFunction.EFFORT),
+                rtol=1e-9,
             )
     assert Specification().tracking_weight() is None
     assert Specification().limit_weight() is None

@@ -7,35 +7,38 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from control_design import RationalWeight, Specification, SpecificationError, UncertainPlant
+from control_design import LoopFunction, RationalWeight, Specification, SpecificationError, UncertainPlant
 from validation.example_plants import flexible_link
 
 from .plants import hub_arm, tip_acceleration
 
 
 def test_bandwidth_means_minus_three_decibels():
+    lag = UncertainPlant("lag", control.ss(0.9, 0.1, 1, 0, 0.001))
     for integrator in (False, True):
         spec = Specification(bandwidth_rad_s=3.0, modulus_margin=0.5, integrator=integrator)
         # At s = j bandwidth the weight is sqrt 2 up to the tiny low-frequency floor.
-        value = abs(spec.tracking_at(np.array([3j]))[0])
+        value = abs(spec.tracking_weight().at(np.array([3j]))[0])
         assert value == pytest.approx(np.sqrt(2), rel=1e-5)
-        high = spec.sensitivity_magnitude(np.array([500.0]), 0.001)
+        high = spec.magnitude(lag, np.array([500.0]), LoopFunction.SENSITIVITY)
         assert high[0] == pytest.approx(0.5, rel=1e-3)
-    low = abs(Specification(bandwidth_rad_s=3.0).tracking_at(np.array([1e-9j]))[0])
+    low = abs(Specification(bandwidth_rad_s=3.0).tracking_weight().at(np.array([1e-9j]))[0])
     assert low == pytest.approx(1000, rel=1e-6)
 
 
 def test_effort_limit_and_rolloff():
     spec = Specification(effort_limit=4.0, effort_rolloff_rad_s=10.0)
-    limit = 1 / spec.effort_magnitude(np.array([0.01, 10.0, 100.0]), 1e-5)
+    lag = UncertainPlant("lag", control.ss(0.9, 0.1, 1, 0, 1e-5))
+    omega = np.array([0.01, 10.0, 100.0])
+    limit = 1 / spec.magnitude(lag, omega, LoopFunction.EFFORT)
     np.testing.assert_allclose(limit, [4, 4 / np.sqrt(2), 4 / np.sqrt(101)], rtol=0.05)
-    assert np.all(Specification().effort_magnitude(np.array([1.0]), 0.01) == 0)
+    assert np.all(Specification().magnitude(lag, np.array([1.0]), LoopFunction.EFFORT) == 0)
 
 
 def test_damping_weight_is_relative_to_the_open_loop_peak():
     plant = UncertainPlant("arm", hub_arm())
     spec = Specification(mode_peak_ratio=0.25)
-    weight = spec.damping_magnitude(np.array([5.0, 16.0, 100.0]), plant)
+    weight = spec.magnitude(plant, np.array([5.0, 16.0, 100.0]), LoopFunction.DISTURBANCE)
     omega = np.linspace(16 / 1.5, 24, 20_001)
     peak = np.max(np.abs(control.frequency_response(hub_arm(), omega).complex))
     np.testing.assert_allclose(weight, [0, 4 / peak, 0], rtol=1e-3)  # peak found on 121 points of the mode
@@ -126,11 +129,11 @@ def test_weights_are_the_formulas_of_their_words(integrators):
     )
     corner = 3.0 * np.sqrt(2 - 0.4**2)
     expected = (0.4 * s + corner) / s * ((s + corner / 20) / s) ** integrators
-    np.testing.assert_allclose(spec.tracking_at(s, integrators), expected, rtol=1e-12)
+    np.testing.assert_allclose(spec.tracking_weight(integrators).at(s), expected, rtol=1e-12)
     limit = spec.limit_weight()
     assert limit is not None
     np.testing.assert_allclose(limit.at(s), (s / 40 + 1) / (s / 1600 + 1) / 5.0, rtol=1e-12)
     # Without an integrator of its own the controller is not asked for integral action.
     plain = Specification(bandwidth_rad_s=3.0, modulus_margin=0.4, low_frequency_rejection=0.01)
     expected = (0.4 * s + corner) / (s + corner * 0.01)
-    np.testing.assert_allclose(plain.tracking_at(s, integrators), expected, rtol=1e-12)
+    np.testing.assert_allclose(plain.tracking_weight(integrators).at(s), expected, rtol=1e-12)

@@ -9,6 +9,7 @@ import pytest
 from control_design import Specification, SynthesisOptions, UncertainPlant, certify, synthesise
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
+from control_design.requirement import LoopFunction
 from control_design.synthesis.descent import MinimaxDescent, _Boundary
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import StartMaker, with_cancelling_section
@@ -93,9 +94,10 @@ def test_descent_sees_the_exact_worst_case_of_the_ellipses():
     k = cascade.response(parameters, data.ellipses.omega_rad_s)
     distance = distance_to_minus_one(k * data.delay, data.ellipses)
     exact = np.maximum(
-        np.maximum(data.w1, data.modulus) / distance,
+        data.largest(LoopFunction.SENSITIVITY) / distance,
         np.maximum(
-            data.w3 * np.abs(k) / distance, data.w4 * largest_disturbance_gain(k * data.delay, data.ellipses)
+            data.largest(LoopFunction.EFFORT) * np.abs(k) / distance,
+            data.largest(LoopFunction.DISTURBANCE) * largest_disturbance_gain(k * data.delay, data.ellipses),
         ),
     )
     assert score == pytest.approx(np.max(exact), rel=1e-3)

@@ -19,6 +19,7 @@ from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import JointCoverage
 from control_design.convex.reference_filter import Prefilter
 from control_design.plants.plant_set import UncertainPlant
+from control_design.requirement import LoopFunction
 from control_design.specification import RationalWeight, Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from tests.workflow.report_examples import (
@@ -140,7 +141,7 @@ def test_whole_responses_agree_with_drawing_them_here():
     omega = np.geomspace(1e-3, np.pi / DT_S, 3000)
     drawn = uncertain.sample(np.random.default_rng(11), 200)
     loop = uncertain.response_of(drawn, omega) * law.response(omega)
-    weight = spec().sensitivity_magnitude(omega, DT_S, 1)
+    weight = spec().magnitude(plant(), omega, LoopFunction.SENSITIVITY)
     gamma = np.max(weight / np.abs(1 + loop), axis=1)
     # Both are shares of about all draws: 1 % is two draws of 200.
     assert abs(np.mean(gamma <= certificate.gamma) - numbers["held_share"]) < 0.02

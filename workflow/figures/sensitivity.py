@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
 from control_design.plants.plant_set import UncertainPlant
+from control_design.requirement import LoopFunction
 from control_design.specification import Specification
 from workflow.figures import style
 from workflow.figures.bands import Real
@@ -55,9 +56,9 @@ def sensitivity_curves(
     distance = np.maximum(distance_to_minus_one(gain, ellipses), 1e-300)
     worst_s = 1 / distance
     centre_s = 1 / np.abs(1 + gain * ellipses.centre)
-    nothing = np.full(omega.shape, np.nan)
-    tracking = specification.sensitivity_magnitude(omega, plant.dt_s)
-    effort = specification.effort_magnitude(omega, plant.dt_s)
+    complementary = specification.magnitude(plant, omega, LoopFunction.COMPLEMENTARY)
+    tracking = specification.magnitude(plant, omega, LoopFunction.SENSITIVITY)
+    effort = specification.magnitude(plant, omega, LoopFunction.EFFORT)
     performance = plant.performance_at(omega)
     worst_gs_own = largest_disturbance_gain(gain, ellipses)
     if performance is None:
@@ -68,7 +69,7 @@ def sensitivity_curves(
             performance.farthest() * worst_s,
             False,
         )
-    damping = specification.damping_magnitude(omega, plant)
+    damping = specification.magnitude(plant, omega, LoopFunction.DISTURBANCE)
     centre_t = np.abs(gain * ellipses.centre) * centre_s
 
     def ceiling(weight: Real) -> Real:
@@ -84,7 +85,7 @@ def sensitivity_curves(
     return (
         SensitivityCurve("|S|", to_error, "1", omega, centre_s, worst_s, ceiling(tracking)),
         SensitivityCurve("|K S|", to_command, effort_unit, omega, centre_ks, worst_ks, ceiling(effort)),
-        SensitivityCurve("|T|", to_output, "1", omega, centre_t, worst_t, nothing),
+        SensitivityCurve("|T|", to_output, "1", omega, centre_t, worst_t, ceiling(complementary)),
         SensitivityCurve(
             symbol, from_input, disturbance_unit, omega, centre_gs, worst_gs, ceiling(damping), exact
         ),

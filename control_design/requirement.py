@@ -1,0 +1,162 @@
+"""What a requirement is: the closed-loop function it bounds, its weight, its check and its caption.
+
+With K the controller and G a member of the uncertainty, four functions are everything a linear loop does:
+
+    S = 1/(1 + G K),   K S,   G S,   T = G K S.
+
+A weighted requirement asks max |W f| <= 1 over the ellipses for one of them. Everything numerical (worst
+case, programmes of the synthesis, bounds between grid points, achievable performance) knows these four and
+no requirement by name; slopes and curvatures follow from the powers of K and G.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import ClassVar
+
+import numpy as np
+
+from control_design.controllers.biquads import imaginary_axis
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.plant_set import Channel, Mode, UncertainPlant
+from control_design.plants.weights import RationalWeight
+
+_PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
+
+
+class LoopFunction(Enum):
+    """K^a G^b/(1 + G K), value (a, b)."""
+
+    SENSITIVITY = (0, 0)
+    EFFORT = (1, 0)
+    DISTURBANCE = (0, 1)
+    COMPLEMENTARY = (1, 1)
+
+    @property
+    def of_controller(self) -> bool:
+        """Whether K is a factor."""
+        return self in (LoopFunction.EFFORT, LoopFunction.COMPLEMENTARY)
+
+    @property
+    def of_plant(self) -> bool:
+        """Whether the member G is a factor."""
+        return self in (LoopFunction.DISTURBANCE, LoopFunction.COMPLEMENTARY)
+
+
+@dataclass(frozen=True)
+class SpecificationItem:
+    """One requirement on one plant: met or not, with the number that decides it and where.
+
+    bound: what was proved of `achieved` for all frequencies, where that was possible.
+    """
+
+    requirement: str
+    plant: str
+    required: float
+    achieved: float
+    unit: str
+    met: bool
+    omega_rad_s: float | None = None
+    bound: float | None = None
+
+    def sentence(self) -> str:
+        """One line for a report."""
+        where = "" if self.omega_rad_s is None else f" at {self.omega_rad_s:.4g} rad/s"
+        verdict = "met" if self.met else "NOT met"
+        unit = f" {self.unit}" if self.unit else ""
+        numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
+        known = self.met and self.bound is not None
+        proved = f" ({self.bound:.4g} proved for all frequencies)" if known else ""
+        return f"{self.plant}: {self.requirement}: {numbers}{proved}: {verdict}"
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found out about one loop, for requirements to decide on.
+
+    peaks: by name of the weighted requirement, its largest value over ellipses and grid, and where. bounds:
+    the same proved for all frequencies, None where that is not possible. modulus: smallest distance from -1,
+    and where. delay_s: worst delay margin. modes: of the nominal closed loop.
+    """
+
+    plant: str
+    peaks: Mapping[str, tuple[float, float]]
+    bounds: Mapping[str, float] | None
+    modulus: tuple[float, float]
+    delay_s: float
+    modes: Sequence[Mode]
+    controller: Controller
+
+    def proved(self, name: str) -> bool:
+        """Whether a requirement is shown to hold for all frequencies, where that can be shown at all."""
+        return self.bounds is None or self.bounds.get(name, np.inf) <= 1.0 + _PROOF_SLACK
+
+
+class Requirement(ABC):
+    """One requirement on one plant; `Specification.requirements` makes those that are asked."""
+
+    caption: ClassVar[str]
+
+    @abstractmethod
+    def check(self, found: Findings) -> SpecificationItem:
+        """Met or not, and the number that decides."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedRequirement(Requirement):
+    """max |W f| <= 1 over the ellipses of one plant, f a closed-loop function.
+
+    weight : W(s), seen through the Tustin frequency. band : frequencies where it is asked, None = all.
+    above : asked only where |W| is larger (below, another requirement asks more). channel : an independent
+    response Gp in place of the factor G of f; every pair of members is then allowed.
+    """
+
+    name: ClassVar[str]
+    function: ClassVar[LoopFunction]
+
+    weight: RationalWeight
+    band: tuple[float, float] | None = None
+    above: float = 0.0
+    channel: Channel | None = None
+
+    @property
+    def of_member(self) -> LoopFunction:
+        """f without the factor that the independent channel replaces."""
+        if self.channel is None:
+            return self.function
+        return LoopFunction.EFFORT if self.function.of_controller else LoopFunction.SENSITIVITY
+
+    def magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
+        """|W| (F,), 0 where nothing is asked; without the independent channel."""
+        omega = np.asarray(omega_rad_s, dtype=np.float64)
+        size = np.abs(self.weight.at(imaginary_axis(omega, dt_s)))
+        size = np.where(size > self.above, size, 0.0)
+        if self.band is not None:
+            size = np.where((omega >= self.band[0]) & (omega <= self.band[1]), size, 0.0)
+        return np.asarray(size, dtype=np.float64)
+
+    def check(self, found: Findings) -> SpecificationItem:
+        value, omega = found.peaks[self.name]
+        bound = None if found.bounds is None else found.bounds.get(self.name, np.inf)
+        met = bool(value <= 1.0) and found.proved(self.name)
+        return SpecificationItem(self.caption, found.plant, 1.0, value, "", met, omega, bound)
+
+
+def constant_weight(value: float) -> RationalWeight:
+    """W = value at all frequencies."""
+    return RationalWeight(numerator=(value,), denominator=(1.0,))
+
+
+def tustin_zeros(plant: UncertainPlant, samples_of_delay: int) -> Complex:
+    """Zeros of the loop outside the circle in the Tustin plane, where S(w) = 1 for every stabilising K: the
+    plant's, and the one at z = infinity (last, w = 2/dt) that a sample of delay makes."""
+    dt = plant.dt_s
+    outside = plant.zeros[np.abs(plant.zeros) > 1.0 + 1e-9]
+    w = 2.0 / dt * (outside - 1.0) / (outside + 1.0) if outside.size else np.zeros(0, complex)
+    if float(np.asarray(plant.nominal.D)[0, 0]) == 0.0 or samples_of_delay > 0:
+        w = np.append(w, 2.0 / dt)
+    return np.asarray(w, dtype=np.complex128)
