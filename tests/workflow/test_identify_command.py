@@ -16,7 +16,7 @@ from tests.workflow.test_report import ATTACK, Page
 from workflow.cli import main
 from workflow.engine.errors import InputError
 from workflow.figures.style import Picture
-from workflow.report import identify_page as page_module
+from workflow.report import rendering
 from workflow.tasks.log_identification import identify_logs, read_model
 from workflow.tasks.summary import between
 
@@ -63,7 +63,7 @@ def identified(logs):
 @pytest.fixture
 def undrawn(monkeypatch):
     empty = Picture("svg", b'<svg viewBox="0 0 1 1"><path id="a"/><use href="#a"/></svg>')
-    monkeypatch.setattr(page_module, "render", lambda figure: empty)
+    monkeypatch.setattr(rendering, "render", lambda figure: empty)
 
 
 def test_page_says_in_words_what_the_numbers_say(identified):
@@ -77,7 +77,7 @@ def test_page_says_in_words_what_the_numbers_say(identified):
     for mode in numbers["modes"]:
         assert f"{mode['omega_rad_s']:.3g} rad/s ({mode['frequency_Hz']:.3g} Hz), damping" in words
     assert f"{numbers['fit_validation_percent']['fresh']:.3g} % (fresh)" in words
-    assert "What to be careful about" in words
+    assert "Warnings and limits" in words
     assert "The residuals pass both tests" in words
     for known in numbers["uncertainty"]["intervals"]["modes"]:
         assert between(*known["frequency_Hz"]) in page.text

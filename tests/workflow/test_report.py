@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import workflow.report
 from control_design.convex.reference_filter import Prefilter
 from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import Picture
-from workflow.report import write_report
+from workflow.report import rendering
+from workflow.report.run_report import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
 
 ATTACK = "<script>alert(1)</script>"
@@ -55,7 +55,7 @@ class Page(HTMLParser):
 def undrawn(monkeypatch):
     """Figures are built but not rendered: what a page says does not depend on its pictures."""
     empty = Picture("svg", b'<svg viewBox="0 0 1 1"><path id="a"/><use href="#a"/></svg>')
-    monkeypatch.setattr(workflow.report, "render", lambda figure: empty)
+    monkeypatch.setattr(rendering, "render", lambda figure: empty)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_ids_are_unique_and_every_reference_has_its_target(drawn):
 def test_same_bytes_twice(drawn):
     first = drawn.report_path.read_bytes()
     pictures = {path.name: path.read_bytes() for path in drawn.figures_path.iterdir()}
-    write_report(drawn, example.config())
+    write_report(RunResults(drawn), example.config())
     assert drawn.report_path.read_bytes() == first
     assert {path.name: path.read_bytes() for path in drawn.figures_path.iterdir()} == pictures
 
@@ -157,7 +157,7 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
     for item in certificate.items:
         assert f"{item.achieved:.4g}" in text
     # Responses were sampled in a stage of their own, and the page says that instead.
-    sampled = "joint level: sampled, not certified; see the whole responses"
+    sampled = "joint level: sampled, not certified; see the sampled responses"
     opened = [sampled if line.startswith("joint level") else line for line in certificate.not_checked]
     assert sampled in opened
     for line in (*certificate.checked, *opened):
@@ -173,7 +173,7 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
 
 def test_a_certified_run_says_so_and_why(undrawn, tmp_path):
     page = page_for(tmp_path, example.config())
-    assert "Certified All 3 runs on the simulated arm settled." in page.text
+    assert "Certified All 3 runs on the simulated arm came to rest." in page.text
     assert "no 95 % ellipse reaches -1, and all 2 items of the specification are met" in page.text
     assert any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
@@ -188,8 +188,8 @@ def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
 
 def test_a_certificate_does_not_hide_a_loop_that_does_not_settle(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(), settled=1)
-    assert "Certificate holds, but the loop does not settle" in page.text
-    assert "2 of 3 runs on the simulated arm did not settle" in page.text
+    assert "Certificate holds, but the loop does not come to rest" in page.text
+    assert "2 of 3 runs on the simulated arm did not come to rest" in page.text
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
@@ -271,7 +271,7 @@ def test_a_real_arm_is_not_said_to_have_run(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(machine="identified"))
     assert "Nothing was run on the real machine here." in page.text
     assert "The controller has not run on the real machine." in page.text
-    assert "on the simulated arm settled" not in page.text
+    assert "on the simulated arm came to rest" not in page.text
 
 
 def test_hostile_names_are_escaped(tmp_path):
@@ -325,7 +325,7 @@ def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn
     text = Page(write_report(RunResults(run), example.config()).read_text(encoding="utf-8")).text
     assert "The loop on the arm is not the predicted one" in text
     assert "dry friction takes" not in text
-    assert "The loop does not settle with: payload 200 % and push at the tip." in text
+    assert "The loop does not come to rest with: payload 200 % and push at the tip." in text
 
 
 def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, undrawn):
@@ -342,7 +342,7 @@ def test_page_tells_of_any_order_whole_responses_and_prefilter(tmp_path, undrawn
     # Made up: 0.8 reached by any order, and the worst case of the ellipses holds for 990 of 1000 draws.
     off = f"{100 * abs(gamma / 0.8 - 1):.2g}"
     assert f"{off} % {'above' if gamma > 0.8 else 'below'} the 0.8 that a controller of any order" in text
-    assert "Against a controller of any order" in text
+    assert "against a controller of any order" in text
     assert "99 % stay within the worst case of the 95 % ellipses (98.17 % to 99.46 %" in text
     assert "Joint level: sampled, not certified" in text
     assert "Prefilter" not in text

@@ -22,6 +22,8 @@ def code_digest(*, drawing: bool = False) -> str:
             if drawing or not name.startswith(_ONLY_DRAWING):
                 digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     if drawing:
-        for path in sorted(p for p in (root / "workflow" / "templates").rglob("*") if p.is_file()):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+        templates = root / "workflow" / "templates"
+        for path in sorted(path for path in templates.rglob("*") if path.is_file()):
+            name = path.relative_to(templates).as_posix()
+            digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

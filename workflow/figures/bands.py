@@ -31,6 +31,14 @@ class ResponseBand:
     phase_high_deg: Real
 
 
+@dataclass(frozen=True, eq=False)
+class EmpiricalResponse:
+    """A response taken from the records without a model: omega_rad_s (K,), response (K,)."""
+
+    omega_rad_s: Real
+    response: Complex
+
+
 def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
     """Band of a response; frequency 0 is left out, it has no place on a log axis."""
     keep = uncertainty.omega_rad_s > 0

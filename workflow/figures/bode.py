@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
@@ -11,15 +9,23 @@ from matplotlib.ticker import MultipleLocator
 from ident.basis.model import GobfModel
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
-from workflow.figures.bands import Complex, Real, degrees_near, response_band
+from workflow.figures.bands import Complex, EmpiricalResponse, Real, degrees_near, response_band
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import ChannelView
 
 
-@dataclass(frozen=True, eq=False)
-class EmpiricalResponse:
-    """A response taken from the records without a model: omega_rad_s (K,), response (K,)."""
-
-    omega_rad_s: Real
-    response: Complex
+@drawing("bode")
+def draw_channel(channel: ChannelView, name: str) -> Figure:
+    """Identified response of a channel, its nominal model, and what the records say without one."""
+    model = channel.found.model
+    return draw_bode(
+        channel.spread.frequency,
+        name=name,
+        input_label=(model.input_name, channel.units[0]),
+        output_label=(model.output_name, channel.units[1]),
+        model=channel.spread.nominal,
+        empirical=channel.empirical,
+    )
 
 
 def draw_bode(

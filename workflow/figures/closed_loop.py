@@ -12,6 +12,9 @@ from matplotlib.figure import Figure
 
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
+from workflow.figures.registry import drawing
+from workflow.figures.sensitivity import curves_of
+from workflow.figures.subjects import MACHINE, RunView
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,29 @@ class LoopScene:
     performance: tuple[str, str] | None = None
     command_limit: float | None = None
     model: Real | None = None
+
+
+@drawing("closed-loop")
+def draw_run(run: RunView) -> Figure:
+    """The reference step and the disturbance of a run, predicted and on its machine."""
+    loop, channel, performance = run.loop, run.config.control_channel, run.performance
+    assert loop is not None
+    scene = LoopScene(
+        time_s=loop.time_s,
+        reference=loop.reference,
+        model=loop.model_answer,
+        disturbance=loop.disturbance,
+        output=(channel.output, run.output_unit),
+        command=(channel.input, run.input_unit),
+        performance=None if performance is None else (performance.found.output, performance.units[1]),
+        command_limit=loop.input_limit,
+    )
+    predicted, runs = (
+        LoopTraces(of.output, of.command, of.performance) for of in (loop.predicted_runs, loop.achieved_runs)
+    )
+    if loop.machine == "simulated":
+        return draw_closed_loop(scene, predicted, runs, machine=MACHINE["simulated"])
+    return draw_closed_loop(scene, predicted, None, spread=runs)
 
 
 def draw_closed_loop(
@@ -262,6 +288,20 @@ _MARKERS = (
 )
 
 
+@drawing("measured-sensitivity")
+def draw_measured(run: RunView) -> Figure | None:
+    """|S| of a run as measured on the arm; nothing where it was not."""
+    loop, plant = run.loop, run.plant
+    if loop is None or loop.sensitivity is None:
+        return None
+    low, high = loop.sensitivity.band_rad_s
+    omega = np.geomspace(0.9 * low, min(1.1 * high, plant.nyquist_rad_s), 900)
+    curve = curves_of(run, omega)[0]
+    peaks = [MeasuredPeak(m.name, m.omega_rad_s, m.magnitude, m.std) for m in loop.sensitivity.measured]
+    predicted = PredictedSensitivity(omega, curve.nominal, curve.worst)
+    return draw_measured_sensitivity(predicted, peaks, level=run.level)
+
+
 def draw_measured_sensitivity(
     predicted: PredictedSensitivity, measured: Sequence[MeasuredPeak], *, level: float
 ) -> Figure:
@@ -317,6 +357,17 @@ class ConditionTraces:
     reference: Real
     predicted: Real
     achieved: Real
+
+
+@drawing("closed-loop-conditions")
+def draw_run_conditions(run: RunView) -> Figure | None:
+    """The loop of a run under other conditions; nothing where none was tried."""
+    loop, output = run.loop, run.config.control_channel.output
+    if loop is None or not loop.conditions:
+        return None
+    rows = [ConditionTraces(c.name, c.words, c.reference, c.predicted, c.achieved) for c in loop.conditions]
+    time_s = loop.time_s[: rows[0].reference.size]
+    return draw_conditions(time_s, rows, (output, run.output_unit), machine=MACHINE[loop.machine])
 
 
 def draw_conditions(

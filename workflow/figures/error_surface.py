@@ -8,10 +8,38 @@ import numpy as np
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 
-from ident.search.error_surface import ErrorSurface
+from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.search_trace import SearchStage
 from workflow.figures import style
 from workflow.figures.bands import Real
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import ChannelView
+
+
+@drawing("error-surface")
+def draw_channel(channel: ChannelView) -> Figure | None:
+    """The surface of the slowest lightly damped pair, on a grid around it; nothing without a pair."""
+    pair = channel.shown_pair
+    if pair is None:
+        return None
+    found = channel.found.identification
+    poles, dt_s = found.model.poles, found.model.dt_s
+    omega, zeta = float(poles.omega_rad_s(dt_s)[pair]), float(poles.zeta()[pair])
+    longest_s = max(record.n_samples for record in channel.found.used) * dt_s
+    low = min(max(omega / 8, 2 * np.pi / longest_s), 0.8 * omega)
+    high = max(min(8 * omega, 0.95 * np.pi / dt_s), 1.02 * omega)
+    wide = np.geomspace(low, high, 30)
+    # The valley of a lightly damped pair is as narrow as its damping: even steps would jump over it.
+    near = omega * np.exp(zeta * np.sinh(np.linspace(-3.0, 3.0, 21)))
+    surface = error_surface(
+        channel.found.used,
+        found.model,
+        found.structure,
+        pair=pair,
+        first=np.unique(np.concatenate([wide, near[(near > low) & (near < high)]])),
+        second=np.geomspace(min(1e-3, zeta / 3), max(0.7, min(0.97, 1.1 * zeta)), 24),
+    )
+    return draw_error_surface(surface, searched_pairs(found.search.stages, omega), name=channel.name)
 
 
 def draw_error_surface(surface: ErrorSurface, searched: Real, *, name: str) -> Figure:

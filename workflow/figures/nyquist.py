@@ -11,9 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from control_design.plants.ellipses import nearest_distance
-from ident.uncertainty import FrequencyUncertainty
+from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import RunView
 
 _MOST_ELLIPSES = 220
 
@@ -50,6 +52,22 @@ def uncertain_loop(plant: FrequencyUncertainty, controller: Complex) -> Uncertai
         (-1.0 - centre) * np.conj(axis), size * ellipse.semi_major[keep], size * ellipse.semi_minor[keep]
     )
     return UncertainLoop(plant.omega_rad_s[keep], centre, centre[:, None] + offset, distance)
+
+
+def loop_of(run: RunView) -> UncertainLoop:
+    """The certified loop of a run, fine enough for what its controller does to the modes."""
+    frequency, plant = run.control.spread.frequency, run.plant
+    if isinstance(plant.uncertainty, ResponsePosterior):
+        frequency = plant.uncertainty.at(run.loop_grid, plant.level)
+    response = run.synthesis_or_raise.controller.response(frequency.omega_rad_s)
+    return uncertain_loop(frequency, response)
+
+
+@drawing("nyquist")
+def draw_run(run: RunView) -> Figure:
+    """The loop of a run."""
+    margin = run.config.specification.modulus_margin
+    return draw_nyquist(loop_of(run), level=run.level, modulus_margin=margin, name=run.control.name)
 
 
 def draw_nyquist(

@@ -12,11 +12,23 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from ident.search.order_selection import OrderStep
 from ident.stabilisation import Stabilisation
 from workflow.figures import style
-from workflow.figures.bode import EmpiricalResponse
+from workflow.figures.bands import EmpiricalResponse
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import ChannelView
 
 # Below this a difference of the criterion is drawn linearly, above logarithmically: a factor exp(5) = 150 in
 # posterior odds is where "better" begins to mean something.
 _LINEAR = 10.0
+
+
+@drawing("order")
+def draw_channel(channel: ChannelView) -> Figure | None:
+    """Of a channel; nothing where no other structure was tried."""
+    plot, steps = channel.found.stabilisation, channel.found.order_table
+    if plot is None or not steps:
+        return None
+    chosen = plot.n_real, plot.chosen
+    return draw_order(steps, chosen, plot, name=channel.name, response=channel.empirical)
 
 
 def draw_order(

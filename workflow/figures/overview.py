@@ -13,7 +13,9 @@ from ident.basis.model import GobfModel
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline, response_band
-from workflow.figures.nyquist import UncertainLoop, draw_around_minus_one
+from workflow.figures.nyquist import UncertainLoop, draw_around_minus_one, loop_of
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import MACHINE, RunView
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,30 @@ class StepView:
     achieved: Real
     machine: str
     output: tuple[str, str]
+
+
+@drawing("overview")
+def draw_run(run: RunView) -> Figure:
+    """Of a run whose loop was run: the step without the disturbance that follows it."""
+    loop, channel = run.loop, run.config.control_channel
+    assert loop is not None
+    half = slice(0, loop.time_s.size // 2)
+    step = StepView(
+        time_s=loop.time_s[half],
+        reference=loop.reference[half],
+        predicted=loop.predicted_runs.output[0, half],
+        achieved=loop.achieved_runs.output[:, half],
+        machine=MACHINE[loop.machine],
+        output=(channel.output, run.output_unit),
+    )
+    return draw_overview(
+        run.control.spread.frequency,
+        run.control.spread.nominal,
+        loop_of(run),
+        step,
+        gain_unit=style.ratio_unit(run.output_unit, run.input_unit),
+        modulus_margin=run.config.specification.modulus_margin,
+    )
 
 
 def draw_overview(

@@ -10,8 +10,24 @@ from matplotlib.figure import Figure
 
 from workflow.figures import style
 from workflow.figures.bands import Complex
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import ChannelView
 
 _DAMPINGS = (0.02, 0.1, 0.3, 0.6)
+
+
+@drawing("poles")
+def draw_channel(channel: ChannelView, with_zeros: bool = False) -> Figure:
+    """Poles of a channel, with its zeros if asked for, and those of the loop around it if there is one."""
+    model = channel.found.model
+    return draw_poles(
+        model.dt_s,
+        identified=model.poles.values,
+        integrators=model.integrators,
+        closed_loop=channel.closed_loop,
+        zeros=channel.zeros if with_zeros else None,
+        name=channel.name,
+    )
 
 
 def draw_poles(

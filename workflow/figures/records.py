@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 from ident.data.record import Record
 from workflow.figures import style
 from workflow.figures.bands import Real, outline
+from workflow.figures.registry import drawing
 
 Role = Literal["estimation", "validation", "repeat"]
 _ZOOM_SAMPLES = 400
@@ -27,6 +28,7 @@ class ShownRecord:
     role: Role
 
 
+@drawing("records")
 def draw_records(shown: Sequence[ShownRecord], inputs: Sequence[str], outputs: Sequence[str]) -> Figure:
     """Rows: the named inputs and outputs. Left: all records one after another. Right: the liveliest part of
     the first.

@@ -10,9 +10,11 @@ from matplotlib.figure import Figure
 
 from ident.checks.validation import ScatterRow
 from workflow.figures import style
+from workflow.figures.registry import drawing
 
 
-def draw_repeat_scatter(rows: Sequence[ScatterRow], *, name: str) -> Figure:
+@drawing("repeats")
+def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
     """Relative scatter per band, predicted and measured, and their ratio. Raises ValueError without a
     band."""
     if not rows:

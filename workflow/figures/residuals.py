@@ -7,6 +7,17 @@ from matplotlib.figure import Figure
 
 from ident.checks.validation import ResidualTest
 from workflow.figures import style
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import ChannelView
+
+
+@drawing("residuals")
+def draw_channel(channel: ChannelView) -> Figure | None:
+    """Of a channel; nothing where its records allow no test."""
+    tests = {test.name: test for test in channel.spread.tests}
+    if not {"whiteness", "independence"} <= tests.keys():
+        return None
+    return draw_residual_tests(tests["whiteness"], tests["independence"], name=channel.name)
 
 
 def draw_residual_tests(whiteness: ResidualTest, independence: ResidualTest, *, name: str) -> Figure:

@@ -15,6 +15,8 @@ from control_design.requirement import LoopFunction
 from control_design.specification import Specification
 from workflow.figures import style
 from workflow.figures.bands import Real
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import RunView
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +92,27 @@ def sensitivity_curves(
             symbol, from_input, disturbance_unit, omega, centre_gs, worst_gs, ceiling(damping), exact
         ),
     )
+
+
+def curves_of(run: RunView, omega_rad_s: Real | None = None) -> tuple[SensitivityCurve, ...]:
+    """The curves of a run, at frequencies (F,) of one's own or at those that show its loop."""
+    return sensitivity_curves(
+        run.plant,
+        run.synthesis_or_raise.controller,
+        run.config.specification,
+        run.loop_grid if omega_rad_s is None else omega_rad_s,
+        input_unit=run.input_unit,
+        output_unit=run.output_unit,
+        performance_unit="" if run.performance is None else run.performance.units[1],
+    )
+
+
+@drawing("sensitivities")
+def draw_run(run: RunView) -> Figure:
+    """Closed-loop gains of a run, its first lightly damped modes marked."""
+    modes = enumerate(run.control.light[:4], 1)
+    marks = [(mode.omega_rad_s, f"mode {number}") for number, (_, mode) in modes]
+    return draw_sensitivities(curves_of(run), level=run.level, marks=marks)
 
 
 def draw_sensitivities(

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from workflow.figures.registry import drawing
 from workflow.figures.style import (
     LIMIT,
     PREDICTED,
@@ -51,6 +52,7 @@ class Panel:
     missing: int = 0
 
 
+@drawing("pareto")
 def draw_pareto(panels: Sequence[Panel]) -> Figure:
     """Certified points filled (those on the front coloured and numbered), others hollow."""
     rows = -(-len(panels) // _PER_ROW)

@@ -7,16 +7,34 @@ from typing import Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.checks.validation import FreshFit
+from ident.checks.validation import FreshFit, fit_on_fresh_data
 from ident.data.record import Record
 from workflow.figures import style
 from workflow.figures.bands import outline
+from workflow.figures.registry import drawing
+from workflow.figures.subjects import ChannelView
 
 _WORDS = {
     "validation": "fresh record",
     "repeat": "repeat of a fitted one",
     "estimation": "record of the fit",
 }
+
+
+@drawing("validation")
+def draw_channel(channel: ChannelView) -> Figure:
+    """The free run of a channel on a record kept back, or on the first fitted one where there is none."""
+    found, shown = channel.found.identification, channel.shown_fresh
+    if shown is None:
+        record = channel.found.used[0]
+        fit = fit_on_fresh_data(found.model, record)
+        return draw_validation(record, fit, kept_as="estimation", noise_std=found.noise_std)
+    return draw_validation(
+        channel.fresh_records[shown],
+        channel.found.fresh[shown],
+        kept_as=channel.found.fresh_roles[shown],
+        noise_std=found.noise_std,
+    )
 
 
 def draw_validation(

@@ -140,6 +140,15 @@ def setting(value: Any) -> str:
     return str(value)
 
 
+def _finite(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _nan(value: float) -> bool:
+    return math.isnan(value)
+
+
+TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": _nan}
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "number": number,
     "si": si,
@@ -151,6 +160,7 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "extent": extent,
     "frequency": frequency,
     "hertz": hertz,
+    "ln": math.log,
     "degrees": degrees,
     "decibels": decibels,
     "listing": listing,

@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from workflow.figures.registry import drawings
 from workflow.figures.style import Picture, inline_svg, render
-from workflow.report.formats import FILTERS
+from workflow.report.formats import FILTERS, TESTS
 from workflow.report.page import Plot, Section
 
 
@@ -36,7 +36,7 @@ def environment(package: str = "workflow") -> Environment:
         lstrip_blocks=True,
     )
     made.filters.update(FILTERS)
-    made.globals.update(FILTERS)
+    made.tests.update(TESTS)
     return made
 
 

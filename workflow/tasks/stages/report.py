@@ -25,7 +25,7 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
 def write_page(stage: StageInput) -> ReportResult:
     """report.html and the hash of its content."""
     # Imported here: matplotlib takes a second to load, and only this stage draws.
-    from workflow.report import write_report
+    from workflow.report.run_report import write_report
 
     path = write_report(
         stage.results,

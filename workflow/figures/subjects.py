@@ -1,0 +1,325 @@
+"""What pages and pictures are about: an identified channel, and a run, from the typed results of the steps.
+
+Here are the numbers that a page needs and no step has computed; every sentence stands in the templates.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from control_design.analysis.certificate import Certificate
+from control_design.analysis.stability import closed_loop_poles
+from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.synthesis.synthesis_result import SynthesisResult
+from ident.basis.options import IdentOptions
+from ident.data.record import Record
+from workflow.config.run_config import Channel, RunConfig
+from workflow.figures.bands import Complex, EmpiricalResponse, Real
+from workflow.tasks.conditioning import as_fitted
+from workflow.tasks.joint_coverage import joint_numbers
+from workflow.tasks.log_identification import LogIdentification
+from workflow.tasks.results import IdentifiedChannel, LoopCheck, ModelMode, RunResults, UncertainChannel
+
+MACHINE = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
+LIGHT = 0.3  # damping ratio below which a pole pair is called lightly damped
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelView:
+    """One channel: model, ellipses, options of the fit, and the records behind the free runs `found.fresh`.
+
+    units: of input and output, empty where nobody stated them. file: what tells its pictures from those of
+    another channel. closed_loop: poles (n,) of the loop around it, where there is one.
+    """
+
+    found: IdentifiedChannel
+    spread: UncertainChannel
+    options: IdentOptions
+    fresh_records: tuple[Record, ...]
+    units: tuple[str, str] = ("", "")
+    file: str = ""
+    closed_loop: Complex | None = None
+
+    @property
+    def name(self) -> str:
+        return self.found.name
+
+    @property
+    def light(self) -> list[tuple[int, ModelMode]]:
+        """Lightly damped modes with their place among all modes."""
+        return [(k, mode) for k, mode in enumerate(self.found.modes) if mode.damping < LIGHT]
+
+    @property
+    def shown_fresh(self) -> int | None:
+        """Which free run is shown: the first validation record, else the first repeat, else a fitted record
+        (None)."""
+        roles = self.found.fresh_roles
+        return next((roles.index(role) for role in ("validation", "repeat") if role in roles), None)
+
+    @property
+    def shown_pair(self) -> int | None:
+        """Index of the pole pair whose error surface is shown: the slowest lightly damped one, else the
+        slowest."""
+        model = self.found.model
+        if model.poles.pairs.size == 0:
+            return None
+        omega, zeta = model.poles.omega_rad_s(model.dt_s), model.poles.zeta()
+        light = np.flatnonzero((zeta < LIGHT) & (zeta > 5e-4))
+        candidates = light if light.size else np.arange(omega.size)
+        return int(candidates[np.argmin(omega[candidates])])
+
+    @property
+    def shown_omega_rad_s(self) -> float | None:
+        model, pair = self.found.model, self.shown_pair
+        return None if pair is None else float(model.poles.omega_rad_s(model.dt_s)[pair])
+
+    @property
+    def empirical(self) -> EmpiricalResponse | None:
+        found = self.spread.empirical
+        return None if found is None else EmpiricalResponse(found.omega_rad_s, found.centre)
+
+    @property
+    def unconfirmed_rad_s(self) -> list[float]:
+        """Pole pairs of the model that the stabilisation plot does not confirm."""
+        plot = self.found.stabilisation
+        if plot is None:
+            return []
+        modes = [mode.omega_rad_s for mode in plot.columns()]
+        mine = plot.omega_rad_s[plot.n_pairs == plot.chosen]
+        return [float(w) for w in mine if not any(abs(w / mode - 1) < 0.02 for mode in modes)]
+
+    @cached_property
+    def zeros(self) -> Complex:
+        return self.found.model.zeros()
+
+    @property
+    def zeros_outside(self) -> int:
+        return int(np.count_nonzero(np.abs(self.zeros) > 1))
+
+    @property
+    def zero_pairs(self) -> list[tuple[float, float]]:
+        """Antiresonances: frequency [rad/s] and damping ratio of lightly damped zero pairs."""
+        zeros = self.zeros
+        log = np.log(zeros[(zeros.imag > 1e-9) & (np.abs(zeros) > 0.05)]) / self.found.model.dt_s
+        return sorted((abs(s), -s.real / abs(s)) for s in log if abs(s.real) < LIGHT * abs(s))
+
+    @property
+    def searched(self) -> tuple[int, int]:
+        """Real poles and pole pairs that were found, those given as known left out."""
+        fixed = self.options.fixed()
+        return len(self.found.real_poles_z) - fixed.real.size, len(self.found.modes) - fixed.pairs.size
+
+    @property
+    def unseen(self) -> list[tuple[str, float, str]]:
+        """Name, fit [%] and role of the records that the fit has not seen, validation first."""
+        fits = [(fit.name, fit.fit_percent) for fit in self.found.fresh]
+        rows = [
+            (name, fit, str(role)) for (name, fit), role in zip(fits, self.found.fresh_roles, strict=True)
+        ]
+        return sorted(rows, key=lambda row: row[2] != "validation")
+
+
+def log_channel(result: LogIdentification) -> ChannelView:
+    """The channel of `flexlink identify`."""
+    first = result.measured[0]
+    units = [names[0] if names else "" for names in (first.input_units, first.output_units)]
+    return ChannelView(
+        result.about, result.spread, result.options, result.fresh_records, (units[0], units[1])
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RunView:
+    """A run whose stages are all there."""
+
+    config: RunConfig
+    results: RunResults
+    config_text: str
+    manifest: Mapping[str, Any]
+
+    @cached_property
+    def channels(self) -> tuple[ChannelView, ...]:
+        by_name = {item.name: item.record for item in self.results.records.records}
+        views = []
+        for index, (channel, found, spread) in enumerate(
+            zip(
+                self.config.channels,
+                self.results.identify.channels,
+                self.results.uncertainty.channels,
+                strict=True,
+            )
+        ):
+            slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
+            with_loop = index == self.config.control_index and self.results.design.has_controller
+            views.append(
+                ChannelView(
+                    found,
+                    spread,
+                    channel.identification,
+                    tuple(_as_fitted(by_name[fit.name], channel) for fit in found.fresh),
+                    (self.unit(found.model.input_name), self.unit(found.model.output_name)),
+                    f"{index + 1}{'-' + slug if slug else ''}",
+                    closed_loop_poles(self.synthesis_or_raise.controller, self.plant) if with_loop else None,
+                )
+            )
+        return tuple(views)
+
+    @property
+    def control(self) -> ChannelView:
+        return self.channels[self.config.control_index]
+
+    @property
+    def performance(self) -> ChannelView | None:
+        index = self.config.performance_index
+        return None if index is None else self.channels[index]
+
+    @property
+    def inputs(self) -> list[str]:
+        return list(dict.fromkeys(channel.input for channel in self.config.channels))
+
+    @property
+    def outputs(self) -> list[str]:
+        return list(dict.fromkeys(channel.output for channel in self.config.channels))
+
+    def unit(self, signal: str) -> str:
+        """Unit of a signal, empty where nobody stated it."""
+        return self.results.records.unit(signal)
+
+    @property
+    def input_unit(self) -> str:
+        return self.unit(self.config.control_channel.input)
+
+    @property
+    def output_unit(self) -> str:
+        return self.unit(self.config.control_channel.output)
+
+    @property
+    def synthesis(self) -> SynthesisResult | None:
+        return self.results.design.synthesis
+
+    @property
+    def synthesis_or_raise(self) -> SynthesisResult:
+        if self.synthesis is None:
+            raise ValueError("the run has no design")
+        return self.synthesis
+
+    @property
+    def certificate(self) -> Certificate | None:
+        return self.results.certify.certificate
+
+    @property
+    def loop(self) -> LoopCheck | None:
+        return self.results.closed_loop.check
+
+    @property
+    def plant(self) -> UncertainPlant:
+        return self.results.uncertainty.plant(self.config)
+
+    @property
+    def level(self) -> float:
+        """Level of the ellipses of the channel that is fed back."""
+        return self.control.spread.level
+
+    @property
+    def certified_level(self) -> float:
+        """Level of the ellipses that were certified: calibrated to sampled responses where that was asked
+        for."""
+        joint = None if self.certificate is None else self.certificate.joint
+        return self.level if joint is None else max(self.level, joint.level)
+
+    @property
+    def proved(self) -> bool:
+        """Whether the certificate speaks for every frequency between the grid's points too."""
+        certificate = self.certificate
+        return certificate is not None and all(v.all_frequencies.proved for v in certificate.plants)
+
+    @property
+    def shares(self) -> Mapping[str, Any]:
+        """Shares of sampled responses that hold and are stable, with their 95 % intervals."""
+        return joint_numbers(self.results.certify.sampled)
+
+    @property
+    def requirements(self) -> list[tuple[str, Any, str]]:
+        """Name, value and meaning of what the specification asks for."""
+        asked = self.config.specification
+        rows = []
+        for name, field in type(asked).model_fields.items():
+            value = getattr(asked, name)
+            if name in _NOT_A_REQUIREMENT or value is None or value is False:
+                continue
+            if name == "low_frequency_rejection" and (asked.bandwidth_rad_s is None or asked.integrator):
+                continue
+            rows.append((name, value, field.description or ""))
+        return rows
+
+    @property
+    def largest_recorded_input(self) -> float:
+        """Of the records of the fit."""
+        fitted = self.results.records.fitted(self.config.control_channel)
+        return max(float(np.max(np.abs(record.input))) for record in fitted)
+
+    @property
+    def lasting_error_share(self) -> float:
+        """Of the reference step that a constant disturbance leaves as error; 0 without tracking."""
+        loop = self.loop
+        if loop is None or not loop.tracking:
+            return 0.0
+        return abs(loop.predicted.disturbance_left) / loop.reference_step
+
+    def spread_of(self, metric: str) -> tuple[float | None, float | None, float | None]:
+        """First, smallest and largest of a closed-loop metric over the runs; one that a run never reached
+        (None) is larger than every other."""
+        assert self.loop is not None
+        values = [getattr(row, metric) for row in self.loop.achieved]
+        known = [value for value in values if value is not None]
+        return values[0], min(known, default=None), max(known) if len(known) == len(values) else None
+
+    @cached_property
+    def loop_grid(self) -> Real:
+        """Display frequencies, denser around the modes of controller and closed loop, with the certificate's
+        worst one.
+
+        A controller that notches a mode has features as narrow as the mode's own; the identified poles do
+        not show them.
+        """
+        omega = self.control.spread.frequency.omega_rad_s
+        omega = omega[omega > 0]
+        if self.plant.own_grid is not None:
+            return omega
+        controller = self.synthesis_or_raise.controller
+        poles = [closed_loop_poles(controller, self.plant)]
+        if controller.order:
+            poles.append(np.linalg.eigvals(controller.A).astype(np.complex128))
+        modes = [
+            Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4))
+            for mode in modes_of(np.concatenate(poles), self.plant.dt_s)
+            if omega[0] < mode.omega_rad_s < omega[-1]
+        ]
+        plants = () if self.certificate is None else self.certificate.plants
+        worst = [v.worst_margin_omega_rad_s for v in plants if 0 < v.worst_margin_omega_rad_s <= omega[-1]]
+        dense = frequency_grid(
+            float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=81 * len(modes)
+        )
+        every = np.unique(np.concatenate([omega, dense, worst]))
+        return np.asarray(every[(every > 0) & (every <= omega[-1])])
+
+
+_NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
+
+
+def _as_fitted(record: Record, channel: Channel) -> Record:
+    """The record as the fit sees it, increments and filtered signals named so."""
+    fitted = as_fitted(record, channel)
+    name = fitted.output_names[0]
+    if channel.increments:
+        name = f"Δ {name}"
+    elif channel.band_rad_s is not None:
+        name = f"{name}, in band"
+    return replace(fitted, output_names=(name,))

@@ -1,0 +1,41 @@
+"""The report of a run: one self-contained page and its pictures, from what the stages left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from workflow.config.run_config import RunConfig
+from workflow.engine import storage
+from workflow.figures.subjects import RunView
+from workflow.report.rendering import render_page
+from workflow.tasks.results import RunResults
+from workflow.tasks.summary import summarise
+
+
+def write_report(
+    results: RunResults, config: RunConfig, progress: Callable[[float, str], None] | None = None
+) -> Path:
+    """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
+
+    Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
+    Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
+    """
+    run = results.run
+    text = run.path / "config.toml"
+    view = RunView(
+        config, results, text.read_text(encoding="utf-8") if text.is_file() else "", run.manifest()
+    )
+    title = config.run.title or config.run.name
+    page = render_page("report.html.j2", progress, title=title, run=view, summary=summarise(results, config))
+    run.figures_path.mkdir(exist_ok=True)
+    written = set()
+    for name, picture in page.pictures.items():
+        path = run.figures_path / f"{name}.{picture.kind}"
+        storage.write_bytes(path, picture.content)
+        written.add(path.name)
+    for stale in sorted(run.figures_path.iterdir()):
+        if stale.suffix in (".svg", ".png") and stale.name not in written:
+            stale.unlink()
+    storage.write_text(run.report_path, page.html)
+    return run.report_path
