@@ -183,7 +183,8 @@ def minima(record: Record, say: Print) -> None:
             continue
         last, shown = rss, shown + 1
         linear = fit(data, poles)
-        item = score(GobfModel(poles, linear.coefficients, 1.0, linear.feedthrough), record)
+        model = GobfModel(poles, linear.coefficients[0], 1.0, float(linear.feedthrough[0]))
+        item = score(model, record)
         names = ", ".join(
             f"{w:.3f} {z:.4f}" for w, z in zip(poles.omega_rad_s(1.0), poles.zeta(), strict=True)
         )

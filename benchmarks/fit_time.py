@@ -6,7 +6,7 @@ Plant P1 (one mode, double integrator, 30 dB). Fits: two real poles and a pair s
 knowledge, N = 1000, on noise seeds 0 .. SEEDS - 1, ours and an output-error fit (Steiglitz-McBride start,
 NumPy and SciPy) taking turns. Warnings are worked out when they are asked for: the row that names them asks.
 Cost: residual sum of squares at points of the unit cube of that search, with the offset of the output as
-nuisance; "one by one" as an optimiser calls it, "together" as the search does.
+nuisance.
 Peak memory is that of the process, libraries included. Compiling: CPU time of the first fit of a process
 without any stored code, and of the first fit of one that finds it.
 """
@@ -27,8 +27,9 @@ from benchmarks.harness import Print, main, median_s, taking_turns
 from ident import IdentOptions, identify
 from ident.basis.coordinates import search_space
 from ident.basis.poles import Poles
+from ident.fit.problem import CandidateCost
 from ident.fit.regression import prepare
-from ident.search.candidate_cost import CandidateCost
+from ident.search.direct import minimise
 from tests.ident.benchmark_plants import max_length_sequence, p1
 from validation.comparators.comparators import oe
 
@@ -69,7 +70,7 @@ def cost_of(n_samples: int) -> tuple[CandidateCost, np.ndarray]:
         [type(record)("P1", u[:, None], y[:, None], 0.005, ("u",), ("y",))], FOURTH_ORDER.structure()
     )
     space = search_space(2, 1, data.longest, data.dt_s, FOURTH_ORDER)
-    return CandidateCost(data, space, Poles(), Poles()), rng.random((96, 4))
+    return data.candidate_cost(space, Poles(), Poles()), rng.random((96, 4))
 
 
 def lfilter_and_lstsq(n_samples: int) -> Callable[[], object]:
@@ -93,21 +94,18 @@ def lfilter_and_lstsq(n_samples: int) -> Callable[[], object]:
 
 
 def costs(out: Print) -> None:
-    out(f"{'cost, n = 4':<26}  us per candidate                      together")
-    out(f"{'N':<26}  one by one  together  lfilter+lstsq  ns per sample  peak memory MB")
-    out(f"{'reach (N = 1000)':<26}  {'12':>10}  {'4':>8}  {'':>13}  {'constant':>13}  {'2000':>14}")
+    out(f"{'cost, n = 4':<26}  us per candidate")
+    out(f"{'N':<26}  one by one  lfilter+lstsq  ns per sample  peak memory MB")
+    out(f"{'reach (N = 1000)':<26}  {'12':>10}  {'':>13}  {'constant':>13}  {'2000':>14}")
     for n_samples in (1_000, 10_000, 100_000, 1_000_000):
         cost, units = cost_of(n_samples)
         repeats, at_once = max(5, 200_000 // n_samples), max(1, 50_000 // n_samples)
-        single = median_s(lambda cost=cost, units=units: cost.log(units[:1]), repeats, at_once)
-        together = median_s(lambda cost=cost, units=units: cost.log(units), max(3, repeats // 20)) / len(
-            units
-        )
+        single = median_s(lambda cost=cost, units=units: cost.log(units[0]), repeats, at_once)
         library = median_s(lfilter_and_lstsq(n_samples), max(3, repeats // 10))
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         out(
-            f"{n_samples:<26}  {1e6 * single:>10.1f}  {1e6 * together:>8.2f}  {1e6 * library:>13.1f}  "
-            f"{1e9 * together / n_samples:>13.2f}  {peak_mb:>14.0f}"
+            f"{n_samples:<26}  {1e6 * single:>10.1f}  {1e6 * library:>13.1f}  "
+            f"{1e9 * single / n_samples:>13.2f}  {peak_mb:>14.0f}"
         )
     out()
 
@@ -116,9 +114,8 @@ def searches(out: Print) -> None:
     evaluations = FOURTH_ORDER.evaluations
     cost, _ = cost_of(1000)
     out(f"{f'DIRECT-L, {evaluations} evaluations':<26}  CPU ms")
-    for name, algorithm in (("points together", "DIRECT_L"), ("NLopt, one by one", "GN_DIRECT_L")):
-        seconds = median_s(lambda algorithm=algorithm: cost.minimise(algorithm, evaluations), 21)
-        out(f"{name:<26}  {1e3 * seconds:>6.2f}")
+    seconds = median_s(lambda: minimise(cost.log, 4, FOURTH_ORDER.algorithm, evaluations), 21)
+    out(f"{'NLopt':<26}  {1e3 * seconds:>6.2f}")
     out()
 
 

@@ -17,13 +17,13 @@ import numpy as np
 
 from benchmarks.harness import Print, main
 from ident import IdentOptions
-from ident.fit.regression import Regression, prepare
+from ident.fit.least_squares import Regression
+from ident.fit.regression import prepare
 from ident.search.pole_search import PoleSearch
 from tests.ident.benchmark_plants import p2
 
 ROWS: dict[str, dict[str, object]] = {
     "as delivered": {},
-    "NLopt's GN_DIRECT_L": {"algorithm": "GN_DIRECT_L"},
     "500 evaluations": {"evaluations": 500},
     "the paper's coordinates": {"coordinates": "raw"},
     "no rescans": {},

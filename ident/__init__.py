@@ -9,8 +9,8 @@ from ident.basis.structure import Structure
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited
 from ident.frequency_fit import FrfIdentification, identify_frf
-from ident.identify import Identification, identify
-from ident.miso_identification import MisoIdentification
+from ident.identification import Identification, MisoIdentification
+from ident.identify import identify
 from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.search_trace import SearchTrace
 from ident.several_inputs import identify_miso

@@ -15,10 +15,11 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, readonly_real
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.fit.frf_refinement import to_log
-from ident.fit.frf_regression import FrfFit, FrfRegression, fit_response, pole_directions, prepare_response
-from ident.search.frf_search import FrfSearch
-from ident.search.order_selection import OrderStep
+from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
+from ident.fit.refinement import pole_system
+from ident.identify import in_order
+from ident.search.order_selection import OrderSelection, OrderStep
+from ident.search.pole_search import PoleSearch
 from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import SearchTrace
 from ident.uncertainty.embedding import EmbeddingOptions
@@ -210,12 +211,13 @@ def identify_frf(
             f"{response.omega_rad_s.size} frequencies are too few for order {fixed.order + searched}, which "
             f"has {needed} unknowns; expected at least {needed // 2 + 1}"
         )
-    search = FrfSearch(data, options)
-    best = search.run()
-    poles = _in_order(best.poles, fixed)
+    search = PoleSearch(data, options)
+    selection = OrderSelection(search, lambda fraction, message: None)
+    best = selection.run()
+    poles = in_order(best.poles, fixed)
     fit = fit_response(data, poles)
     freedom = data.n_rows - data.n_parameters(poles.order, fixed.order)
-    decay, omega, zeta = _pole_deviations(data, poles, fit, fixed, max(1.0, fit.rss / freedom))
+    decay, omega, zeta = _pole_deviations(data, poles, fixed, max(1.0, fit.rss / freedom))
     model = GobfModel(
         poles=poles,
         coefficients=fit.coefficients,
@@ -244,7 +246,7 @@ def identify_frf(
         decay_std_per_s=decay,
         omega_std_rad_s=omega,
         zeta_std=zeta,
-        order_table=search.table(best),
+        order_table=selection.table(best),
         verdicts=(_residual_verdict(fit.rss, freedom),),
         search=SearchTrace(
             tuple(search.stages),
@@ -286,32 +288,30 @@ def _outside_the_band(poles: Poles, fixed: Poles, response: FrequencyUncertainty
     ]
 
 
-def _in_order(poles: Poles, fixed: Poles) -> Poles:
-    """Known poles first as they are, then real ones from slow to fast and pairs by frequency."""
-    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
-    return Poles(
-        np.concatenate([fixed.real, np.sort(real)[::-1]]),
-        np.concatenate([fixed.pairs, pairs[np.argsort(np.abs(np.log(pairs)))]]),
-    )
-
-
 def _pole_deviations(
-    data: FrfRegression, poles: Poles, fit: FrfFit, fixed: Poles, scale: float
+    data: FrfRegression, poles: Poles, fixed: Poles, scale: float
 ) -> tuple[RealArray, RealArray, RealArray]:
     """Standard deviations of decay (R,) [1/s], omega (P,) [rad/s] and zeta (P,) from the Kaufman Jacobian."""
     n_real, n_pairs = fixed.real.size, fixed.pairs.size
-    directions = pole_directions(data, poles, fit, n_real, n_pairs)
     decay = np.zeros(poles.real.size)
     omega, zeta = np.zeros(poles.pairs.size), np.zeros(poles.pairs.size)
-    if directions.shape[1] == 0:
+    normal, _ = pole_system(data.linearise(*poles.writable()), poles, fixed)
+    if normal.size == 0:
         return decay, omega, zeta
-    inverse = np.linalg.pinv(directions, rcond=1e-10)
-    spread = np.sqrt(scale * np.sum(inverse**2, axis=1))
-    x = to_log(poles, n_real, n_pairs)
+    lengths = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal / np.outer(lengths, lengths), rcond=1e-14, hermitian=True)
+    covariance = scale * inverse / np.outer(lengths, lengths)
     n_free = poles.real.size - n_real
-    # d decay / d ln(1 - a) = (1 - a) / (a dt): infinite at a = 0, where decay itself is.
+    real = np.abs(poles.real[n_real:])
+    # d decay / d (1 - a) = 1 / (a dt): infinite at a = 0, where decay itself is.
     with np.errstate(divide="ignore"):
-        decay[n_real:] = spread[:n_free] * np.exp(x[:n_free]) / np.abs(poles.real[n_real:]) / data.dt_s
-    omega[n_pairs:] = spread[n_free::2] * np.exp(x[n_free::2]) / data.dt_s
-    zeta[n_pairs:] = spread[n_free + 1 :: 2] * np.exp(x[n_free + 1 :: 2])
+        decay[n_real:] = np.sqrt(np.maximum(np.diag(covariance)[:n_free], 0.0)) / real / data.dt_s
+    for i in range(n_pairs, poles.pairs.size):
+        at = n_free + 2 * (i - n_pairs)
+        s, f = -np.log(np.abs(poles.pairs[i])), np.angle(poles.pairs[i])
+        size = np.hypot(s, f)
+        # omega = |s + jf|, zeta = s / omega.
+        slopes = np.array([[s / size, f / size], [f**2 / size**3, -s * f / size**3]])
+        spread = np.sqrt(np.maximum(np.diag(slopes @ covariance[at : at + 2, at : at + 2] @ slopes.T), 0.0))
+        omega[i], zeta[i] = spread[0] / data.dt_s, spread[1]
     return decay, omega, zeta

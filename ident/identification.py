@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
+from ident.basis.miso_model import MisoModel
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import PriorTest
@@ -17,13 +18,12 @@ from ident.search.order_selection import OrderStep
 from ident.search.search_trace import SearchTrace
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
-    """A fitted model and how well it fits.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedRecords:
+    """How well a model with poles fits the records it was made from.
 
     Attributes
     ----------
-    model : GobfModel
     structure : Structure
         What the fit assumed around the basis, after the data decided what was left to them.
     record_names : tuple of str
@@ -39,6 +39,8 @@ class Identification:
         Share of the residual (0..1) in the tangent space of the poles that are free to move: 0 at an optimum.
     order_table : tuple of OrderStep
         Every structure that was tried, by order.
+    n_fixed : (int, int)
+        Numbers of real poles and pairs that were given (integrators counted); they come first of each type.
     verdicts : tuple of str
         One sentence for each question that was left to the data, and for each prior that they judged.
     prior_tests : tuple of PriorTest
@@ -50,7 +52,6 @@ class Identification:
         of a fit of low order.
     """
 
-    model: GobfModel
     structure: Structure
     record_names: tuple[str, ...]
     residuals: tuple[RealArray, ...]
@@ -61,14 +62,20 @@ class Identification:
     order_table: tuple[OrderStep, ...]
     verdicts: tuple[str, ...]
     search: SearchTrace
+    n_fixed: tuple[int, int] = (0, 0)
     prior_tests: tuple[PriorTest, ...] = ()
-    advise: Callable[[], Sequence[str]] = tuple
+    advise: Callable[[], Sequence[str]] = field(default=tuple)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
         object.__setattr__(self, "fit_percent", readonly_real(self.fit_percent))
         if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
             raise ValueError("residuals, record_names and fit_percent must have one entry per record")
+        if not (self.rss >= 0 and self.noise_std >= 0 and self.tangent_optimality >= 0):
+            raise ValueError(
+                "rss, noise_std and tangent_optimality must not be negative; got "
+                f"{self.rss}, {self.noise_std}, {self.tangent_optimality}"
+            )
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -99,6 +106,7 @@ class Identification:
                 [(s.n_real, s.n_pairs) for s in self.order_table], dtype=np.int64
             ).reshape(-1, 2),
             "order_values": np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2),
+            "n_fixed": np.array(self.n_fixed, dtype=np.int64),
             "verdicts": np.array(self.verdicts, dtype=np.str_),
             "prior_texts": np.array([(t.prior, t.verdict) for t in self.prior_tests], dtype=np.str_).reshape(
                 -1, 2
@@ -112,37 +120,34 @@ class Identification:
             ).reshape(-1, 5),
         }
         arrays |= {f"residual{i}": residual for i, residual in enumerate(self.residuals)}
-        arrays |= {f"model_{key}": value for key, value in self.model.to_arrays().items()}
         search = replace(self.search, warnings=self.warnings)
-        arrays |= {f"search_{key}": value for key, value in search.to_arrays().items()}
-        return arrays
+        return arrays | {f"search_{key}": value for key, value in search.to_arrays().items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Identification:
+    def _fields(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> dict[str, Any]:
+        """The fields of `to_arrays`, for the constructor."""
         integrators, delay, feedthrough, offset, initial_state, relative_degree = (
             int(item) for item in arrays["structure"]
         )
         names = tuple(str(item) for item in arrays["record_names"])
-        return cls(
-            model=GobfModel.from_arrays(_under("model_", arrays)),
-            structure=Structure(
+        steps = zip(arrays["order_counts"], arrays["order_values"], strict=True)
+        priors = zip(arrays["prior_texts"], arrays["prior_values"], strict=True)
+        return {
+            "structure": Structure(
                 integrators, delay, bool(feedthrough), bool(offset), bool(initial_state), relative_degree
             ),
-            record_names=names,
-            residuals=tuple(arrays[f"residual{i}"] for i in range(len(names))),
-            fit_percent=arrays["fit_percent"],
-            rss=float(arrays["rss"]),
-            noise_std=float(arrays["noise_std"]),
-            tangent_optimality=float(arrays["tangent_optimality"]),
-            order_table=tuple(
+            "record_names": names,
+            "residuals": tuple(arrays[f"residual{i}"] for i in range(len(names))),
+            "fit_percent": arrays["fit_percent"],
+            **{name: float(arrays[name]) for name in ("rss", "noise_std", "tangent_optimality")},
+            "order_table": tuple(
                 OrderStep(int(n_real), int(n_pairs), float(rss), float(criterion))
-                for (n_real, n_pairs), (rss, criterion) in zip(
-                    arrays["order_counts"], arrays["order_values"], strict=True
-                )
+                for (n_real, n_pairs), (rss, criterion) in steps
             ),
-            verdicts=tuple(str(item) for item in arrays["verdicts"]),
-            search=SearchTrace.from_arrays(_under("search_", arrays)),
-            prior_tests=tuple(
+            "n_fixed": (int(arrays["n_fixed"][0]), int(arrays["n_fixed"][1])),
+            "verdicts": tuple(str(item) for item in arrays["verdicts"]),
+            "search": SearchTrace.from_arrays(_under("search_", arrays)),
+            "prior_tests": tuple(
                 PriorTest(
                     str(prior),
                     bool(refused),
@@ -152,11 +157,42 @@ class Identification:
                     int(degrees),
                     str(verdict),
                 )
-                for (prior, verdict), (refused, imposed, value, bound, degrees) in zip(
-                    arrays["prior_texts"], arrays["prior_values"], strict=True
-                )
+                for (prior, verdict), (refused, imposed, value, bound, degrees) in priors
             ),
-        )
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Identification(FittedRecords):
+    """A fitted model of one input, and how well it fits."""
+
+    model: GobfModel
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        return super().to_arrays() | {f"model_{key}": value for key, value in self.model.to_arrays().items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+        return cls(model=GobfModel.from_arrays(_under("model_", arrays)), **cls._fields(arrays))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MisoIdentification(FittedRecords):
+    """A fitted model of several inputs with shared poles, and how well it fits; the criterion of its order
+    table counts 1 + U numbers per pole."""
+
+    model: MisoModel
+
+    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Plain arrays, exact round trip through `from_arrays`."""
+        return super().to_arrays() | {f"model_{key}": value for key, value in self.model.to_arrays().items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Self:
+        """Inverse of `to_arrays`."""
+        return cls(model=MisoModel.from_arrays(_under("model_", arrays)), **cls._fields(arrays))
 
 
 def _under(prefix: str, arrays: Mapping[str, np.ndarray[Any, Any]]) -> dict[str, np.ndarray[Any, Any]]:

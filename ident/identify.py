@@ -1,10 +1,12 @@
-"""Records and settings in, a GOBF model with everything needed to judge it out."""
+"""Records and settings in, a GOBF model with everything needed to judge it out; and the part of that which is
+the same for several inputs (`ident.several_inputs`)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -27,10 +29,10 @@ from ident.checks.prior_tests import (
 )
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.fit.least_squares import fit, linearisation
-from ident.fit.refinement import Bounds, Polished, free_optimality
-from ident.fit.regression import Regression, prepare, restructured, thinned
-from ident.fit.structured_fit import structured_fit, structured_optimality
+from ident.fit.least_squares import LinearFit, Regression, fit
+from ident.fit.refinement import Bounds, Refined, free_optimality
+from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
+from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification
 from ident.search.order_selection import OrderSelection, Progress
 from ident.search.pole_search import PoleSearch
@@ -69,22 +71,9 @@ def identify(
     options = options or IdentOptions()
     report = progress or _silent
     data = prepare(records, options.structure())
-    fixed = options.fixed()
-    wanted = fixed.order + (options.n_real or 0) + 2 * (options.n_pairs or 0)
-    refuse_unusable(
-        records, data, wanted if wanted else min(2, options.max_real) + 2 * min(1, options.max_pairs)
-    )
-    part, in_mid_record = thinned(records, options.search_samples)
-    structure = options.structure()
-    if in_mid_record:
-        structure = replace(structure, estimate_initial_state=True)
-    if in_mid_record or len(part) < len(records):
-        data = prepare(part, structure)
-    outcome = _searched(data, options, lambda f, message: report(0.4 * f, message))
-    if options.estimate_initial_state == "auto" and not in_mid_record:
-        outcome = _searched_with_initial_state(part, outcome, report)
-    report(0.85, "polish and tests on all samples")
-    data, best, verdicts = _fitted_on_all(records, options, outcome)
+    refuse_unusable(records, data, least_order(options))
+    outcome, part = searched(records, data, options, report)
+    data, best, verdicts = fitted_on_all(records, outcome)
     report(0.9, "tests of what is stated as known")
     data, best, tests = _priors_judged(records, part, outcome, data, best)
     result = _result(records, data, best, outcome, verdicts, tests)
@@ -92,8 +81,32 @@ def identify(
     return result
 
 
+def least_order(options: IdentOptions) -> int:
+    """Poles that the data have to be enough for."""
+    wanted = options.fixed().order + (options.n_real or 0) + 2 * (options.n_pairs or 0)
+    return wanted if wanted else min(2, options.max_real) + 2 * min(1, options.max_pairs)
+
+
+def searched(
+    records: Sequence[Record], data: Regression, options: IdentOptions, report: Progress
+) -> tuple[Outcome, Sequence[Record]]:
+    """Poles from a search on the records, or a part of long ones, and that part; initial states are estimated
+    where the data ask for it. `data` are the records made ready for a fit from rest."""
+    part, in_mid_record = thinned(records, options.search_samples)
+    structure = options.structure()
+    if in_mid_record:
+        structure = replace(structure, estimate_initial_state=True)
+    if in_mid_record or len(part) < len(records):
+        data = prepare_inputs(part, structure)
+    outcome = _searched(data, options, lambda f, message: report(0.4 * f, message))
+    if options.estimate_initial_state == "auto" and not in_mid_record:
+        outcome = _searched_with_initial_state(part, outcome, report)
+    report(0.85, "refinement and tests on all samples")
+    return outcome, part
+
+
 @dataclass(frozen=True, eq=False)
-class _Outcome:
+class Outcome:
     """A search that has come to an end on one structure.
 
     `from_rest` is the test that left the initial states out; where it took a descent with them, `free` is its
@@ -103,20 +116,20 @@ class _Outcome:
     data: Regression
     search: PoleSearch
     selection: OrderSelection
-    best: Polished
-    free: Polished | None = None
+    best: Refined
+    free: Refined | None = None
     from_rest: NuisanceTest | None = None
 
 
 def _searched(
-    data: Regression, options: IdentOptions, report: Progress, start: Polished | None = None
-) -> _Outcome:
+    data: Regression, options: IdentOptions, report: Progress, start: Refined | None = None
+) -> Outcome:
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
-    return _Outcome(data, search, selection, selection.run(start))
+    return Outcome(data, search, selection, selection.run(start))
 
 
-def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, report: Progress) -> _Outcome:
+def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, report: Progress) -> Outcome:
     """Search again with unknown initial states if the fit from rest is improbably worse than one with
     them."""
     data, options = outcome.data, outcome.search.options
@@ -135,7 +148,14 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
         without = PoleSearch(data, options).descend(end.poles, "from rest")
     else:
         if without.poles.order > 0 and (
-            clear := _clearly_left_out(outcome, (data, without), free, outcome.selection.worth(without))
+            clear := clearly_left_out(
+                "initial state",
+                (data, without),
+                free,
+                search.bounds,
+                search.fixed,
+                outcome.selection.worth(without),
+            )
         ):
             return replace(outcome, from_rest=clear)
         end = search.descend(without.poles, "with initial state")
@@ -147,25 +167,16 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: _Outcome, r
     return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
 
 
-def _clearly_left_out(
-    outcome: _Outcome, without: tuple[Regression, Polished], free: Regression, worth: float
-) -> NuisanceTest | None:
-    fixed = outcome.search.fixed
-    n_fixed = fixed.real.size, fixed.pairs.size
-    return clearly_left_out("initial state", without, free, outcome.search.bounds, n_fixed, worth)
-
-
-def _fitted_on_all(
-    records: Sequence[Record], options: IdentOptions, outcome: _Outcome
-) -> tuple[Regression, Polished, tuple[str, ...]]:
-    """Polish on all samples and decide what was left to the data: initial state first, then the offset."""
+def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Regression, Refined, tuple[str, ...]]:
+    """Refine on all samples and decide what was left to the data: initial state first, then the offset."""
     structure, search, best = outcome.data.structure, outcome.search, outcome.best
+    options = search.options
     if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
         structure = replace(structure, estimate_initial_state=False)
     if outcome.data.n_samples == sum(record.n_samples - structure.input_delay_samples for record in records):
         data = restructured(records, outcome.data, structure)
     else:
-        data = prepare(records, structure)
+        data = prepare_inputs(records, structure)
         best = _moved(data, best, search)
     verdicts = []
     for name, key, chosen in (
@@ -199,8 +210,8 @@ def _fitted_on_all(
 
 
 def _priors_judged(
-    records: Sequence[Record], part: Sequence[Record], outcome: _Outcome, data: Regression, best: Polished
-) -> tuple[Regression, Polished, tuple[PriorTest, ...]]:
+    records: Sequence[Record], part: Sequence[Record], outcome: Outcome, data: Regression, best: Refined
+) -> tuple[Regression, Refined, tuple[PriorTest, ...]]:
     """Test what the options state as known, and impose the relative degree.
 
     Each test starts from a model that the data have not refused yet: where the integrators are refused, the
@@ -249,7 +260,7 @@ def _priors_judged(
     return data, best, tuple(tests)
 
 
-def _in_order(poles: Poles, fixed: Poles) -> Poles:
+def in_order(poles: Poles, fixed: Poles) -> Poles:
     """Fixed poles first as they are, then real ones from slow to fast and pairs from low to high
     frequency."""
     real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
@@ -259,7 +270,7 @@ def _in_order(poles: Poles, fixed: Poles) -> Poles:
     )
 
 
-def _moved(data: Regression, best: Polished, search: PoleSearch) -> Polished:
+def _moved(data: Regression, best: Refined, search: PoleSearch) -> Refined:
     """The best poles polished on other rows or columns; noted in the trace of the search."""
     other = PoleSearch(data, search.options)
     end = other.descend(best.poles, "final polish")
@@ -275,69 +286,71 @@ def _silent(fraction: float, message: str) -> None:
 def _result(
     records: Sequence[Record],
     data: Regression,
-    best: Polished,
-    outcome: _Outcome,
+    best: Refined,
+    outcome: Outcome,
     verdicts: tuple[str, ...],
     tests: tuple[PriorTest, ...],
 ) -> Identification:
-    search = outcome.search
-    options = search.options
-    best = replace(best, poles=_in_order(best.poles, search.fixed))
-    relative_degree = data.structure.relative_degree
-    linear = (
-        structured_fit(data, best.poles, relative_degree) if relative_degree > 1 else fit(data, best.poles)
-    )
+    options, fixed = outcome.search.options, outcome.search.fixed
+    poles = in_order(best.poles, fixed)
+    degree = data.structure.relative_degree
+    linear = structured_fit(data, poles, degree) if degree > 1 else fit(data, poles)
+    bounds = Bounds.from_options(options, data.longest, data.dt_s)
     model = GobfModel(
-        poles=best.poles,
-        coefficients=linear.coefficients,
+        poles=poles,
+        coefficients=linear.coefficients[0],
         dt_s=data.dt_s,
-        feedthrough=linear.feedthrough,
+        feedthrough=float(linear.feedthrough[0]),
         integrators=options.integrators,
         input_delay_samples=options.input_delay_samples,
         input_name=records[0].input_names[0],
         output_name=records[0].output_names[0],
     )
-    residuals = tuple(linear.residual[data.segment(i)] for i in range(data.n_records))
-    spread = [
-        np.linalg.norm(data.y[here] - data.y[here].mean())
-        for here in map(data.segment, range(data.n_records))
-    ]
-    fixed = search.fixed
-    bounds = Bounds.from_options(options, data.longest, data.dt_s)
+    if degree > 1:
+        optimality = UnderRelativeDegree(data, degree, fixed).optimality(poles, bounds)
+    else:
+        optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, fixed)
     refused = tuple(
         test.verdict for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
     )
-    if relative_degree > 1:
-        optimality = structured_optimality(
-            data,
-            best.poles,
-            relative_degree,
-            bounds,
-            n_fixed_real=fixed.real.size,
-            n_fixed_pairs=fixed.pairs.size,
-        )
-    else:
-        optimality = free_optimality(
-            linearisation(data, best.poles), best.poles, bounds, fixed.real.size, fixed.pairs.size
-        )
-    unknowns = data.n_parameters(best.poles.order) - (relative_degree - 1)
+    described = description(records, data, poles, linear, outcome, optimality)
+    residuals = described["residuals"]
     return Identification(
         model=model,
-        structure=data.structure,
-        record_names=tuple(record.name for record in records),
-        residuals=residuals,
-        fit_percent=np.array(
-            [100 * (1 - np.linalg.norm(r) / size) for r, size in zip(residuals, spread, strict=True)]
-        ),
-        rss=linear.rss,
-        noise_std=float(np.sqrt(linear.rss / (data.n_samples - unknowns))),
-        tangent_optimality=optimality,
-        order_table=outcome.selection.table(outcome.best),
         verdicts=(*verdicts, *(test.verdict for test in tests)),
-        search=SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
         prior_tests=tests,
         advise=partial(_advice, tuple(records), data, model, residuals, fixed, bounds, refused),
+        **described,
     )
+
+
+def description(
+    records: Sequence[Record],
+    data: Regression,
+    poles: Poles,
+    linear: LinearFit,
+    outcome: Outcome,
+    optimality: float,
+) -> dict[str, Any]:
+    """Fields of `ident.identification.FittedRecords` that are read from the fit and the search."""
+    search = outcome.search
+    residuals = tuple(linear.residual[here] for here in data.segments)
+    spread = [np.linalg.norm(data.y[here] - data.y[here].mean()) for here in data.segments]
+    unknowns = data.n_parameters(poles.order) - (data.structure.relative_degree - 1)
+    return {
+        "structure": data.structure,
+        "record_names": tuple(record.name for record in records),
+        "residuals": residuals,
+        "fit_percent": np.array(
+            [100 * (1 - np.linalg.norm(r) / size) for r, size in zip(residuals, spread, strict=True)]
+        ),
+        "rss": linear.rss,
+        "noise_std": float(np.sqrt(linear.rss / (data.n_samples - unknowns))),
+        "tangent_optimality": optimality,
+        "order_table": outcome.selection.table(outcome.best),
+        "n_fixed": (search.fixed.real.size, search.fixed.pairs.size),
+        "search": SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
+    }
 
 
 def _advice(

@@ -20,13 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
 from ident.data.arrays import RealArray, readonly_real
 from ident.data.record import Record
-from ident.fit.least_squares import fit
-from ident.fit.refinement import Polished
-from ident.fit.regression import Regression, prepare, thinned
-from ident.fit.residual_colour import effective_samples
+from ident.fit.least_squares import EXPLAINED, Regression, fit
+from ident.fit.refinement import Refined
+from ident.fit.regression import prepare, thinned
 from ident.identification import Identification
 from ident.search.order_selection import Progress
 from ident.search.pole_search import PoleSearch
@@ -39,8 +37,6 @@ _BEYOND_CHOSEN = 3
 _MOST_SAMPLES = 10_000
 _MOST_PAIRS = 12
 _FEWEST_ORDERS = 2
-# Below this share of the output's power residuals are rounding, and poles fitted to them mean nothing.
-_EXPLAINED = 1e-18
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -163,13 +159,13 @@ def stabilisation(
     n_real = found.model.poles.real.size - fixed_real
     chosen = found.model.poles.pairs.size - fixed_pairs
     most = min(chosen + _BEYOND_CHOSEN, _MOST_PAIRS) if max_pairs is None else max_pairs
-    fits: list[Polished] = []
+    fits: list[Refined] = []
     for count in range(most + 1):
         if progress is not None:
             progress(count / (most + 1), f"{count} pole pairs")
         if not data.n_samples > 2 * data.n_parameters(search.fixed.order + n_real + 2 * count):
             break
-        if fits and fits[-1].rss <= _EXPLAINED * float(data.y @ data.y):
+        if fits and fits[-1].rss <= EXPLAINED * float(data.y @ data.y):
             break
         end = search.joint(n_real, 0) if count == 0 else search.add_pair(fits[-1].poles)
         if count == chosen:
@@ -180,7 +176,7 @@ def stabilisation(
 
 
 def _compared(
-    data: Regression, fits: Sequence[Polished], n_real: int, chosen: int, fixed_real: int, fixed_pairs: int
+    data: Regression, fits: Sequence[Refined], n_real: int, chosen: int, fixed_real: int, fixed_pairs: int
 ) -> Stabilisation:
     n_pairs: list[int] = []
     previous: list[int] = []
@@ -233,13 +229,13 @@ def _counterparts(omega: RealArray, before: RealArray) -> list[int]:
     return match
 
 
-def _needed(data: Regression, end: Polished, pairs: IntArray) -> list[bool]:
+def _needed(data: Regression, end: Refined, pairs: IntArray) -> list[bool]:
     """Whether the data miss each pair when it is taken out and the other poles stay where they are."""
-    worth = effective_samples(fit(data, end.poles).residual, data.starts)
-    floor = max(_EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
+    worth = data.colour(data.residual(end.poles)).effective_samples
+    floor = max(EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
     answers = []
     for index in pairs:
-        without = fit(data, Poles(end.poles.real, np.delete(end.poles.pairs, index))).rss
+        without = fit(data, end.poles.without_pair(index)).rss
         gain = worth * np.log(max(without, floor) / max(end.rss, floor))
         answers.append(bool(gain > 4 * np.log(worth)))
     return answers

@@ -70,8 +70,7 @@ class IdentOptions(BaseModel):
 
     algorithm: Algorithm = Field(
         "DIRECT_L",
-        description="DIRECT_L: NLopt's GN_DIRECT_L point for point, the points of an iteration evaluated "
-        "together; or NLopt's DIRECT variants themselves, or scipy's",
+        description="NLopt's DIRECT variants (DIRECT_L is GN_DIRECT_L), or scipy's",
     )
     coordinates: Literal["log", "raw"] = Field(
         "log",

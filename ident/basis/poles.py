@@ -104,6 +104,19 @@ class Poles:
         """Copies of real and pairs as compiled code takes them (`ident.data.arrays.kernel_array`)."""
         return self.real.copy(), self.pairs.copy()
 
+    def blocks(self) -> tuple[Poles, ...]:
+        """Each real pole and each pair by itself, in order."""
+        real = (Poles(real=self.real[i : i + 1]) for i in range(self.real.size))
+        return (*real, *(Poles(pairs=self.pairs[i : i + 1]) for i in range(self.pairs.size)))
+
+    def without_real(self, index: Any) -> Poles:
+        """These poles but the real one (or those) at `index`."""
+        return Poles(np.delete(self.real, index), self.pairs)
+
+    def without_pair(self, index: Any) -> Poles:
+        """These poles but the pair (or those) at `index`."""
+        return Poles(self.real, np.delete(self.pairs, index))
+
     def doubled(self) -> Poles:
         """Every pole twice, neighbours equal: the poles of the tangent space Phi2 (design 4.2)."""
         return Poles(np.repeat(self.real, 2), np.repeat(self.pairs, 2))

@@ -16,9 +16,8 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.fit.least_squares import linearisation
+from ident.fit.least_squares import Regression
 from ident.fit.refinement import pole_system
-from ident.fit.regression import Regression
 from ident.fit.residual_colour import effective_samples
 
 # An input is there at a frequency if it has this share of the density that it would have if its power were
@@ -102,8 +101,8 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     """
     poles, dt_s = model.poles, model.dt_s
     n_real, n_pairs = fixed.real.size, fixed.pairs.size
-    here = linearisation(data, poles)
-    normal, _ = pole_system(here, poles, n_real, n_pairs)
+    here = data.linearise(*poles.writable())
+    normal, _ = pole_system(here, poles, fixed)
     if normal.size == 0 or not data.n_samples > data.n_parameters(poles.order):
         return []
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -114,10 +113,11 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     n_free = poles.real.size - n_real
     still = 1.01e-3 / data.longest  # slower ones have come to the bound, which pole_warnings speaks of
     seconds = data.longest * dt_s
+    residual = data.residual(poles)
     sentences = []
     for rate, spread in zip(1 - poles.real[n_real:], deviation[:n_free], strict=True):
         slow = still < rate < 1 / (_SLOW * data.longest)
-        if slow and not _is_known(here.residual, data, rate / dt_s, spread / rate):
+        if slow and not _is_known(residual, data, rate / dt_s, spread / rate):
             sentences.append(
                 f"a real pole decays with a time constant of {dt_s / rate:.0f} s, give or take a factor "
                 f"of two at best, in {seconds:.3g} s of record: record longer, or give it as known "
@@ -126,7 +126,7 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     omegas = poles.omega_rad_s(dt_s)[n_pairs:]
     rates = -np.log(np.abs(poles.pairs[n_pairs:]))
     for omega, rate, spread in zip(omegas, rates, deviation[n_free::2], strict=True):
-        if rate > still and not _is_known(here.residual, data, omega, spread / rate):
+        if rate > still and not _is_known(residual, data, omega, spread / rate):
             sentences.append(
                 f"the damping of the pole pair at {omega:.4g} rad/s is known to a factor of two at best: "
                 f"record longer than {seconds:.3g} s, drive it harder, or fit one pair less if it is no mode "
@@ -222,10 +222,11 @@ def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
         np.polynomial.legendre.legvander(np.linspace(-1, 1, n), max(degree, 1)) for n in np.diff(data.starts)
     ]
     with_lines = replace(data, polynomials=np.ascontiguousarray(np.concatenate(lines).T))
-    without = Poles(np.delete(poles.real, index), poles.pairs)
+    without = poles.without_real(index)
     if not data.n_samples > with_lines.n_parameters(without.order):
         return False
-    return linearisation(with_lines, without).rss <= _AS_WELL * linearisation(data, poles).rss
+    there = with_lines.linearise(*without.writable()).rss
+    return there <= _AS_WELL * data.linearise(*poles.writable()).rss
 
 
 def _far_from_zero(records: Sequence[Record], data: Regression) -> list[str]:

@@ -11,7 +11,8 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import ROUGH, Fitted, PriorTest, judged, limit, silent, statistic
 from ident.data.record import Record
-from ident.fit.regression import Regression, prepare
+from ident.fit.least_squares import Regression
+from ident.fit.regression import prepare
 from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import PoleSearch
 
@@ -90,9 +91,10 @@ def _without_integrators(
     ends = [small.descend(start, "integrators freed", ROUGH) for start in starts]
     ends.append(OrderSelection(small, silent).run())
     best = min(ends, key=lambda end: end.rss)
-    search = PoleSearch(prepared(records, given.data.structure), options)
+    data = prepared(records, given.data.structure)
+    search = PoleSearch(data, options)
     search.evaluations = small.evaluations
-    return Fitted(search.data, search.descend(best.poles, "integrators freed"), search)
+    return Fitted(data, search.descend(best.poles, "integrators freed"), search)
 
 
 def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
@@ -141,13 +143,8 @@ def _other_pole_to_spare(given: Fitted, price: float) -> bool:
     Then the pole too many was another one: it can take the place of an integrator, or a pair that of two.
     """
     poles, fixed = given.end.poles, given.search.fixed
-    fewer = [
-        (Poles(np.delete(poles.real, i), poles.pairs), price) for i in range(fixed.real.size, poles.real.size)
-    ]
-    fewer += [
-        (Poles(poles.real, np.delete(poles.pairs, i)), 2 * price)
-        for i in range(fixed.pairs.size, poles.pairs.size)
-    ]
+    fewer = [(poles.without_real(i), price) for i in range(fixed.real.size, poles.real.size)]
+    fewer += [(poles.without_pair(i), 2 * price) for i in range(fixed.pairs.size, poles.pairs.size)]
     return any(
         statistic(given.search.descend(start, "one less").rss, given) <= limit_here
         for start, limit_here in fewer

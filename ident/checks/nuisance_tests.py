@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from ident.fit.least_squares import linearisation
-from ident.fit.refinement import Bounds, Polished, free_optimality
-from ident.fit.regression import Regression
-from ident.fit.residual_colour import effective_samples
+from ident.basis.poles import Poles
+from ident.fit.least_squares import Regression
+from ident.fit.refinement import Bounds, Refined, free_optimality
 
 # A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
 NUISANCE_LEVEL = 0.99
@@ -52,24 +51,24 @@ class NuisanceTest:
 
 def nuisance_test(
     name: str,
-    without: tuple[Regression, Polished],
-    with_it: tuple[Regression, Polished],
+    without: tuple[Regression, Refined],
+    with_it: tuple[Regression, Refined],
     worth: float | None = None,
 ) -> NuisanceTest:
     """Likelihood ratio of two optima; `worth` of the residual with the nuisance, if it is known."""
     data, end = with_it
     if worth is None:
-        worth = effective_samples(linearisation(data, end.poles).residual, data.starts)
+        worth = data.colour(data.residual(end.poles)).effective_samples
     ratio = max(without[1].rss, 1e-300) / max(end.rss, 1e-300)
     return NuisanceTest(name, _columns(without, data), float(worth * np.log(ratio)))
 
 
 def clearly_left_out(
     name: str,
-    without: tuple[Regression, Polished],
+    without: tuple[Regression, Refined],
     with_it: Regression,
     bounds: Bounds,
-    n_fixed: tuple[int, int],
+    fixed: Poles,
     worth: float,
 ) -> NuisanceTest | None:
     """The score test if it leaves no doubt that the nuisance is not needed, else None: descend and compare.
@@ -78,14 +77,14 @@ def clearly_left_out(
     nuisance, for the statistic that is shown.
     """
     end = without[1]
-    here = linearisation(with_it, end.poles)
-    share = free_optimality(here, end.poles, bounds, *n_fixed)
+    here = with_it.linearise(*end.poles.writable())
+    share = free_optimality(here, end.poles, bounds, fixed)
     promised = here.rss * (1 - share**2)
     gain = float(np.log(max(end.rss, 1e-300) / max(promised, 1e-300)))
     test = NuisanceTest(name, _columns(without, with_it), worth * gain)
     return test if with_it.n_samples * gain < _CLEARLY_BELOW * test.limit else None
 
 
-def _columns(without: tuple[Regression, Polished], with_it: Regression) -> int:
+def _columns(without: tuple[Regression, Refined], with_it: Regression) -> int:
     order = without[1].poles.order
     return with_it.n_parameters(order) - without[0].n_parameters(order)

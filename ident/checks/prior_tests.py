@@ -23,11 +23,10 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.fit.least_squares import fit
-from ident.fit.refinement import Polished
-from ident.fit.regression import Regression, prepare
-from ident.fit.residual_colour import effective_samples
-from ident.fit.structured_fit import structured_fit, structured_polish
+from ident.fit.least_squares import Regression
+from ident.fit.refinement import Refined
+from ident.fit.regression import prepare
+from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import PoleSearch
 
@@ -77,16 +76,16 @@ class Fitted:
     """An optimum on all samples, and the search (options, bounds, trace) it belongs to."""
 
     data: Regression
-    end: Polished
+    end: Refined
     search: PoleSearch
 
     @property
     def residual(self) -> RealArray:
-        return fit(self.data, self.end.poles).residual
+        return self.data.residual(self.end.poles)
 
     def worth(self) -> float:
         """Independent samples that the residual is worth."""
-        return effective_samples(self.residual, self.data.starts)
+        return self.data.colour(self.residual).effective_samples
 
 
 def statistic(rss_with_prior: float, without: Fitted) -> float:
@@ -170,7 +169,7 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
         residuals = [
-            fit(item.data, item.end.poles).residual
+            item.residual
             if structure.feedthrough  # which a relative degree of 1, the least there is, would refuse
             else structured_fit(item.data, item.end.poles, relative_degree).residual
             for item in (given, shifted)
@@ -178,7 +177,7 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
         common = max(delay, other)
         ours = _power_from(residuals[0], given.data, common - delay)
         theirs = _power_from(residuals[1], data, common - other)
-        worth = effective_samples(residuals[1], data.starts)
+        worth = data.colour(residuals[1]).effective_samples
         value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
         if ours <= 1e-18 * float(given.data.y @ given.data.y):
             value = 0.0
@@ -214,7 +213,7 @@ def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
     )
 
 
-def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Polished]:
+def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Refined]:
     """Relative degree r >= 2 against 1, and the best fit under it.
 
     `free` is the optimum without the conditions. The descent under them starts there and, because a wrong
@@ -252,7 +251,7 @@ def too_few_poles(relative_degree: int, order: int) -> PriorTest:
     return PriorTest(prior, True, False, 0.0, limit(relative_degree - 1), relative_degree - 1, verdict)
 
 
-def best_under_relative_degree(free: Fitted, relative_degree: int) -> Polished:
+def best_under_relative_degree(free: Fitted, relative_degree: int) -> Refined:
     """Best descent under the relative degree from the free optimum and the next two other ones."""
     search, poles = free.search, free.end.poles
     starts = [poles]
@@ -264,21 +263,9 @@ def best_under_relative_degree(free: Fitted, relative_degree: int) -> Polished:
             starts.append(other)
         if len(starts) == 3:
             break
-    fixed = search.fixed
-
-    def descended(start: Poles, tolerance: float) -> Polished:
-        return structured_polish(
-            free.data,
-            start,
-            relative_degree,
-            search.bounds,
-            n_fixed_real=fixed.real.size,
-            n_fixed_pairs=fixed.pairs.size,
-            tolerance=tolerance,
-        )
-
-    rough = min((descended(start, ROUGH) for start in starts), key=lambda end: end.rss)
-    return descended(rough.poles, 1e-9)
+    constrained = UnderRelativeDegree(free.data, relative_degree, search.fixed)
+    ends = (constrained.refine(start, search.bounds, ROUGH) for start in starts)
+    return constrained.refine(min(ends, key=lambda end: end.rss).poles, search.bounds)
 
 
 def _distance(one: Poles, other: Poles) -> float:

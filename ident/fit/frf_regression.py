@@ -7,16 +7,21 @@ together play the part of the samples in the time domain (design 4.2): thin QR, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ident.basis.functions import basis_response
+from ident.basis.coordinates import SearchSpace
+from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import standard_axes
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.fit.problem import CandidateCost, Linearisation
+from ident.fit.residual_colour import ResidualColour, residual_colour
 
 # A minor axis below this part of the major one would let one direction of one frequency overrule the rest.
 _THINNEST = 1e-4
@@ -51,10 +56,27 @@ class FrfRegression:
     feedthrough: bool
     dt_s: float
 
-    @property
+    @cached_property
     def n_rows(self) -> int:
         """Number of real numbers that were measured: two per frequency, one at 0 and at pi/dt."""
         return int(np.count_nonzero(self.weight))
+
+    @cached_property
+    def power(self) -> float:
+        """|y|^2."""
+        return float(self.y @ self.y)
+
+    @cached_property
+    def longest(self) -> int:
+        """Samples of a record that shows the lowest measured frequency twice."""
+        angle = np.angle(self.z)
+        return int(np.ceil(4 * np.pi / angle[angle > 0].min()))
+
+    @cached_property
+    def omega_max_rad_s(self) -> float | None:
+        """The last measured frequency: beyond nothing shows where a pair is; a refinement may still go
+        there."""
+        return min(float(np.angle(self.z).max()), 0.9 * np.pi) / self.dt_s
 
     def n_parameters(self, order: int, n_fixed: int = 0) -> int:
         """Number of free real numbers of a fit: coefficients, direct term, poles that are not known."""
@@ -78,6 +100,74 @@ class FrfRegression:
     def columns(self, poles: Poles) -> RealArray:
         """The same whitened, (2 F, B or B + 1)."""
         return self.whiten(self.responses(poles))
+
+    def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
+        """Cost and Kaufman linearisation at these poles."""
+        poles = Poles(real, pairs)
+        here = fit_response(self, poles)
+        if not here.rss < below:
+            return Linearisation(here.rss, np.zeros((0, 0)), np.zeros(0))
+        states = [basis_response(block, self.z) for block in poles.blocks()]
+        rows = self.whiten(here.response[:, np.newaxis] * np.hstack([np.zeros((self.z.size, 0)), *states]))
+        rows -= here.q @ (here.q.T @ rows)
+        return Linearisation(here.rss, rows.T @ rows, rows.T @ here.residual)
+
+    def residual(self, poles: Poles) -> RealArray:
+        """The whitened residual (2 F,)."""
+        return fit_response(self, poles).residual
+
+    def colour(self, residual: RealArray) -> ResidualColour:
+        """Colour of a whitened residual (2 F,) over frequency; what it is worth counts measured numbers."""
+        count = self.z.size
+        found = residual_colour(residual, np.array([0, count, 2 * count], dtype=np.int64))
+        share = found.effective_samples / residual.size
+        return ResidualColour(max(share * self.n_rows, 3.0), found.white)
+
+    def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
+        """J / scale + (free numbers) ln Ne, J as far as it is independent.
+
+        J is a chi-square because the covariances are known: one more pole, of two numbers, is kept if J falls
+        by more than 2 ln Ne (a pair: 4 ln Ne, design 4.3), and a fall within the covariances is no reason for
+        one, however small the residual became. Where J stays larger than the covariances explain they are
+        multiplied by its excess. Neighbouring frequencies may share their errors, hence Ne = worth instead of
+        the number of rows.
+        """
+        scale = max(1.0, rss / max(self.n_rows - self.n_parameters(order), 1))
+        share, price = worth / self.n_rows, float(np.log(worth))
+        return lambda rss, order: share * rss / scale + self.n_parameters(order) * price
+
+    def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
+        """Cost of candidates on top of frozen poles; a response has no free ones."""
+        frozen = self.columns(shared)
+        q = np.linalg.qr(frozen)[0] if frozen.shape[1] else frozen
+        residual = self.y - q @ (q.T @ self.y)
+        drive = self.common * all_pass_response(shared, self.z)
+
+        def costs(units: RealArray) -> RealArray:
+            blocks = np.stack([space.blocks(unit) for unit in units])
+            rows = self.whiten(_cascade_responses(blocks, space.n_real, self.z, drive))
+            q_new = np.linalg.qr(rows - q @ (q.T @ rows))[0]
+            return np.asarray(
+                residual @ residual - np.sum(np.einsum("enk,n->ek", q_new, residual) ** 2, axis=1)
+            )
+
+        return CandidateCost(space, self.power, lambda unit: float(costs(unit[np.newaxis])[0]), costs)
+
+
+def _cascade_responses(blocks: RealArray, n_real: int, z: ComplexArray, drive: ComplexArray) -> ComplexArray:
+    """Responses (E, F, B) of E cascades, given by their blocks (E, R + P, 4), behind `drive` (F,)."""
+    drive = np.broadcast_to(drive, (len(blocks), z.size))
+    columns = []
+    for i in range(blocks.shape[1]):
+        p0, p1, p2, p3 = (blocks[:, i, j, np.newaxis] for j in range(4))
+        if i < n_real:
+            columns.append(p1 / (z - p0) * drive)
+            drive = drive * (1 - p0 * z) / (z - p0)
+        else:
+            below = z**2 - p1 * (1 + p0) * z + p0
+            columns += [p2 * (z - p1) / below * drive, p2 * p3 / below * drive]
+            drive = drive * (1 - p1 * (1 + p0) * z + p0 * z**2) / below
+    return np.stack(columns, axis=-1)
 
 
 def prepare_response(
@@ -158,26 +248,3 @@ def fit_response(data: FrfRegression, poles: Poles) -> FrfFit:
         rss=float(residual @ residual),
         q=q,
     )
-
-
-def pole_directions(data: FrfRegression, poles: Poles, fit: FrfFit, n_real: int, n_pairs: int) -> RealArray:
-    """Whitened sensitivities (2 F, R + 2 P) of the fit to (ln(1 - a); ln omega, ln zeta), coefficients
-    re-fitted all the time.
-
-    The first n_real and n_pairs poles are fixed and have no column. Modulo the columns of the fit, moving a
-    pole changes the response G by -(dD_b / D_b) G, D_b the denominator of its block; what the columns explain
-    is projected off (Kaufman). J changes by -2 r^T s.
-    """
-    z, g = data.z, fit.response
-    parts = [-(1 - a) / (z - a) * g for a in poles.real[n_real:]]
-    for p in poles.pairs[n_pairs:]:
-        # D = z^2 - t z + h with t = 2 exp(-s) cos f, h = exp(-2 s); s = zeta omega, f = omega sqrt(1 -
-        # zeta^2).
-        s, f = -np.log(abs(p)), float(np.angle(p))
-        by_s = (-2 * p.real * z + 2 * abs(p) ** 2) / ((z - p) * (z - np.conj(p))) * g
-        by_f = -2 * p.imag * z / ((z - p) * (z - np.conj(p))) * g
-        parts += [s * by_s + f * by_f, s * by_s - s**2 / f * by_f]
-    if not parts:
-        return np.zeros((2 * z.size, 0))
-    rows = data.whiten(np.column_stack(parts))
-    return rows - fit.q @ (fit.q.T @ rows)

@@ -1,11 +1,11 @@
-"""Compiled inner loops of the pole search: the cost of a candidate and the linearisation of a fit.
+"""Compiled inner loops: the cost of candidate poles and the linearisation of a fit, for one or more inputs.
 
 Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1].
 Matrices are kept as rows (columns of the regression), so that every inner loop runs over contiguous memory.
 
-Here and in the other compiled modules a function whose products and sums may be fused or reordered is always
-compiled into its callers (forceinline): left as a call, the copy of whichever kernel was loaded first would
-be taken, and copies round differently.
+Both kernels work on inner products of the columns. A function whose products and sums may be fused or
+reordered is always compiled into its callers (forceinline): left as a call, the copy of whichever kernel was
+loaded first would be taken, and copies round differently.
 """
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ from typing import Any
 import numba
 import numpy as np
 
+from ident.basis.coordinates import blocks_of_point
 from ident.basis.functions import run_cascade, run_cascade_free
 
 # A column whose part outside the columns before it is below this fraction of its length carries no
 # information.
 _RANK_TOLERANCE = 1e-11
+# Least square of a column's part outside the columns before it, relative to its own, for a linearisation by
+# products: the error of the inverse is about 1e-16 over this, before refinement.
+_LEAST_PIVOT = 1e-8
 
 
 @numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
@@ -31,6 +35,32 @@ def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
     for k in range(x.size):
         total += x[k] * y[k]
     return total
+
+
+@numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
+def _four_dots(a: Any, rows: Any, j: int, last: int, lo: int, hi: int) -> tuple[float, float, float, float]:
+    """Products of a with rows j .. j + 3, or `last` in place of what lies beyond it."""
+    x = a[lo:hi]
+    y0, y1 = rows[j, lo:hi], rows[min(j + 1, last), lo:hi]
+    y2, y3 = rows[min(j + 2, last), lo:hi], rows[min(j + 3, last), lo:hi]
+    s0 = s1 = s2 = s3 = 0.0
+    for k in range(x.size):
+        s0 += x[k] * y0[k]
+        s1 += x[k] * y1[k]
+        s2 += x[k] * y2[k]
+        s3 += x[k] * y3[k]
+    return s0, s1, s2, s3
+
+
+@numba.njit(cache=True)
+def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
+    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: j <= i only."""
+    for i in range(first, rows.shape[0]):
+        last = i if lower else others.shape[0] - 1
+        for j in range(0, last + 1, 4):
+            four = _four_dots(rows[i], others, j, last, lo, hi)
+            for q in range(min(4, last + 1 - j)):
+                target[i, j + q] = four[q]
 
 
 @numba.njit(cache=True)
@@ -47,37 +77,20 @@ def _copy(target: Any, source: Any) -> None:
         target[k] = source[k]
 
 
-@numba.njit(cache=True, forceinline=True)
-def _dots(rows: Any, others: Any, lo: int, hi: int) -> Any:
-    """Inner products (A, B) of rows (A, N) and others (B, N) over lo..hi."""
-    products = np.empty((rows.shape[0], others.shape[0]))
-    for i in range(rows.shape[0]):
-        for j in range(others.shape[0]):
-            products[i, j] = _dot(rows[i], others[j], lo, hi)
-    return products
-
-
 @numba.njit(cache=True)
-def _place(target: Any, part: Any, row: int, column: int) -> None:
-    for i in range(part.shape[0]):
-        for j in range(part.shape[1]):
-            target[row + i, column + j] = part[i, j]
-
-
-@numba.njit(cache=True)
-def _subtract_products(target: Any, a: Any, b: Any, row: int, column: int) -> None:
-    """target[row:, column:] -= a b^T."""
-    for i in range(a.shape[0]):
-        for j in range(b.shape[0]):
+def _subtract_squares(target: Any, a: Any, first: int) -> None:
+    """target[i, j] -= a[i] a[j]^T, lower triangle from row `first` on."""
+    for i in range(first, a.shape[0]):
+        for j in range(i + 1):
             total = 0.0
             for q in range(a.shape[1]):
-                total += a[i, q] * b[j, q]
-            target[row + i, column + j] -= total
+                total += a[i, q] * a[j, q]
+            target[i, j] -= total
 
 
 @numba.njit(cache=True)
-def _schur_drop(gram: Any, b: Any) -> float:
-    """b^T gram^-1 b by Cholesky; dependent columns are left out."""
+def schur_drop(gram: Any, b: Any) -> float:
+    """b^T gram^-1 b by Cholesky in place; dependent columns are left out."""
     n = b.size
     drop = 0.0
     for j in range(n):
@@ -104,187 +117,264 @@ def _schur_drop(gram: Any, b: Any) -> float:
     return drop
 
 
-@numba.njit(cache=True, forceinline=True)
+@numba.njit(cache=True)
+def factorise(gram: Any, n: int, least_pivot: float) -> bool:
+    """Cholesky factor into the lower triangle of gram[:n, :n]; False if a pivot is below its least share."""
+    for j in range(n):
+        diagonal = gram[j, j]
+        pivot = diagonal
+        for i in range(j):
+            pivot -= gram[j, i] ** 2
+        if not pivot > least_pivot * diagonal:
+            return False
+        gram[j, j] = np.sqrt(pivot)
+        for row in range(j + 1, n):
+            entry = gram[row, j]
+            for i in range(j):
+                entry -= gram[row, i] * gram[j, i]
+            gram[row, j] = entry / gram[j, j]
+    return True
+
+
+@numba.njit(cache=True)
+def forward(factor: Any, n: int, b: Any) -> None:
+    """b[:n] = L^-1 b[:n]."""
+    for i in range(n):
+        for j in range(i):
+            b[i] -= factor[i, j] * b[j]
+        b[i] /= factor[i, i]
+
+
+@numba.njit(cache=True)
+def backward(factor: Any, n: int, b: Any) -> None:
+    """b[:n] = L^-T b[:n]."""
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            b[i] -= factor[j, i] * b[j]
+        b[i] /= factor[i, i]
+
+
+@numba.njit(cache=True)
+def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) -> None:
+    """States of a cascade driven by each of the signals (U, N), record by record from rest, into rows
+    (U B, N); signals become what its all-pass makes of them."""
+    order = 2 * blocks.shape[0] - n_real
+    for i in range(signals.shape[0]):
+        for r in range(starts.size - 1):
+            run_cascade(blocks, n_real, signals[i], rows, i * order, starts[r], starts[r + 1])
+
+
+@numba.njit(cache=True)
+def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
+    """Free responses of a cascade over the longest record (B, T)."""
+    longest = 0
+    for r in range(starts.size - 1):
+        longest = max(longest, starts[r + 1] - starts[r])
+    rows = np.empty((2 * blocks.shape[0] - n_real, longest))
+    run_cascade_free(blocks, n_real, rows, 0, longest)
+    return rows
+
+
+@numba.njit(cache=True)
 def candidate_rss(
-    blocks: Any, n_real: int, w: Any, residual: Any, starts: Any, local_q: Any, shared_q: Any, free: bool
+    blocks: Any, n_real: int, drive: Any, frozen: Any, starts: Any, local_q: Any, free: bool
 ) -> float:
     """Residual sum of squares when the given blocks join what is already fitted.
 
-    w (N,) drives the candidate blocks (the input, or the all-pass output of the frozen poles); residual
-    (N,) is what the frozen columns leave of y; local_q (Ql, N) and shared_q (Qs, N) are those columns made
-    orthonormal, within each record and over all. With `free` the candidate poles also get their free
-    responses per record. Works on the Gram matrix: good to about 1e-10 of |residual|^2, enough to rank
-    candidates.
+    drive (U, N) are the signals that drive the candidate blocks (the inputs, or what the all-pass of the
+    frozen poles makes of them); frozen (Q + 1, N) are the columns common to all records made orthonormal,
+    then the residual; local_q (L, N) are the columns of single records made orthonormal in each. With `free`
+    the candidate poles also get their free responses per record.
+
+    J = |r|^2 - b^T G^-1 b with the products G of what the new columns add to the frozen ones, b = those with
+    r: good to about 1e-10 of |r|^2, enough to rank candidates.
     """
-    n_records = starts.size - 1
-    n_total = residual.size
-    m = 0
-    for i in range(blocks.shape[0]):
-        m += 1 if i < n_real else 2
-    phi = np.empty((m, n_total))
-    signal = np.empty((1, n_total))
-    _copy(signal[0], w)
-    for r in range(n_records):
-        run_cascade(blocks, n_real, signal[0], phi, 0, starts[r], starts[r + 1])
-    _copy(signal[0], residual)
-    # Free responses first: unknown i of record r has the index r m + i, the shared columns follow.
-    first = m * n_records if free else 0
-    size = first + m
-    gram = np.zeros((size, size))
-    b = np.zeros(size)
-    on_shared = np.zeros((size, shared_q.shape[0]))
-    for i in range(m):
-        for j in range(i + 1):  # the factorisation looks at the lower triangle only
-            gram[first + i, first + j] = _dot(phi[i], phi[j], 0, n_total)
-    _place(on_shared, _dots(phi, shared_q, 0, n_total), first, 0)
-    along = _dots(phi, signal, 0, n_total)
-    for i in range(m):
-        b[first + i] = along[i, 0]
-    response = np.empty((m, n_total))
+    n_records, n_inputs, n_total = starts.size - 1, drive.shape[0], drive.shape[1]
+    order, n_frozen = 2 * blocks.shape[0] - n_real, frozen.shape[0] - 1
+    # Free responses first: that of record r and state i is row r * order + i.
+    first = order * n_records if free else 0
+    m = first + n_inputs * order
+    phi = np.empty((n_inputs * order, n_total))
+    driven_rows(blocks, n_real, drive.copy(), starts, phi)
+    gram, on_frozen = np.zeros((m, m)), np.empty((m, n_frozen + 1))
+    _products(phi, phi, 0, n_total, True, 0, gram[first:, first:])
+    _products(phi, frozen, 0, n_total, False, 0, on_frozen[first:])
+    on_local = np.empty((phi.shape[0], local_q.shape[0]))
     if free:
-        longest = 0
-        for r in range(n_records):
-            longest = max(longest, starts[r + 1] - starts[r])
-        run_cascade_free(blocks, n_real, response, 0, longest)
-    placed = np.empty((m, n_total))
+        response = _free_rows(blocks, n_real, starts)
+        placed = np.empty((order, n_total))
+        free_on_local = np.empty((order, local_q.shape[0]))
     for r in range(n_records):
         lo, hi = starts[r], starts[r + 1]
-        on_local = _dots(phi, local_q, lo, hi)
-        _subtract_products(gram, on_local, on_local, first, first)
+        _products(phi, local_q, lo, hi, False, 0, on_local)
+        _subtract_squares(gram[first:, first:], on_local, 0)
         if free:
-            for i in range(m):
+            at = r * order
+            for i in range(order):
                 _copy(placed[i, lo:hi], response[i, : hi - lo])
-            free_on_local = _dots(placed, local_q, lo, hi)
-            _place(gram, _dots(placed, placed, lo, hi), r * m, r * m)
-            _subtract_products(gram, free_on_local, free_on_local, r * m, r * m)
-            _place(gram, _dots(phi, placed, lo, hi), first, r * m)
-            _subtract_products(gram, on_local, free_on_local, first, r * m)
-            _place(on_shared, _dots(placed, shared_q, lo, hi), r * m, 0)
-            along = _dots(placed, signal, lo, hi)
-            for i in range(m):
-                b[r * m + i] = along[i, 0]
-    _subtract_products(gram, on_shared, on_shared, 0, 0)
-    return _dot(residual, residual, 0, n_total) - _schur_drop(gram, b)
+            _products(placed, local_q, lo, hi, False, 0, free_on_local)
+            _products(placed, placed, lo, hi, True, 0, gram[at : at + order, at : at + order])
+            _subtract_squares(gram[at : at + order, at : at + order], free_on_local, 0)
+            _products(placed, frozen, lo, hi, False, 0, on_frozen[at : at + order])
+            _products(phi, placed, lo, hi, False, 0, gram[first:, at : at + order])
+            for i in range(phi.shape[0]):
+                for j in range(order):
+                    for q in range(local_q.shape[0]):
+                        gram[first + i, at + j] -= on_local[i, q] * free_on_local[j, q]
+    _subtract_squares(gram, on_frozen[:, :n_frozen], 0)
+    residual = frozen[n_frozen]
+    return float(_dot(residual, residual, 0, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
 
 
-@numba.njit(cache=True, forceinline=True)
+@numba.njit(cache=True)
+def cost_of_point(
+    unit: Any,
+    n_real: int,
+    low: Any,
+    high: Any,
+    raw: bool,
+    drive: Any,
+    frozen: Any,
+    starts: Any,
+    local_q: Any,
+    free: bool,
+) -> float:
+    """`candidate_rss` at a point (D,) of the unit cube of a search space."""
+    blocks = blocks_of_point(unit, n_real, low, high, raw)
+    return float(candidate_rss(blocks, n_real, drive, frozen, starts, local_q, free))
+
+
+@numba.njit(cache=True)
+def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> Any:
+    """Polynomials and free responses (L, N), orthonormal in each record (modified Gram-Schmidt, twice)."""
+    n_known = polynomials_q.shape[0]
+    response = _free_rows(blocks, n_real, starts)
+    rows = np.zeros((n_known + response.shape[0], polynomials_q.shape[1]))
+    for i in range(n_known):
+        _copy(rows[i], polynomials_q[i])
+    for r in range(starts.size - 1):
+        lo, hi = starts[r], starts[r + 1]
+        for i in range(n_known, rows.shape[0]):
+            part = rows[i, lo:hi]
+            _copy(part, response[i - n_known, : hi - lo])
+            before = _dot(part, part, 0, part.size)
+            for _ in range(2):
+                for j in range(i):
+                    _subtract(rows[i], _dot(rows[j], rows[i], lo, hi), rows[j], lo, hi)
+            size = _dot(part, part, 0, part.size)
+            factor = 1 / np.sqrt(size) if size > _RANK_TOLERANCE**2 * before else 0.0
+            for k in range(part.size):
+                part[k] *= factor
+    return rows
+
+
+@numba.njit(cache=True)
+def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
+    for r in range(starts.size - 1):
+        lo, hi = starts[r], starts[r + 1]
+        for i in range(local_q.shape[0]):
+            _subtract(target, _dot(local_q[i], target, lo, hi), local_q[i], lo, hi)
+
+
+@numba.njit(cache=True)
+def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_local: Any, gram: Any) -> None:
+    """Products of rows first .. with all rows before them, local columns taken out of both."""
+    n_local = local_q.shape[0]
+    _products(rows, rows, 0, rows.shape[1], True, first, gram)
+    for r in range(starts.size - 1):
+        here = on_local[:, r * n_local : (r + 1) * n_local]
+        _products(rows, local_q, starts[r], starts[r + 1], False, first, here)
+    _subtract_squares(gram, on_local[: rows.shape[0]], first)
+
+
+@numba.njit(cache=True)
 def linearise(
     blocks: Any,
     n_real: int,
     u: Any,
     y: Any,
     starts: Any,
-    polynomials: Any,
+    polynomials_q: Any,
     feedthrough: bool,
     free: bool,
-    residual: Any,
+    below: float,
     normal: Any,
     gradient: Any,
 ) -> float:
-    """Residual sum of squares J of the fit with all blocks, and its Kaufman linearisation.
+    """Residual sum of squares J of the fit with all blocks, and its Kaufman linearisation; or -1 if the
+    columns are too dependent for products.
 
-    Fills residual (N,), normal (n, n) = S^T S and gradient (n,) = S^T r, where S are the states of each block
-    driven by the fitted output, projected off the regression (see `ident.fit.refinement`). Modified
-    Gram-Schmidt on [columns | y], which is backward stable for least squares; nothing is squared before it is
-    projected.
+    u (U, N); y (N,) without its part in polynomials_q (Q, N), the polynomial columns made orthonormal in each
+    record. If J < below, fills normal (B, B) = S^T S and gradient (B,) = S^T r, S the states of each block
+    driven by the fitted output, projected off the regression (see `ident.fit.refinement`).
+
+    With the columns Phi as rows, G = Phi Phi^T and e = y - Phi^T G^-1 Phi y, all that is needed of the
+    projection P off the columns are products: r^T r = e^T e - (Phi e)^T G^-1 (Phi e), and
+
+        S P S^T = S S^T - (S Phi^T) G^-1 (Phi S^T),   S r = S e - (S Phi^T) G^-1 (Phi e).
+
+    The terms in Phi e, zero but for rounding, are a step of iterative refinement: with the condition of G
+    bounded (`_LEAST_PIVOT`) they bring J and its gradient to the precision of an orthogonal factorisation.
     """
-    n_records = starts.size - 1
-    n_total = y.size
-    n = normal.shape[0]
-    n_poly = polynomials.shape[0]
-    n_local = n_poly + (n if free else 0)
-    n_shared = n + (1 if feedthrough else 0)
-    rows = np.empty((n_local + n_shared, n_total))
-    for i in range(n_poly):
-        _copy(rows[i], polynomials[i])
-    signal = np.empty(n_total)
-    _copy(signal, u)
-    for r in range(n_records):
-        run_cascade(blocks, n_real, signal, rows, n_local, starts[r], starts[r + 1])
-    if feedthrough:
-        _copy(rows[n_local + n], u)
+    n, n_inputs, n_total = normal.shape[0], u.shape[0], y.size
+    n_columns = n_inputs * (n + (1 if feedthrough else 0))
+    rows = np.empty((n_columns + n, n_total))
+    local_q = _local_rows(blocks, n_real, polynomials_q, starts) if free else polynomials_q
+    output = y.copy()
     if free:
-        longest = 0
-        for r in range(n_records):
-            longest = max(longest, starts[r + 1] - starts[r])
-        response = np.empty((n, longest))
-        run_cascade_free(blocks, n_real, response, 0, longest)
-        for r in range(n_records):
-            for i in range(n):
-                for k in range(starts[r + 1] - starts[r]):
-                    rows[n_poly + i, starts[r] + k] = response[i, k]
-    raw = np.empty((n_shared, n_total))
-    for i in range(n_shared):
-        _copy(raw[i], rows[n_local + i])
-    _copy(residual, y)
-    for r in range(n_records):
-        lo, hi = starts[r], starts[r + 1]
-        for j in range(n_local):
-            size = _dot(rows[j], rows[j], lo, hi)
-            for i in range(j):
-                _subtract(rows[j], _dot(rows[i], rows[j], lo, hi), rows[i], lo, hi)
-            _normalise(rows[j], size, lo, hi)
-            for i in range(n_local, n_local + n_shared):
-                _subtract(rows[i], _dot(rows[j], rows[i], lo, hi), rows[j], lo, hi)
-            _subtract(residual, _dot(rows[j], residual, lo, hi), rows[j], lo, hi)
-    triangle = np.zeros((n_shared, n_shared))
-    theta = np.zeros(n_shared)
-    for j in range(n_shared):
-        row = rows[n_local + j]
-        size = _dot(raw[j], raw[j], 0, n_total)
-        for i in range(j):
-            triangle[i, j] = _dot(rows[n_local + i], row, 0, n_total)
-            _subtract(row, triangle[i, j], rows[n_local + i], 0, n_total)
-        triangle[j, j] = _normalise(row, size, 0, n_total)
-        theta[j] = _dot(row, residual, 0, n_total)
-        _subtract(residual, theta[j], row, 0, n_total)
-    # The fitted output that the poles make. With free responses among the columns a polynomial part does no
-    # harm (filtered, it stays in the span of the columns); without them it has to be left out.
-    fitted = np.empty(n_total)
-    _copy(fitted, y)
-    _subtract(fitted, 1.0, residual, 0, n_total)
-    if not free:
-        for j in range(n_shared - 1, -1, -1):
-            for i in range(j + 1, n_shared):
-                theta[j] -= triangle[j, i] * theta[i]
-            theta[j] = theta[j] / triangle[j, j] if triangle[j, j] > 0 else 0.0
+        _take_out_local(output, local_q, starts)
+    driven_rows(blocks, n_real, u.copy(), starts, rows)
+    if feedthrough:
+        for i in range(n_inputs):
+            _copy(rows[n_inputs * n + i], u[i])
+    gram = np.empty((rows.shape[0], rows.shape[0]))
+    on_local = np.empty((rows.shape[0], local_q.shape[0] * (starts.size - 1)))
+    _off_local_products(rows[:n_columns], 0, local_q, starts, on_local, gram)
+    if not factorise(gram, n_columns, _LEAST_PIVOT):
+        return -1.0
+    theta = np.empty(n_columns)
+    for i in range(n_columns):
+        theta[i] = _dot(rows[i], output, 0, n_total)
+    forward(gram, n_columns, theta)
+    backward(gram, n_columns, theta)
+    residual = output.copy()
+    for i in range(n_columns):
+        _subtract(residual, theta[i], rows[i], 0, n_total)
+    fitted = np.empty((1, n_total))
+    for k in range(n_total):
+        fitted[0, k] = output[k] - residual[k]
+    _take_out_local(residual, local_q, starts)
+    if free:
+        # Free responses are part of the output that the poles make; a polynomial part then does no harm
+        # (filtered, it stays in the span of the columns).
         for k in range(n_total):
-            fitted[k] = 0.0
-        for j in range(n_shared):
-            _subtract(fitted, -theta[j], raw[j], 0, n_total)
-    states = np.empty((n, n_total))
-    at = 0
+            fitted[0, k] = y[k] - residual[k]
+    on_residual = np.empty(rows.shape[0])
+    for i in range(n_columns):
+        on_residual[i] = _dot(rows[i], residual, 0, n_total)
+    forward(gram, n_columns, on_residual)
+    rss = _dot(residual, residual, 0, n_total)
+    for q in range(n_columns):
+        rss -= on_residual[q] ** 2
+    if not rss < below:
+        return float(rss)
+    signal = np.empty((1, n_total))
+    at = n_columns
     for i in range(blocks.shape[0]):
-        single = blocks[i : i + 1]
-        _copy(signal, fitted)
-        for r in range(n_records):
-            run_cascade(single, 1 if i < n_real else 0, signal, states, at, starts[r], starts[r + 1])
+        _copy(signal[0], fitted[0])
+        driven_rows(blocks[i : i + 1], 1 if i < n_real else 0, signal, starts, rows[at:])
         at += 1 if i < n_real else 2
+    _off_local_products(rows, n_columns, local_q, starts, on_local, gram)
     for i in range(n):
-        for r in range(n_records):
-            lo, hi = starts[r], starts[r + 1]
-            for j in range(n_local):
-                _subtract(states[i], _dot(rows[j], states[i], lo, hi), rows[j], lo, hi)
-        for j in range(n_local, n_local + n_shared):
-            _subtract(states[i], _dot(rows[j], states[i], 0, n_total), rows[j], 0, n_total)
-        gradient[i] = _dot(states[i], residual, 0, n_total)
+        row = gram[n_columns + i]
+        forward(gram, n_columns, row)
+        gradient[i] = _dot(rows[n_columns + i], residual, 0, n_total)
+        for q in range(n_columns):
+            gradient[i] -= row[q] * on_residual[q]
         for j in range(i + 1):
-            normal[i, j] = _dot(states[i], states[j], 0, n_total)
-            normal[j, i] = normal[i, j]
-    return _dot(residual, residual, 0, n_total)
-
-
-@numba.njit(cache=True, forceinline=True)
-def _normalise(row: Any, size_before: float, lo: int, hi: int) -> float:
-    """Scale row[lo:hi] to length 1 and return the length it had, or set it to zero if nothing of it is
-    left."""
-    size = _dot(row, row, lo, hi)
-    if not size > _RANK_TOLERANCE**2 * size_before:
-        for k in range(lo, hi):
-            row[k] = 0.0
-        return 0.0
-    length = np.sqrt(size)
-    part = row[lo:hi]
-    for k in range(part.size):
-        part[k] /= length
-    return float(length)
+            left = row[n_columns + j]
+            for q in range(n_columns):
+                left -= row[q] * gram[n_columns + j, q]
+            normal[i, j] = left
+            normal[j, i] = left
+    return float(rss)

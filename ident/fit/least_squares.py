@@ -1,32 +1,191 @@
-"""Linear least squares for given poles by thin QR, with per-record nuisance columns (design 4.2)."""
+"""Linear least squares of records for given poles by thin QR, with per-record nuisance columns (design 4.2).
+
+One output, one or several inputs: the columns are [Phi(u_1) Phi(u_2) ...]. The numerators of all channels are
+re-fitted, their denominator is one, so modulo these columns moving a pole changes the output by
+-(dD_b/dp)/D_b y_hat, y_hat being the fitted output of all channels together.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
-from ident.basis.functions import all_pass_signal, block_parameters, free_response, regressor
+from ident.basis.coordinates import SearchSpace
+from ident.basis.functions import _blocks, block_parameters, free_response
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray
-from ident.fit.kernels import linearise
-from ident.fit.regression import Regression
+from ident.basis.structure import Structure
+from ident.data.arrays import ComplexArray, RealArray
+from ident.fit.kernels import cost_of_point, driven_rows, linearise
+from ident.fit.problem import CandidateCost, Linearisation
+from ident.fit.residual_colour import ResidualColour, residual_colour
 
 # Directions of the columns weaker than this fraction of the strongest are left at zero: the data do not
 # show them.
 _RANK_TOLERANCE = 1e-12
+# Residual this small relative to the output (in power) is rounding: no further pole can be seen.
+EXPLAINED = 1e-18
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Records made ready for a fit, one after the other: everything it needs but the poles.
+
+    Attributes
+    ----------
+    u : (U, N) array
+        Inputs after delay and integrators. The first `input_delay_samples` rows of a record are left out: the
+        input they answer to was not recorded.
+    y : (N,) array
+        Outputs of the same rows.
+    starts : (K + 1,) int array
+        Record i owns the samples starts[i]:starts[i + 1].
+    polynomials : (Q, N) array
+        Per-record polynomial nuisance columns, as rows (Legendre, degrees 0 .. Q - 1).
+    structure : Structure
+    dt_s : float
+    """
+
+    u: RealArray
+    y: RealArray
+    starts: npt.NDArray[np.int64]
+    polynomials: RealArray
+    structure: Structure
+    dt_s: float
+
+    @cached_property
+    def polynomials_q(self) -> RealArray:
+        """The polynomial columns made orthonormal within each record, (Q, N)."""
+        rows = np.zeros_like(self.polynomials)
+        if len(rows) == 1:  # constants, by far the most common: no factorisation
+            for here in self.segments:
+                rows[0, here] = 1 / np.sqrt(here.stop - here.start)
+            return rows
+        for here in self.segments:
+            q, _ = np.linalg.qr(self.polynomials[:, here].T)
+            rows[: q.shape[1], here] = q.T
+        return rows
+
+    @cached_property
+    def y_clear(self) -> RealArray:
+        """The outputs without their part in the polynomial columns, (N,)."""
+        y = self.y.copy()
+        self.take_out_local(self.polynomials_q, y[np.newaxis])
+        return y
+
+    @cached_property
+    def power(self) -> float:
+        """|y_clear|^2."""
+        return float(self.y_clear @ self.y_clear)
+
+    @property
+    def omega_max_rad_s(self) -> float | None:
+        """None: records show what lies below the Nyquist frequency."""
+        return None
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples N over all records."""
+        return int(self.y.size)
+
+    @property
+    def n_rows(self) -> int:
+        """How many real numbers were measured: N."""
+        return int(self.y.size)
+
+    @property
+    def n_records(self) -> int:
+        return int(self.starts.size - 1)
+
+    @property
+    def n_inputs(self) -> int:
+        return int(self.u.shape[0])
+
+    @cached_property
+    def longest(self) -> int:
+        """Samples of the longest record."""
+        return int(np.max(np.diff(self.starts)))
+
+    @cached_property
+    def segments(self) -> tuple[slice, ...]:
+        """The samples of each record."""
+        return tuple(map(self.segment, range(self.n_records)))
+
+    def segment(self, record: int) -> slice:
+        return slice(int(self.starts[record]), int(self.starts[record + 1]))
+
+    def n_parameters(self, order: int) -> int:
+        """Number of free real numbers of a fit with `order` poles: coefficients of each input, poles,
+        nuisances."""
+        local = self.polynomials.shape[0] + (order if self.structure.estimate_initial_state else 0)
+        return int(order + self.n_inputs * (order + self.structure.feedthrough) + self.n_records * local)
+
+    def take_out_local(self, local_q: RealArray, rows: RealArray) -> None:
+        """Project rows (R, N) off the columns local_q (Q, N) of each record, in place."""
+        if len(local_q):
+            for here in self.segments:
+                rows[:, here] -= (rows[:, here] @ local_q[:, here].T) @ local_q[:, here]
+
+    def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
+        """Cost and Kaufman linearisation at these poles (compiled; by orthogonal factorisation where the
+        columns are nearly dependent); only the cost counts where it is not under `below`."""
+        blocks = _blocks(real, pairs)
+        n = real.size + 2 * pairs.size
+        normal, gradient = np.empty((n, n)), np.empty(n)
+        rss = linearise(
+            blocks, real.size, self.u, self.y_clear, self.starts, self.polynomials_q,
+            self.structure.feedthrough, self.structure.estimate_initial_state, below, normal, gradient,
+        )  # fmt: skip
+        return Linearisation(rss, normal, gradient) if rss >= 0 else linearisation(self, Poles(real, pairs))
+
+    def residual(self, poles: Poles) -> RealArray:
+        """What the fit with these poles leaves of the output, (N,)."""
+        return project(self, poles).residual
+
+    def colour(self, residual: RealArray) -> ResidualColour:
+        """Colour of a residual (N,)."""
+        return residual_colour(residual, self.starts)
+
+    def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
+        """Ne ln(J/N) + (free numbers) ln Ne with Ne = worth."""
+        floor = max(EXPLAINED * float(self.y @ self.y), np.finfo(np.float64).tiny)
+
+        def value(rss: float, order: int) -> float:
+            fall = worth * np.log(max(rss, floor) / self.n_samples)
+            return float(fall + self.n_parameters(order) * np.log(worth))
+
+        return value
+
+    def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
+        """Cost of candidates on top of frozen poles: `shared` are driven by the input, `local` are those of
+        the free responses; their columns are taken out of the output once, here."""
+        kept = project(self, shared, local)
+        frozen = np.vstack([kept.shared_q, kept.residual])
+        drive = _driven(self, shared, self.u)[1]
+        free = self.structure.estimate_initial_state
+        known = (
+            space.n_real, space.low.copy(), space.high.copy(), space.raw,
+            drive, frozen, self.starts, kept.local_q, free,
+        )  # fmt: skip
+        return CandidateCost(space, float(self.y @ self.y), lambda unit: cost_of_point(unit, *known))
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Orthonormal columns of a regression (as rows) and what they leave of the output.
+    """Columns of a regression as rows, and what they leave of the output.
 
     Attributes
     ----------
     local_q : (Ql, N) array
         Nuisance columns of each record, orthonormal within each record.
+    shared : (Qs, N) array
+        Columns common to all records: the basis driven by each input, then the inputs if they have a direct
+        term.
     shared_q : (Qs, N) array
-        Columns common to all records, orthonormal to each other and to the local ones.
+        The same orthonormal to each other and to the local ones.
     triangle : (Qs, Qs) array
         R of the shared columns after the local ones are taken out.
     residual : (N,) array
@@ -34,36 +193,35 @@ class Projection:
     """
 
     local_q: RealArray
+    shared: RealArray
     shared_q: RealArray
     triangle: RealArray
     residual: RealArray
 
+    def coefficients(self, y: RealArray) -> RealArray:
+        """Least-squares coefficients (Qs,) of the shared columns for the output y (N,)."""
+        # Q is orthogonal to the local part of y, so that needs no subtraction here.
+        theta = np.linalg.lstsq(self.triangle, self.shared_q @ y, rcond=_RANK_TOLERANCE)[0]
+        return np.asarray(theta, dtype=np.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """Least-squares fit for given poles: coefficients (B,), direct term, residual (N,), residual sum of
-    squares."""
+    """Least-squares fit for given poles: coefficients (U, B), direct terms (U,), residual (N,), residual sum
+    of squares."""
 
     coefficients: RealArray
-    feedthrough: float
+    feedthrough: RealArray
     residual: RealArray
     rss: float
 
 
-def shared_columns(data: Regression, poles: Poles) -> RealArray:
-    """Columns common to all records (N, B or B + 1): the basis driven by the input, then the input itself."""
-    parts = [regressor(poles, data.u[data.segment(i)]) for i in range(data.n_records)]
-    columns = np.concatenate(parts)
-    return np.column_stack([columns, data.u]) if data.structure.feedthrough else columns
-
-
-def local_columns(data: Regression, poles: Poles, record: int) -> RealArray:
-    """Nuisance columns of one record (T, Q): polynomials, then the free responses of the poles."""
-    here = data.segment(record)
-    polynomials = data.polynomials[:, here].T
-    if not data.structure.estimate_initial_state:
-        return polynomials
-    return np.column_stack([polynomials, free_response(poles, here.stop - here.start)])
+def _driven(data: Regression, poles: Poles, signals: RealArray) -> tuple[RealArray, RealArray]:
+    """Basis functions driven by each of the signals (U, N), record by record from rest, (U B, N), and the
+    signals sent through the all-pass of the poles (U, N)."""
+    rows, through = np.empty((signals.shape[0] * poles.order, signals.shape[1])), signals.copy()
+    driven_rows(block_parameters(poles), poles.real.size, through, data.starts, rows)
+    return rows, through
 
 
 def project(data: Regression, shared: Poles, local: Poles | None = None) -> Projection:
@@ -71,32 +229,30 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
     same).
 
     With `shared` doubled and `local` not, the residual is the one that candidates for a further pole see: all
-    first-order changes of the poles are taken out of it (design 4.3).
+    first-order changes of the poles are taken out of it (design 4.3; with several inputs some more, because
+    in the tangent space of shared poles the channels move together).
     """
     local = shared if local is None else local
-    free = local.order > 0 and data.structure.estimate_initial_state
-    if shared.order == 0 and not free and not data.structure.feedthrough:
-        nothing = np.zeros((0, data.n_samples))
-        return Projection(data.polynomials_q, nothing, np.zeros((0, 0)), data.y_clear.copy())
-    columns = shared_columns(data, shared)
-    if free:
-        residual = data.y.copy()
-        local_q = np.zeros((data.polynomials.shape[0] + local.order, data.n_samples))
-        for i in range(data.n_records):
-            here = data.segment(i)
-            q, _ = np.linalg.qr(local_columns(data, local, i))
+    rows = _driven(data, shared, data.u)[0]
+    if data.structure.feedthrough:
+        rows = np.vstack([rows, data.u])
+    local_q, residual = data.polynomials_q, data.y_clear.copy()
+    if local.order > 0 and data.structure.estimate_initial_state:
+        n_polynomials = data.polynomials.shape[0]
+        local_q = np.zeros((n_polynomials + local.order, data.n_samples))
+        for here in data.segments:
+            free = free_response(local, here.stop - here.start)
+            q, _ = np.linalg.qr(np.column_stack([data.polynomials[:, here].T, free]))
             local_q[: q.shape[1], here] = q.T
-            columns[here] -= q @ (q.T @ columns[here])
-            residual[here] -= q @ (q.T @ residual[here])
-    else:
-        local_q, residual = data.polynomials_q, data.y_clear.copy()
-        for here in map(data.segment, range(data.n_records)):
-            columns[here] -= local_q[:, here].T @ (local_q[:, here] @ columns[here])
-    if columns.shape[1] == 0:
-        return Projection(local_q, np.zeros((0, data.n_samples)), np.zeros((0, 0)), residual)
-    q, triangle = np.linalg.qr(columns)
-    residual -= q @ (q.T @ residual)
-    return Projection(local_q, np.ascontiguousarray(q.T), triangle, residual)
+        data.take_out_local(local_q, residual[np.newaxis])
+    if len(rows) == 0:
+        return Projection(local_q, rows, rows, np.zeros((0, 0)), residual)
+    clear = rows.copy()
+    data.take_out_local(local_q, clear)
+    q, triangle = np.linalg.qr(clear.T)
+    shared_q = np.ascontiguousarray(q.T)
+    residual -= (shared_q @ residual) @ shared_q
+    return Projection(local_q, rows, shared_q, triangle, residual)
 
 
 def fit(data: Regression, poles: Poles) -> LinearFit:
@@ -111,64 +267,42 @@ def fit(data: Regression, poles: Poles) -> LinearFit:
     if not data.n_samples > needed:
         raise ValueError(f"too few samples: {data.n_samples} for {needed} unknowns with {poles.order} poles")
     projection = project(data, poles)
-    # Q^T y with the local part taken out: Q is orthogonal to it, so it needs no subtraction here.
-    theta = np.linalg.lstsq(projection.triangle, projection.shared_q @ data.y, rcond=_RANK_TOLERANCE)[0]
+    theta, n = projection.coefficients(data.y), data.n_inputs * poles.order
     residual = projection.residual
     return LinearFit(
-        coefficients=np.asarray(theta[: poles.order], dtype=np.float64),
-        feedthrough=float(theta[poles.order]) if data.structure.feedthrough else 0.0,
+        coefficients=theta[:n].reshape(data.n_inputs, poles.order),
+        feedthrough=theta[n:] if data.structure.feedthrough else np.zeros(data.n_inputs),
         residual=residual,
         rss=float(residual @ residual),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """How the residual sum of squares changes with the poles, coefficients re-fitted all the time.
+def block_states(data: Regression, poles: Poles, signal: RealArray) -> RealArray:
+    """States (B, N) of each block by itself driven by the signal (N,), record by record from rest."""
+    parts = [_driven(data, block, signal[np.newaxis])[0] for block in poles.blocks()]
+    return np.concatenate(parts) if parts else np.zeros((0, signal.size))
 
-    The directions are the states of each block driven by the fitted output (one per real pole, two per pair),
-    projected off the regression: every pole sensitivity is a combination of them and of regression columns.
 
-    Attributes
-    ----------
-    rss : float
-    residual : (N,) array
-    normal : (B, B) array
-        S^T S of the projected directions: the Gauss-Newton (Kaufman) Hessian.
-    gradient : (B,) array
-        S^T r.
-    """
+def fitted_output(data: Regression, projection: Projection) -> RealArray:
+    """The part of the output that the poles make, (N,)."""
+    # With free responses among the columns a polynomial part does no harm (filtered, it stays in their span);
+    # without them it has to be left out.
+    if data.structure.estimate_initial_state:
+        return np.asarray(data.y - projection.residual)
+    return np.asarray(projection.coefficients(data.y) @ projection.shared)
 
-    rss: float
-    residual: RealArray
-    normal: RealArray
-    gradient: RealArray
+
+def pole_sensitivities(data: Regression, poles: Poles, projection: Projection) -> RealArray:
+    """States (B, N) of each block driven by the fitted output, projected off the regression."""
+    states = block_states(data, poles, fitted_output(data, projection))
+    data.take_out_local(projection.local_q, states)
+    states -= (states @ projection.shared_q.T) @ projection.shared_q
+    return states
 
 
 def linearisation(data: Regression, poles: Poles) -> Linearisation:
-    """Cost, residual and Kaufman linearisation at the given poles (compiled; see
-    `ident.fit.kernels.linearise`)."""
-    n = poles.order
-    residual, normal, gradient = np.empty(data.n_samples), np.empty((n, n)), np.empty(n)
-    rss = linearise(
-        block_parameters(poles),
-        poles.real.size,
-        data.u,
-        data.y,
-        data.starts,
-        data.polynomials,
-        data.structure.feedthrough,
-        data.structure.estimate_initial_state,
-        residual,
-        normal,
-        gradient,
-    )
-    return Linearisation(float(rss), residual, normal, gradient)
-
-
-def driving_signal(data: Regression, poles: Poles) -> RealArray:
-    """The input sent through the all-pass of the poles, (N,): what drives the next block of the cascade."""
-    if poles.order == 0:
-        return data.u
-    parts = [all_pass_signal(poles, data.u[data.segment(i)]) for i in range(data.n_records)]
-    return np.concatenate(parts)
+    """Cost and Kaufman linearisation at the given poles by orthogonal factorisation; `Regression.linearise`
+    has them faster."""
+    projection = project(data, poles)
+    states, residual = pole_sensitivities(data, poles, projection), projection.residual
+    return Linearisation(float(residual @ residual), states @ states.T, states @ residual)

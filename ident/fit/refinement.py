@@ -1,4 +1,4 @@
-"""Local descent in the poles: Levenberg-Marquardt on Kaufman's Jacobian (design 4.2).
+"""Local refinement of the poles: Levenberg-Marquardt on Kaufman's Jacobian (design 4.2).
 
 Modulo the columns of the regression, moving a pole changes the fitted output y_hat by -(dD_b/dp)/D_b y_hat,
 D_b(z) being the denominator of its block: the numerator is re-fitted anyway. So the sensitivities are
@@ -11,30 +11,39 @@ The unknowns are decay rates and angles, linear, so that a pole can reach the ci
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from ident.basis.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray, kernel_array
-from ident.fit.descent import blocked, chain_rule, clip_parameters, descend, free_parameters
-from ident.fit.kernels import _schur_drop
-from ident.fit.least_squares import Linearisation
-from ident.fit.regression import Regression
+from ident.data.arrays import ComplexArray, RealArray
+from ident.fit.pole_unknowns import (
+    chain_rule,
+    clip_parameters,
+    damped_step,
+    free_parameters,
+    scaled_system,
+    set_poles,
+)
+from ident.fit.problem import Linearisation
 
 # Damping of the first step in units of the scaled normal matrix. From afar a full step mostly leads too far:
-# half the evaluations of a descent that starts boldly are steps taken back.
+# half the evaluations of a refinement that starts boldly are steps taken back.
 NEAR, FAR = 1e-3, 1.0
+# Steps that do not gain multiply the damping by this, by its square next, and so on.
+_GROWTH = 4.0
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Sides that a polished pole keeps: user bounds, and the circle itself.
+    """Sides that a refined pole keeps: user bounds, and the circle itself.
 
-    decay: 1 - a of real poles; omega: |log p|, zeta; s_min: least decay per sample of a pair.
+    decay: 1 - a of real poles; omega: |log p|, zeta; s_min: least decay per sample of a pair. Compiled code
+    takes them in this order (`ident.fit.pole_unknowns`).
     """
 
     distance_min: float
@@ -59,7 +68,7 @@ class Bounds:
 
         return cls(
             distance_min=max(distance(options.decay_min_per_s, still), still),
-            # Negative poles down to -0.95 are reached by descent only; they have no continuous counterpart.
+            # Negative poles down to -0.95 are reached by refinement only: no continuous counterpart.
             distance_max=distance(options.decay_max_per_s, 1.95),
             omega_min=angle(options.omega_min_rad_s, 0.1 / longest),
             omega_max=min(angle(options.omega_max_rad_s, 0.995 * np.pi), 0.995 * np.pi),
@@ -68,30 +77,15 @@ class Bounds:
             s_min=still,
         )
 
-    def clip(self, poles: Poles, n_fixed_real: int = 0, n_fixed_pairs: int = 0) -> Poles:
-        """The nearest poles inside the bounds; the first n_fixed ones of each type are left alone."""
-        x = free_parameters(*poles.writable(), n_fixed_real, n_fixed_pairs)
-        n_free_real = poles.real.size - n_fixed_real
-        x = self.clip_parameters(x, n_free_real)
-        pairs = np.exp(-x[n_free_real::2] + 1j * x[n_free_real + 1 :: 2])
-        return Poles(
-            np.concatenate([poles.real[:n_fixed_real], 1 - x[:n_free_real]]),
-            np.concatenate([poles.pairs[:n_fixed_pairs], pairs]),
-        )
-
-    def clip_parameters(self, x: RealArray, n_free_real: int) -> RealArray:
-        """Unknowns (1 - a; s, f) inside the bounds."""
-        return np.asarray(clip_parameters(x, n_free_real, self.array))
-
     @cached_property
     def array(self) -> RealArray:
-        """In the order of the fields, as `ident.fit.descent` takes them."""
-        return np.array([getattr(self, field.name) for field in fields(self)])
+        """In the order of the fields."""
+        return np.array([getattr(self, name) for name in self.__dataclass_fields__])
 
 
 @dataclass(frozen=True, eq=False)
-class Polished:
-    """End of a descent: poles, residual sum of squares, iterations; `converged` if a stationary point was
+class Refined:
+    """End of a refinement: poles, residual sum of squares, iterations; `converged` if a stationary point was
     reached."""
 
     poles: Poles
@@ -100,68 +94,81 @@ class Polished:
     converged: bool
 
 
-def polish(
-    data: Regression,
+class Linearised(Protocol):
+    """The part of `ident.fit.problem.PoleProblem` that a refinement needs."""
+
+    @property
+    def power(self) -> float: ...
+
+    def linearise(self, real: RealArray, pairs: ComplexArray, below: float = ...) -> Linearisation: ...
+
+
+def refine(
+    problem: Linearised,
     poles: Poles,
     bounds: Bounds,
+    fixed: Poles | None = None,
     *,
-    n_fixed_real: int = 0,
-    n_fixed_pairs: int = 0,
     max_iterations: int = 60,
     tolerance: float = 1e-9,
     damping: float = NEAR,
-) -> Polished:
-    """Descend from the given poles; the first n_fixed ones of each type stay where they are.
+) -> Refined:
+    """Go downhill from the given poles; as many of each type as there are fixed ones come first and stay.
 
     Stops when the decrease that the linearisation still promises is below `tolerance` of J. damping is that
     of the first step: `NEAR` an optimum, or `FAR` from one.
     """
+    n_fixed = (0, 0) if fixed is None else (fixed.real.size, fixed.pairs.size)
     real, pairs = poles.writable()
-    rss, iterations, converged = descend(
-        real,
-        pairs,
-        n_fixed_real,
-        n_fixed_pairs,
-        bounds.array,
-        data.u,
-        data.y,
-        data.y_clear,
-        data.starts,
-        data.polynomials,
-        data.polynomials_q,
-        data.structure.feedthrough,
-        data.structure.estimate_initial_state,
-        tolerance,
-        max_iterations,
-        damping,
-    )
-    return Polished(Poles(real, pairs), rss, iterations, converged)
+    n_free_real, limits = real.size - n_fixed[0], bounds.array
+    x = clip_parameters(free_parameters(real, pairs, *n_fixed), n_free_real, limits)
+    set_poles(x, real, pairs, *n_fixed)
+    here = problem.linearise(real, pairs)
+    trial_real, trial_pairs = real.copy(), pairs.copy()
+    # Residuals at rounding level relative to the output: nothing left to gain.
+    floor = 1e-26 * problem.power
+    growth = _GROWTH
+    for iteration in range(max_iterations):
+        system, slope, scale, free, promised = scaled_system(
+            real, pairs, *n_fixed, limits, here.normal, here.gradient
+        )
+        if here.rss <= floor or promised <= tolerance * here.rss:
+            return Refined(Poles(real, pairs), here.rss, iteration, True)
+        while True:
+            trial_x, gain = damped_step(x, n_free_real, limits, system, slope, scale, free, damping)
+            ratio = 0.0
+            if gain > 0:
+                set_poles(trial_x, trial_real, trial_pairs, *n_fixed)
+                trial = problem.linearise(trial_real, trial_pairs, here.rss)
+                ratio = (here.rss - trial.rss) / gain
+                if ratio > 1e-4:
+                    break
+            damping *= growth
+            growth *= _GROWTH
+            if damping > 1e12:
+                # No step of any length gains: the linearisation's promise is rounding, or a bound's corner.
+                return Refined(Poles(real, pairs), here.rss, iteration, False)
+        x, here = trial_x, trial
+        real, trial_real, pairs, trial_pairs = trial_real, real, trial_pairs, pairs
+        damping *= max(1 / 5, 1 - (2 * ratio - 1) ** 3)
+        growth = _GROWTH
+    return Refined(Poles(real, pairs), here.rss, max_iterations, False)
 
 
-def pole_system(
-    here: Linearisation, poles: Poles, n_fixed_real: int = 0, n_fixed_pairs: int = 0
-) -> tuple[RealArray, RealArray]:
+def pole_system(here: Linearisation, poles: Poles, fixed: Poles | None = None) -> tuple[RealArray, RealArray]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T
     r."""
-    chain = chain_rule(*poles.writable(), n_fixed_real, n_fixed_pairs)
+    n_fixed = (0, 0) if fixed is None else (fixed.real.size, fixed.pairs.size)
+    chain = chain_rule(*poles.writable(), *n_fixed)
     return chain.T @ here.normal @ chain, chain.T @ here.gradient
 
 
-def free_optimality(
-    here: Linearisation, poles: Poles, bounds: Bounds, n_fixed_real: int = 0, n_fixed_pairs: int = 0
-) -> float:
+def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Poles | None = None) -> float:
     """|P r|/|r| over the tangent directions of the poles that are neither fixed nor held by a bound.
 
     0 at an optimum. With records from rest, nothing fixed and no bound active this is |Phi2^T r|/|r| with
     orthonormal Phi2 (the basis with every pole doubled), by the tangent identity of design 4.2.
     """
-    x = free_parameters(*poles.writable(), n_fixed_real, n_fixed_pairs)
-    if x.size == 0 or here.rss <= 0:
-        return 0.0
-    normal, gradient = pole_system(here, poles, n_fixed_real, n_fixed_pairs)
-    free = np.flatnonzero(~blocked(x, gradient, poles.real.size - n_fixed_real, bounds.array))
-    scale = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
-    slope = gradient[free] / scale
-    scaled = kernel_array(normal[np.ix_(free, free)] / (scale[:, None] * scale))
-    share = float(_schur_drop(scaled, slope))
-    return float(np.sqrt(max(share, 0.0) / here.rss))
+    n_fixed = (0, 0) if fixed is None else (fixed.real.size, fixed.pairs.size)
+    promised = scaled_system(*poles.writable(), *n_fixed, bounds.array, here.normal, here.gradient)[-1]
+    return float(np.sqrt(max(promised, 0.0) / here.rss)) if here.rss > 0 else 0.0

@@ -3,87 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-
-
-@dataclass(frozen=True, eq=False)
-class Regression:
-    """Everything a fit needs but the poles.
-
-    Attributes
-    ----------
-    u : (N,) array
-        Inputs after delay and integrators. The first `input_delay_samples` rows of a record are left out: the
-        input they answer to was not recorded.
-    y : (N,) array
-        Outputs of the same rows.
-    starts : (K + 1,) int array
-        Record i owns the rows starts[i]:starts[i + 1].
-    polynomials : (Q, N) array
-        Per-record polynomial nuisance columns, as rows (Legendre, degrees 0 .. Q - 1).
-    structure : Structure
-    dt_s : float
-    """
-
-    u: RealArray
-    y: RealArray
-    starts: npt.NDArray[np.int64]
-    polynomials: RealArray
-    structure: Structure
-    dt_s: float
-
-    @cached_property
-    def polynomials_q(self) -> RealArray:
-        """The polynomial columns made orthonormal within each record, (Q, N)."""
-        rows = np.zeros_like(self.polynomials)
-        if len(rows) == 1:  # constants, by far the most common: no factorisation
-            for here in map(self.segment, range(self.n_records)):
-                rows[0, here] = 1 / np.sqrt(here.stop - here.start)
-            return rows
-        for here in map(self.segment, range(self.n_records)):
-            q, _ = np.linalg.qr(self.polynomials[:, here].T)
-            rows[: q.shape[1], here] = q.T
-        return rows
-
-    @cached_property
-    def y_clear(self) -> RealArray:
-        """The outputs without their part in the polynomial columns, (N,)."""
-        y, rows = self.y.copy(), self.polynomials_q
-        if len(rows) == 0:
-            return y
-        for here in map(self.segment, range(self.n_records)):
-            y[here] -= rows[:, here].T @ (rows[:, here] @ y[here])
-        return y
-
-    @property
-    def n_samples(self) -> int:
-        """Number of rows N over all records."""
-        return int(self.y.size)
-
-    @property
-    def n_records(self) -> int:
-        return int(self.starts.size - 1)
-
-    @property
-    def longest(self) -> int:
-        """Rows of the longest record."""
-        return int(np.max(np.diff(self.starts)))
-
-    def segment(self, record: int) -> slice:
-        return slice(int(self.starts[record]), int(self.starts[record + 1]))
-
-    def n_parameters(self, order: int) -> int:
-        """Number of free real numbers of a fit with `order` poles: coefficients, poles, nuisances."""
-        local = self.polynomials.shape[0] + (order if self.structure.estimate_initial_state else 0)
-        return int(2 * order + self.structure.feedthrough + self.n_records * local)
+from ident.fit.least_squares import Regression
 
 
 def prepare(records: Sequence[Record], structure: Structure) -> Regression:
@@ -92,13 +19,8 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
     Raises
     ------
     ValueError
-        If there is no record, a record has more than one input or output, or the sampling times differ by
-        more than 0.1 %.
+        As `prepare_inputs`, and if a record has more than one input or output.
     """
-    if not records:
-        raise ValueError("identification needs at least one record; got none")
-    dt_s = records[0].dt_s
-    inputs, outputs, polynomials, starts = [], [], [], [0]
     for record in records:
         if record.input.shape[1] != 1 or record.output.shape[1] != 1:
             raise ValueError(
@@ -106,34 +28,61 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
                 f"{list(record.input_names)} "
                 f"and {list(record.output_names)}; choose with Record.siso"
             )
-        if not abs(record.dt_s - dt_s) <= 1e-3 * dt_s:
-            raise ValueError(f"{record.label}: dt_s = {record.dt_s:.6g}, but the first record has {dt_s:.6g}")
-        delay = structure.input_delay_samples
+    return prepare_inputs(records, structure)
+
+
+def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regression:
+    """Stack records of equal inputs and one output for one fit.
+
+    Raises
+    ------
+    ValueError
+        If there is no record, a record has more than one output, the inputs differ between records, or the
+        sampling times differ by more than 0.1 %.
+    """
+    if not records:
+        raise ValueError("identification needs at least one record; got none")
+    first, delay = records[0], structure.input_delay_samples
+    inputs, outputs, polynomials, starts = [], [], [], [0]
+    for record in records:
+        if record.output.shape[1] != 1:
+            raise ValueError(
+                f"{record.label}: identification of several inputs takes one output, got "
+                f"{list(record.output_names)}"
+            )
+        names = record.input_names
+        if max(len(names), len(first.input_names)) > 1 and names != first.input_names:
+            raise ValueError(
+                f"{record.label}: columns {list(names)}, but the first record has {list(first.input_names)}"
+            )
+        if not abs(record.dt_s - first.dt_s) <= 1e-3 * first.dt_s:
+            raise ValueError(
+                f"{record.label}: dt_s = {record.dt_s:.6g}, but the first record has {first.dt_s:.6g}"
+            )
         if record.n_samples <= delay:
             raise ValueError(
                 f"{record.label}: {record.n_samples} samples, not more than the input delay {delay}"
             )
-        u = filter_input(record.input[:, 0], structure.integrators, delay)[delay:]
-        inputs.append(u)
+        inputs.append([filter_input(u, structure.integrators, delay)[delay:] for u in record.input.T])
         outputs.append(record.output[delay:, 0])
-        polynomials.append(_legendre(u.size, structure.n_polynomials))
-        starts.append(starts[-1] + u.size)
+        starts.append(starts[-1] + record.n_samples - delay)
+        polynomials.append(_legendre(record.n_samples - delay, structure.n_polynomials))
     return Regression(
-        u=np.concatenate(inputs),
+        u=np.ascontiguousarray(np.concatenate(inputs, axis=1)),
         y=np.concatenate(outputs),
         starts=np.array(starts, dtype=np.int64),
         polynomials=np.ascontiguousarray(np.concatenate(polynomials, axis=1)),
         structure=structure,
-        dt_s=dt_s,
+        dt_s=first.dt_s,
     )
 
 
 def restructured(records: Sequence[Record], data: Regression, structure: Structure) -> Regression:
-    """`prepare(records, structure)`, the records having been prepared otherwise: where only nuisances differ,
-    their signals are not filtered anew."""
+    """`prepare_inputs(records, structure)`, the records having been prepared otherwise: where only nuisances
+    differ, their signals are not filtered anew."""
     same = ("integrators", "input_delay_samples")
     if any(getattr(structure, name) != getattr(data.structure, name) for name in same):
-        return prepare(records, structure)
+        return prepare_inputs(records, structure)
     if structure.n_polynomials == data.structure.n_polynomials:
         return replace(data, structure=structure)
     sizes = np.diff(data.starts)

@@ -1,4 +1,4 @@
-"""DIRECT over the unit cube: in batches, NLopt's variants and scipy's, recorded point by point."""
+"""DIRECT over the unit cube: NLopt's variants and scipy's, recorded point by point."""
 
 from __future__ import annotations
 
@@ -10,24 +10,19 @@ import numpy as np
 
 from ident.basis.options import Algorithm
 from ident.data.arrays import RealArray, kernel_array
-from ident.search.batched_direct import minimise_in_batches
 
 
 def minimise(
-    cost: Callable[[RealArray], RealArray], dimension: int, algorithm: Algorithm, evaluations: int
+    cost: Callable[[RealArray], float], dimension: int, algorithm: Algorithm, evaluations: int
 ) -> tuple[RealArray, RealArray]:
-    """Points (E, D) of the unit cube that DIRECT looked at, in order, and their costs (E,).
-
-    cost maps points (K, D) to their costs (K,); only "DIRECT_L" asks for more than one at a time.
-    """
-    if algorithm == "DIRECT_L":
-        return minimise_in_batches(cost, dimension, evaluations)
+    """Points (E, D) of the unit cube that DIRECT looked at, in order, and their costs (E,); cost is asked at
+    points (D,)."""
     points: list[RealArray] = []
     costs: list[float] = []
 
-    def recorded(x: Any, *_: Any) -> float:
-        point = np.array(x, dtype=np.float64)
-        value = float(cost(point[np.newaxis])[0])
+    def recorded(x: RealArray, gradient: RealArray | None = None) -> float:
+        point = x.copy()
+        value = cost(point)
         points.append(point)
         costs.append(value)
         return value
@@ -50,7 +45,8 @@ def minimise(
         if "RAND" in algorithm:
             # These variants draw from NLopt's own generator; a fixed seed keeps the search reproducible.
             nlopt.srand(1)
-        problem = nlopt.opt(getattr(nlopt, algorithm), dimension)
+        name = "GN_DIRECT_L" if algorithm == "DIRECT_L" else algorithm
+        problem = nlopt.opt(getattr(nlopt, name), dimension)
         problem.set_lower_bounds(np.zeros(dimension))
         problem.set_upper_bounds(np.ones(dimension))
         problem.set_min_objective(recorded)

@@ -10,12 +10,10 @@ import numpy as np
 
 from ident.basis.coordinates import SearchSpace
 from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, readonly_real
 from ident.data.record import Record
 from ident.fit.regression import prepare
-from ident.search.candidate_cost import CandidateCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +145,10 @@ def error_surface(
             f"the grid of {names} leaves the region of stable pole pairs below the Nyquist frequency"
         )
     data = prepare(records, structure)
-    kept = Poles(model.poles.real, np.delete(model.poles.pairs, pair))
+    kept = model.poles.without_pair(pair)
     low, high = box
     space = SearchSpace(0, 1, low, high, coordinates == "raw", model.dt_s)
     grid = np.array([[a, b] for a in values_first for b in values_second])
-    cost = CandidateCost(data, space, kept, kept)
+    cost = data.candidate_cost(space, kept, kept)
     rss = cost.rss((grid - low[1:]) / (high[1:] - low[1:])).reshape(first.size, second.size)
     return ErrorSurface(first, second, names, rss / data.n_samples, own)

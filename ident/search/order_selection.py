@@ -9,13 +9,14 @@ import numpy as np
 
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.fit.refinement import Polished
+from ident.fit.least_squares import EXPLAINED
+from ident.fit.refinement import Refined
 from ident.search.pole_search import PoleSearch
 
 Progress = Callable[[float, str], None]
 
-# Residual this small relative to the output (in power) is rounding: no further pole can be seen.
-_EXPLAINED = 1e-18
+# (J, order) -> criterion of that model, lower is better (`ident.fit.problem.PoleProblem.criterion`).
+Criterion = Callable[[float, int], float]
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,8 @@ class OrderSelection:
         self.options: IdentOptions = search.options
         self.progress = progress
         self._tried: dict[tuple[int, int], float] = {}
-        self._n = search.data.n_samples
-        self._power = float(search.data.y @ search.data.y)
 
-    def run(self, start: Polished | None = None) -> Polished:
+    def run(self, start: Refined | None = None) -> Refined:
         """Best poles with the numbers asked for, or with those the criterion keeps; `start`: poles to go on
         from, such as those found under another structure."""
         options = self.options
@@ -69,74 +68,74 @@ class OrderSelection:
                 break
         return best
 
-    def table(self, best: Polished) -> tuple[OrderStep, ...]:
+    def table(self, best: Refined) -> tuple[OrderStep, ...]:
         """Everything that was tried, by order, judged by the residual of the chosen model."""
-        worth = self.worth(best)
+        criterion = self._criterion(best)
         steps = [
-            OrderStep(n_real, n_pairs, rss, self._criterion(rss, n_real + 2 * n_pairs, worth))
+            OrderStep(n_real, n_pairs, rss, criterion(rss, n_real + 2 * n_pairs))
             for (n_real, n_pairs), rss in self._tried.items()
         ]
         return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
 
-    def worth(self, end: Polished) -> float:
+    def worth(self, end: Refined) -> float:
         """Independent samples that the residual of an end is worth."""
         return self.search.colour(end).effective_samples
 
-    def _grow_pairs(self, best: Polished, most_pairs: int) -> Polished:
+    def _grow_pairs(self, best: Refined, most_pairs: int) -> Refined:
         while (count := self._counts(best)[1]) < most_pairs and self._visible(best):
             self.progress(0.1 + 0.8 * count / max(most_pairs, 1), f"search for pole pair {count + 1}")
             trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
-            if self.options.n_pairs is None and not self._better(trial, best, self.worth(trial)):
+            if self.options.n_pairs is None and not self._better(trial, best):
                 break
             best = trial
         return best
 
-    def _grow_real(self, best: Polished) -> Polished:
+    def _grow_real(self, best: Refined) -> Refined:
         while self._counts(best)[0] < self.options.max_real and self._visible(best):
             trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
-            if not self._better(trial, best, self.worth(trial)):
+            if not self._better(trial, best):
                 break
             best = trial
         return best
 
-    def _prune(self, best: Polished) -> Polished:
+    def _prune(self, best: Refined) -> Refined:
         """Take out poles whose loss the criterion does not mind, the least needed first."""
-        fixed = self.search.fixed
-        while True:
-            trials = []
-            if self.options.n_real is None:
-                for i in range(fixed.real.size, best.poles.real.size):
-                    trials.append(Poles(np.delete(best.poles.real, i), best.poles.pairs))
-            if self.options.n_pairs is None:
-                for i in range(fixed.pairs.size, best.poles.pairs.size):
-                    trials.append(Poles(best.poles.real, np.delete(best.poles.pairs, i)))
-            worth = self.worth(best) if trials else 0.0
+        free_real, free_pairs = self.options.n_real is None, self.options.n_pairs is None
+        while trials := self._one_less(best.poles, free_real, free_pairs):
+            criterion = self._criterion(best)
             ends = [self._noted(self.search.descend(poles, "pruning", 1e-4)) for poles in trials]
-            ends = [end for end in ends if self._better(end, best, worth)]
-            if not ends:
-                return best
-            chosen = min(ends, key=lambda end: self._criterion(end.rss, end.poles.order, worth))
+            chosen = min(ends, key=lambda end: criterion(end.rss, end.poles.order))
+            if not criterion(chosen.rss, chosen.poles.order) < criterion(best.rss, best.poles.order):
+                break
             best = self._noted(self.search.descend(chosen.poles, "pruning"))
+        return best
 
-    def _better(self, trial: Polished, best: Polished, worth: float) -> bool:
-        """Is the trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne (design 4.3)."""
-        return self._criterion(trial.rss, trial.poles.order, worth) < self._criterion(
-            best.rss, best.poles.order, worth
-        )
+    def _one_less(self, poles: Poles, real: bool, pairs: bool) -> list[Poles]:
+        """The poles without one of the searched real ones or pairs."""
+        fixed = self.search.fixed
+        return [
+            *(poles.without_real(i) for i in range(fixed.real.size, poles.real.size) if real),
+            *(poles.without_pair(i) for i in range(fixed.pairs.size, poles.pairs.size) if pairs),
+        ]
 
-    def _criterion(self, rss: float, order: int, worth: float) -> float:
-        floor = max(rss, _EXPLAINED * self._power, np.finfo(np.float64).tiny)
-        return float(worth * np.log(floor / self._n) + self.search.data.n_parameters(order) * np.log(worth))
+    def _criterion(self, end: Refined) -> Criterion:
+        """The criterion read from the residual of this model."""
+        return self.search.data.criterion(end.rss, end.poles.order, self.worth(end))
 
-    def _visible(self, best: Polished) -> bool:
-        enough = self._n > 2 * self.search.data.n_parameters(best.poles.order + 2)
-        return enough and best.rss > _EXPLAINED * self._power
+    def _better(self, trial: Refined, best: Refined) -> bool:
+        """Is the larger trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne (design 4.3)."""
+        criterion = self._criterion(trial)
+        return criterion(trial.rss, trial.poles.order) < criterion(best.rss, best.poles.order)
 
-    def _counts(self, end: Polished) -> tuple[int, int]:
+    def _visible(self, best: Refined) -> bool:
+        enough = self.search.data.n_rows > 2 * self.search.data.n_parameters(best.poles.order + 2)
+        return enough and best.rss > EXPLAINED * self.search.data.power
+
+    def _counts(self, end: Refined) -> tuple[int, int]:
         fixed = self.search.fixed
         return end.poles.real.size - fixed.real.size, end.poles.pairs.size - fixed.pairs.size
 
-    def _noted(self, end: Polished) -> Polished:
+    def _noted(self, end: Refined) -> Refined:
         key = self._counts(end)
         self._tried[key] = min(end.rss, self._tried.get(key, np.inf))
         return end

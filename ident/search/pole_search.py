@@ -13,12 +13,10 @@ from ident.basis.coordinates import SearchSpace, search_space
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
-from ident.fit.least_squares import linearisation
-from ident.fit.refinement import FAR, NEAR, Bounds, Polished, polish
-from ident.fit.regression import Regression
-from ident.fit.residual_colour import ResidualColour, residual_colour
-from ident.search.candidate_cost import CandidateCost
-from ident.search.direct import best_apart
+from ident.fit.problem import CandidateCost, PoleProblem
+from ident.fit.refinement import FAR, NEAR, Bounds, Refined, refine
+from ident.fit.residual_colour import ResidualColour
+from ident.search.direct import best_apart, minimise
 from ident.search.search_trace import PolishedMinimum, SearchStage
 
 # A rescan has to gain this fraction of J to count.
@@ -30,10 +28,12 @@ _ROUNDS = 6
 ROUGH = 1e-3
 # So many starts that end in one place make further ones and a rescan superfluous.
 _STARTS_TO_AGREE = 3
+# Where they disagree, so many times the starts asked for are tried.
+_PATIENCE = 5
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
 _PAIR_EVALUATIONS = 240
 _REAL_GRID = 9
-_PAIR_GRID = (60, 3)
+_PAIR_GRID = (40, 2)
 # Ends of rough descents are one optimum if they differ in J by no more than what such descents leave, in a
 # pole by no more than this fraction; of rates below the box's slowest nothing is told anyway.
 _SAME_COST = 3 * ROUGH
@@ -44,14 +44,12 @@ _LITTLE_NOISE = 0.02
 
 
 class PoleSearch:
-    """The search on one regression problem; collects the trace on the way.
+    """The search on one problem; collects the trace on the way.
 
     The fixed poles come first among the poles of each type and are never moved.
     """
 
-    patience = 5
-
-    def __init__(self, data: Regression, options: IdentOptions) -> None:
+    def __init__(self, data: PoleProblem, options: IdentOptions) -> None:
         self.data = data
         self.options = options
         self.fixed = options.fixed()
@@ -61,32 +59,31 @@ class PoleSearch:
         self.evaluations = 0
         # Slower than the box of the search goes, of which a record says nothing.
         self._slowest = 0.2 / max(data.longest, 30)
-        self._power = float(data.y_clear @ data.y_clear)
-        self._settled: Polished | None = None
-        self._coloured: tuple[Polished, ResidualColour] | None = None
+        self._box = options
+        unbounded = options.omega_max_rad_s is None and options.coordinates == "log"
+        if unbounded and data.omega_max_rad_s is not None:
+            self._box = options.model_copy(update={"omega_max_rad_s": data.omega_max_rad_s})
+        self._settled: Refined | None = None
+        self._coloured: tuple[Refined, ResidualColour] | None = None
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
-        return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self.options)
+        return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self._box)
 
-    def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
-        """The cost that global searches and rescans look at (`ident.search.miso_search` has another)."""
-        return CandidateCost(self.data, space, shared, local)
-
-    def joint(self, n_real: int, n_pairs: int) -> Polished:
+    def joint(self, n_real: int, n_pairs: int) -> Refined:
         """Best poles of a joint global search over n_real real poles and n_pairs pairs.
 
         The search has settled if the first starts, points of the cube far from each other, all end in one
         place that can be trusted (`_is_trusted`). Agreement by itself is not enough: a broad wrong minimum
-        can catch several starts, but leaves dynamics in the residual. Else `patience` times as many starts
+        can catch several starts, but leaves dynamics in the residual. Else `_PATIENCE` times as many starts
         are tried: more of them find more than more evaluations do.
         """
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
-        cost = self.candidate_cost(space, self.fixed, self.fixed)
+        cost = self.data.candidate_cost(space, self.fixed, self.fixed)
         few = min(self.options.starts, _STARTS_TO_AGREE)
-        most = self.options.starts * self.patience
+        most = self.options.starts * _PATIENCE
         points = self._global(title, cost, self.options.evaluations, most)
 
         def starts(chosen: RealArray) -> list[Poles]:
@@ -105,7 +102,7 @@ class PoleSearch:
                 best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
         return best
 
-    def _is_trusted(self, best: Polished) -> bool:
+    def _is_trusted(self, best: Refined) -> bool:
         """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real poles.
 
         Two real poles that meet stay together in a descent, although apart they may fit better.
@@ -115,9 +112,9 @@ class PoleSearch:
             fast > self._slowest / 4 and fast - slow <= _SAME_POLE * fast
             for slow, fast in pairwise(distances)
         )
-        return not meeting and best.rss <= _LITTLE_NOISE * self._power and self.colour(best).white
+        return not meeting and best.rss <= _LITTLE_NOISE * self.data.power and self.colour(best).white
 
-    def _is_same(self, end: PolishedMinimum, best: Polished) -> bool:
+    def _is_same(self, end: PolishedMinimum, best: Refined) -> bool:
         """Whether a rough descent was on its way to `best`."""
         if end.rss > best.rss * (1 + _SAME_COST):
             return False
@@ -126,20 +123,20 @@ class PoleSearch:
             for ours, theirs in zip(_rates(end.poles), _rates(best.poles), strict=True)
         )
 
-    def add_pair(self, poles: Poles) -> Polished:
+    def add_pair(self, poles: Poles) -> Refined:
         """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
-        cost = self.candidate_cost(space, poles.doubled(), poles)
+        cost = self.data.candidate_cost(space, poles.doubled(), poles)
         points = self._global(
             title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations), self.options.starts
         )
         return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
 
-    def add_real(self, poles: Poles) -> Polished:
+    def add_real(self, poles: Poles) -> Refined:
         """Best descent from the given poles and one more real pole."""
         space = self.space(1, 0)
-        cost = self.candidate_cost(space, poles.doubled(), poles)
+        cost = self.data.candidate_cost(space, poles.doubled(), poles)
         grid = np.linspace(0, 1, 2 * _REAL_GRID)[:, np.newaxis]
         points = best_apart(grid, cost.rss(grid), 2)
         self.evaluations += cost.evaluations
@@ -147,7 +144,7 @@ class PoleSearch:
             [poles.appended(space.poles(point)) for point in points], "one more real pole"
         )
 
-    def rescan(self, best: Polished) -> Polished:
+    def rescan(self, best: Refined) -> Refined:
         """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round
         gains nothing.
 
@@ -171,11 +168,11 @@ class PoleSearch:
                 break
         return best
 
-    def _rescan_real(self, best: Polished, here: slice) -> Polished:
+    def _rescan_real(self, best: Refined, here: slice) -> Refined:
         count = here.stop - here.start
-        kept = Poles(np.delete(best.poles.real, here), best.poles.pairs)
+        kept = best.poles.without_real(here)
         space = self.space(count, 0)
-        cost = self.candidate_cost(space, kept, kept)
+        cost = self.data.candidate_cost(space, kept, kept)
         here_now = np.sort(space.levels(Poles(best.poles.real[here])))
 
         def looks(point: RealArray) -> tuple[Poles, bool]:
@@ -187,10 +184,10 @@ class PoleSearch:
 
         return self._descend_from_grid(best, _real_grid(count), cost, looks, n_starts=2)
 
-    def _rescan_pair(self, best: Polished, here: slice) -> Polished:
-        kept = Poles(best.poles.real, np.delete(best.poles.pairs, here))
+    def _rescan_pair(self, best: Refined, here: slice) -> Refined:
+        kept = best.poles.without_pair(here)
         space = self.space(0, 1)
-        cost = self.candidate_cost(space, kept, kept)
+        cost = self.data.candidate_cost(space, kept, kept)
         here_now = space.levels(Poles(pairs=best.poles.pairs[here]))
 
         def looks(point: RealArray) -> tuple[Poles, bool]:
@@ -204,12 +201,12 @@ class PoleSearch:
 
     def _descend_from_grid(
         self,
-        best: Polished,
+        best: Refined,
         grid: RealArray,
         cost: CandidateCost,
         looks: Callable[[RealArray], tuple[Poles, bool]],
         n_starts: int,
-    ) -> Polished:
+    ) -> Refined:
         """Descents from the best points of the grid; `looks` gives the poles of a point, and whether it is
         next to where the block already is: from there a descent would come back."""
         costs = cost.rss(grid)
@@ -224,39 +221,28 @@ class PoleSearch:
                 found = self.descend(trial.poles, "rescan")
         return found
 
-    def residual(self, poles: Poles) -> RealArray:
-        """What the fit with these poles leaves of the output, (N,)."""
-        return linearisation(self.data, poles).residual
-
-    def colour(self, end: Polished) -> ResidualColour:
+    def colour(self, end: Refined) -> ResidualColour:
         """Colour of the residual of an end; kept for the last end asked for."""
         if self._coloured is None or self._coloured[0] is not end:
-            self._coloured = end, residual_colour(self.residual(end.poles), self.data.starts)
+            self._coloured = end, self.data.colour(self.data.residual(end.poles))
         return self._coloured[1]
 
-    def descend(self, poles: Poles, stage: str, tolerance: float = 1e-9) -> Polished:
-        """Polish from the given poles (fixed ones first) and note the end in the trace."""
-        end = polish(
-            self.data,
-            poles,
-            self.bounds,
-            n_fixed_real=self.fixed.real.size,
-            n_fixed_pairs=self.fixed.pairs.size,
-            tolerance=tolerance,
-            damping=FAR if tolerance >= ROUGH else NEAR,
-        )
+    def descend(self, poles: Poles, stage: str, tolerance: float = 1e-9) -> Refined:
+        """Refine from the given poles (fixed ones first) and note the end in the trace."""
+        damping = FAR if tolerance >= ROUGH else NEAR
+        end = refine(self.data, poles, self.bounds, self.fixed, tolerance=tolerance, damping=damping)
         self.evaluations += end.iterations + 1
         self.minima.append(PolishedMinimum(stage, end.poles, end.rss))
         return end
 
-    def _best_descent(self, starts: list[Poles], stage: str) -> Polished:
+    def _best_descent(self, starts: list[Poles], stage: str) -> Refined:
         return self.descend(self._best_rough(starts, stage).poles, stage)
 
-    def _best_rough(self, starts: list[Poles], stage: str) -> Polished:
+    def _best_rough(self, starts: list[Poles], stage: str) -> Refined:
         return min((self.descend(start, stage, ROUGH) for start in starts), key=lambda end: end.rss)
 
     def _global(self, title: str, cost: CandidateCost, evaluations: int, count: int) -> RealArray:
-        points, costs = cost.minimise(self.options.algorithm, evaluations)
+        points, costs = minimise(cost.log, cost.space.dimension, self.options.algorithm, evaluations)
         self.evaluations += cost.evaluations
         self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
         return best_apart(points, costs, count)

@@ -20,16 +20,9 @@ from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.fit.miso_regression import (
-    MisoProjection,
-    MisoRegression,
-    block_states,
-    fitted_output,
-    prepare_inputs,
-    project,
-    take_out_local,
-)
-from ident.miso_identification import MisoIdentification
+from ident.fit.least_squares import Projection, Regression, block_states, fitted_output, project
+from ident.fit.regression import prepare_inputs
+from ident.identification import MisoIdentification
 
 
 def response_uncertainty(
@@ -102,16 +95,16 @@ def _free_states(identification: MisoIdentification) -> npt.NDArray[np.intp]:
 
 
 def _covariance_factor(
-    data: MisoRegression,
+    data: Regression,
     poles: Poles,
-    projection: MisoProjection,
+    projection: Projection,
     free: npt.NDArray[np.intp],
     noise_std: float,
 ) -> RealArray:
     """F (P, P) with F F^T the covariance of [coefficients of all channels, direct terms, states' weights]."""
     states = block_states(data, poles, fitted_output(data, projection))[free]
     columns = np.vstack([projection.shared, states])
-    take_out_local(data, projection.local_q, columns)
+    data.take_out_local(projection.local_q, columns)
     # Columns of unit length, so that what pinv leaves out as unseen does not depend on their units.
     scale = np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
     triangle = np.linalg.qr((columns / scale[:, None]).T, mode="r")
@@ -120,6 +113,5 @@ def _covariance_factor(
 
 def _block_responses(poles: Poles, z: ComplexArray) -> ComplexArray:
     """Responses (F, B) of each block's states to the signal that enters the block."""
-    parts = [basis_response(Poles(np.array([a])), z) for a in poles.real]
-    parts += [basis_response(Poles(pairs=np.array([p])), z) for p in poles.pairs]
+    parts = [basis_response(block, z) for block in poles.blocks()]
     return np.hstack(parts) if parts else np.zeros((z.size, 0), dtype=np.complex128)

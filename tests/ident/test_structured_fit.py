@@ -14,14 +14,9 @@ from ident.basis.poles import Poles
 from ident.basis.relative_degree import conditions
 from ident.basis.structure import Structure
 from ident.fit.least_squares import fit
-from ident.fit.refinement import Bounds
+from ident.fit.refinement import Bounds, pole_system
 from ident.fit.regression import prepare
-from ident.fit.structured_fit import (
-    structured_fit,
-    structured_optimality,
-    structured_polish,
-    structured_sensitivities,
-)
+from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction, p2
 
 OMEGA = np.geomspace(0.1, 600, 400)
@@ -69,10 +64,9 @@ def test_gradient_is_exact(case, relative_degree):
     """-2 S^T r against central differences of J, two records."""
     structure, poles, n_fixed_real, n_fixed_pairs = CASES[case]
     data = prepare([p1(0, 400).record, p1_friction(1, 300).record], structure)
-    linear, sensitivities = structured_sensitivities(
-        data, poles, relative_degree, n_fixed_real=n_fixed_real, n_fixed_pairs=n_fixed_pairs
-    )
-    gradient = -2 * sensitivities.T @ linear.residual
+    fixed = Poles(poles.real[:n_fixed_real], poles.pairs[:n_fixed_pairs])
+    here = UnderRelativeDegree(data, relative_degree, fixed).linearise(*poles.writable())
+    gradient = -2 * pole_system(here, poles, fixed)[1]
     free = np.concatenate(
         [1 - poles.real[n_fixed_real:], np.abs(np.log(poles.pairs[n_fixed_pairs:])).repeat(2)]
     )
@@ -130,15 +124,15 @@ def test_noise_free_data_give_the_plant_back(k):
     truth = p1(0)
     data = prepare([as_record(truth.record.input[:, 0], truth.clean)], Structure(integrators=k))
     start = Poles([0.0, 0.0] if k else [0.9995, 0.99], [0.97 * np.exp(0.09j)])
-    end = structured_polish(data, start, 2, BOUNDS, n_fixed_real=k)
+    end = UnderRelativeDegree(data, 2, Poles([0.0] * k)).refine(start, BOUNDS)
     linear = structured_fit(data, end.poles, 2)
-    model = GobfModel(end.poles, linear.coefficients, DT_S, integrators=k)
+    model = GobfModel(end.poles, linear.coefficients[0], DT_S, integrators=k)
     error = np.abs(model.frequency_response(OMEGA) / truth.response(OMEGA) - 1)
     # The free poles end at their bound 1e-6 from z = 1: 1e-6/(0.1 rad/s 5 ms) at the lowest frequency.
     assert error.max() < (1e-6 if k else 1e-2)
     # The fit without the conditions satisfies them by itself.
     if k:
-        plain = fit(data, end.poles).coefficients
+        plain = fit(data, end.poles).coefficients[0]
         rows = conditions(end.poles, k, 2)
         assert np.abs(rows @ plain) < 1e-6 * (np.abs(rows) @ np.abs(plain))
 
@@ -165,15 +159,13 @@ def test_descent_ends_where_scipys_optimiser_does():
         residual, base, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
     data = prepare([record], Structure(integrators=2))
-    end = structured_polish(data, Poles([0.0, 0.0], [0.97 * np.exp(0.09j)]), 2, BOUNDS, n_fixed_real=2)
+    problem = UnderRelativeDegree(data, 2, Poles([0.0, 0.0]))
+    end = problem.refine(Poles([0.0, 0.0], [0.97 * np.exp(0.09j)]), BOUNDS)
     assert end.converged
     assert end.rss == pytest.approx(2 * reference.cost, rel=1e-7)
     assert end.poles.omega_rad_s(DT_S)[0] == pytest.approx(np.sqrt(225 * reference.x[4]), rel=1e-5)
-    assert structured_optimality(data, end.poles, 2, BOUNDS, n_fixed_real=2) < 1e-4
-    assert (
-        structured_optimality(data, Poles([0.0, 0.0], [0.99 * np.exp(0.08j)]), 2, BOUNDS, n_fixed_real=2)
-        > 0.1
-    )
+    assert problem.optimality(end.poles, BOUNDS) < 1e-4
+    assert problem.optimality(Poles([0.0, 0.0], [0.99 * np.exp(0.08j)]), BOUNDS) > 0.1
 
 
 def test_descent_keeps_its_bounds_and_fixed_poles():
@@ -182,15 +174,18 @@ def test_descent_keeps_its_bounds_and_fixed_poles():
     bounds = Bounds.from_options(
         IdentOptions(omega_min_rad_s=20.0, zeta_max=0.3, decay_min_per_s=0.5), 1000, DT_S
     )
-    end = structured_polish(data, Poles([0.999, -0.4], [0.9 * np.exp(0.2j)]), 2, bounds, n_fixed_real=1)
+    end = UnderRelativeDegree(data, 2, Poles([0.999])).refine(
+        Poles([0.999, -0.4], [0.9 * np.exp(0.2j)]), bounds
+    )
     assert end.poles.real[0] == 0.999
     assert 0.01 * (1 - 1e-9) <= end.poles.real[1] <= np.exp(-0.5 * DT_S) * (1 + 1e-12)
     assert end.poles.omega_rad_s(DT_S)[0] >= 20 * (1 - 1e-9)
     assert end.poles.zeta()[0] <= 0.3 * (1 + 1e-9)
-    everything_fixed = structured_polish(data, end.poles, 2, bounds, n_fixed_real=2, n_fixed_pairs=1)
-    assert everything_fixed.poles is end.poles
+    problem = UnderRelativeDegree(data, 2, end.poles)
+    everything_fixed = problem.refine(end.poles, bounds)
+    np.testing.assert_array_equal(everything_fixed.poles.values, end.poles.values)
     assert everything_fixed.rss == pytest.approx(end.rss)
-    assert structured_optimality(data, end.poles, 2, bounds, n_fixed_real=2, n_fixed_pairs=1) == 0
+    assert problem.optimality(end.poles, bounds) == 0
 
 
 def test_what_cannot_be_fitted_is_refused():

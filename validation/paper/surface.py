@@ -21,10 +21,9 @@ from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import fit
-from ident.fit.refinement import polish
+from ident.fit.refinement import refine
 from ident.fit.regression import prepare
 from ident.identify import identify
-from ident.search.candidate_cost import CandidateCost
 from ident.search.direct import minimise
 from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.pole_search import PoleSearch
@@ -125,7 +124,7 @@ def study_surface(settings: PaperSettings, report: Callable[[float, str], None])
     best = search.descend(true_pair(), "truth")
     starts = [point for point in surface.local_minima() if not _inside(surface, *point)]
     ends = [
-        polish(search.data, _pair(surface.first[i], surface.second[j]), search.bounds).rss for i, j in starts
+        refine(search.data, _pair(surface.first[i], surface.second[j]), search.bounds).rss for i, j in starts
     ]
     shares = count_hits(settings, lambda fraction, text: report(0.3 + 0.7 * fraction, text))
     gamma = abs(complex(true_pair().pairs[0])) ** 2
@@ -188,7 +187,7 @@ def _costs(record: Record, options: IdentOptions, evaluations: int) -> dict[tupl
         for variant in VARIANTS:
             poles, _ = direct_alone(PoleSearch(data, _searched(options, coordinates, variant)), evaluations)
             # Downhill with the same bounds for both: what differs is where the search was made.
-            found[coordinates, variant] = polish(data, poles, PoleSearch(data, options).bounds).rss
+            found[coordinates, variant] = refine(data, poles, PoleSearch(data, options).bounds).rss
     return found
 
 
@@ -196,7 +195,7 @@ def direct_alone(search: PoleSearch, evaluations: int) -> tuple[Poles, float]:
     """The paper's search: the best point DIRECT looked at, and its residual sum of squares; no descent."""
     options = search.options
     space = search.space(options.n_real or 0, options.n_pairs or 0)
-    cost = CandidateCost(search.data, space, search.fixed, search.fixed)
+    cost = search.data.candidate_cost(space, search.fixed, search.fixed)
     points, costs = minimise(cost.log, space.dimension, options.algorithm, evaluations)
     best = int(np.argmin(costs))
     return space.poles(points[best]), float(np.exp(costs[best]))
@@ -205,11 +204,11 @@ def direct_alone(search: PoleSearch, evaluations: int) -> tuple[Poles, float]:
 def paper_recipe(record: Record, evaluations: int) -> GobfModel:
     """GOBF as the paper found it: DIRECT in the raw box (x, beta, gamma), least squares there, no descent."""
     options = _searched(_from_rest(N_REAL, N_PAIRS), "raw", "GN_DIRECT")
-    search = PoleSearch(prepare([record], options.structure()), options)
-    poles, _ = direct_alone(search, evaluations)
+    data = prepare([record], options.structure())
+    poles, _ = direct_alone(PoleSearch(data, options), evaluations)
     return GobfModel(
         poles,
-        fit(search.data, poles).coefficients,
+        fit(data, poles).coefficients[0],
         record.dt_s,
         input_name=record.input_names[0],
         output_name=record.output_names[0],
