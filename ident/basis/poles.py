@@ -109,11 +109,11 @@ class Poles:
         real = (Poles(real=self.real[i : i + 1]) for i in range(self.real.size))
         return (*real, *(Poles(pairs=self.pairs[i : i + 1]) for i in range(self.pairs.size)))
 
-    def without_real(self, index: Any) -> Poles:
+    def without_real(self, index: int | slice) -> Poles:
         """These poles but the real one (or those) at `index`."""
         return Poles(np.delete(self.real, index), self.pairs)
 
-    def without_pair(self, index: Any) -> Poles:
+    def without_pair(self, index: int | slice) -> Poles:
         """These poles but the pair (or those) at `index`."""
         return Poles(self.real, np.delete(self.pairs, index))
 
