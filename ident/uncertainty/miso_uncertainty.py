@@ -11,23 +11,40 @@ forget that the poles are shared.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ident.basis.functions import basis_response
+from ident.basis.miso_model import MisoModel
 from ident.basis.poles import Poles
+from ident.basis.structure import Structure
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.fit.least_squares import Projection, Regression, block_states, fitted_output, project
 from ident.fit.regression import prepare_inputs
-from ident.identification import MisoIdentification
+
+
+class SharedPoles(Protocol):
+    """What is asked of an identification with several inputs (`ident.identification.MisoIdentification`)."""
+
+    @property
+    def model(self) -> MisoModel: ...
+    @property
+    def structure(self) -> Structure: ...
+    @property
+    def residuals(self) -> tuple[RealArray, ...]: ...
+    @property
+    def noise_std(self) -> float: ...
+    @property
+    def n_fixed(self) -> tuple[int, int]: ...
 
 
 def response_uncertainty(
     records: Sequence[Record],
-    identification: MisoIdentification,
+    identification: SharedPoles,
     omega_rad_s: RealArray,
     *,
     level: float = 0.95,
@@ -85,7 +102,7 @@ def response_uncertainty(
     return tuple(result)
 
 
-def _free_states(identification: MisoIdentification) -> npt.NDArray[np.intp]:
+def _free_states(identification: SharedPoles) -> npt.NDArray[np.intp]:
     """Indices of the block states that belong to searched poles: what was fixed comes first of each type."""
     poles = identification.model.poles
     n_real, n_pairs = identification.n_fixed
