@@ -165,7 +165,7 @@ def identify_frf(
     Parameters
     ----------
     response : FrequencyUncertainty
-        Measurement with a covariance at every frequency (`from_csv`, `from_frf_repeats`, `empirical_frf`).
+        Measurement with a covariance at every frequency (`from_csv`, `FrfRepeats.mean`, `empirical_frf`).
         Errors of different frequencies are taken as independent. One that all of them share (the amplitude
         of a run, the gain of an amplifier) does not show in the residual and is not averaged away by the fit:
         state it as shared_gain_std.

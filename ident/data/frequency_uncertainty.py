@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import (
@@ -18,11 +19,27 @@ from ident.data.ellipses import (
     relative_deficit,
     standard_axes,
 )
-from ident.data.frequency_data import mean_of_repeats, read_frequency_table, write_frequency_table
+from ident.data.record_files import Table, read_table
 
 # A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
 # more.
 _PSD_TOLERANCE = 1e-9
+
+FREQUENCY_COLUMNS = {"omega_rad_s": 1.0, "omega_rad_per_s": 1.0, "frequency_Hz": 2 * np.pi}
+"""Names a frequency column may have, and the factor to rad/s."""
+_COLUMNS = ("real", "imag", "variance_real", "variance_imag")
+_CROSS = "covariance_real_imag"
+
+
+def frequencies(table: Table) -> RealArray:
+    """omega (K,) in rad/s from the one column of `FREQUENCY_COLUMNS` that a table has; else ValueError."""
+    found = [name for name in FREQUENCY_COLUMNS if name in table.names]
+    if len(found) != 1:
+        raise ValueError(
+            f"{table.path}, line 1: need exactly one of the columns {', '.join(FREQUENCY_COLUMNS)}; found "
+            f"{list(table.names)}"
+        )
+    return table.columns(found)[found[0]] * FREQUENCY_COLUMNS[found[0]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,51 +143,25 @@ class FrequencyUncertainty:
         `variance_imag` and, if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming
         file, line and column.
         """
-        path = Path(path)
-        omega, centre, covariance = read_frequency_table(path)
+        table = read_table(path)
+        omega = frequencies(table)
+        re, im, variance_re, variance_im = table.columns(_COLUMNS).values()
+        negative = np.flatnonzero((variance_re < 0) | (variance_im < 0))
+        if negative.size:
+            raise ValueError(f"{path}, {table.place(int(negative[0]))}: a variance is negative")
+        cross = table.columns([_CROSS])[_CROSS] if _CROSS in table.names else np.zeros_like(omega)
+        covariance = np.stack([np.stack([variance_re, cross], -1), np.stack([cross, variance_im], -1)], -2)
         try:
-            return cls(omega, centre, covariance, dt_s=dt_s, level=level, method=f"given in {path.name}")
+            return cls(omega, re + 1j * im, covariance, dt_s, level, f"given in {table.path.name}")
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
     def to_csv(self, path: str | Path) -> None:
         """Write the columns `from_csv` reads; numbers keep all their digits."""
-        write_frequency_table(Path(path), self.omega_rad_s, self.centre, self.covariance)
-
-    @classmethod
-    def from_frf_repeats(
-        cls,
-        omega_rad_s: npt.ArrayLike,
-        response: npt.ArrayLike,
-        dt_s: float,
-        *,
-        level: float = 0.95,
-        pool_neighbours: int = 0,
-        outlier_threshold: float | None = None,
-        of: Literal["mean", "next run"] = "mean",
-    ) -> Self:
-        """Mean and covariance of the mean from repeated measurements of a frequency response.
-
-        omega_rad_s (K,) and response (K,): one entry per measured point in any order; points of equal
-        frequency are repeats. Few repeats know their own scatter badly, so the covariance is widened until
-        the ellipse of the chi-square quantile at `level` equals Hotelling's T-square ellipse at that level
-        (variance x 1.7 with 10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative
-        covariances over m frequencies on either side first, which suits a scatter that varies slowly with
-        frequency and few repeats. outlier_threshold = t drops points farther than t robust standard
-        deviations from the median of their frequency. of = "next run" gives the region of one more run
-        instead: scatter of a run plus error of the mean, widened to Hotelling's prediction region. Raises
-        ValueError where a frequency is left with too few repeats.
-        """
-        omega, centre, covariance = mean_of_repeats(
-            np.asarray(omega_rad_s, dtype=np.float64),
-            np.asarray(response, dtype=np.complex128),
-            level=level,
-            pool_neighbours=pool_neighbours,
-            outlier_threshold=outlier_threshold,
-            of=of,
-        )
-        method = "repeated measurements" if of == "mean" else "one more run"
-        return cls(omega, centre, covariance, dt_s=dt_s, level=level, method=method)
+        parts = (self.centre.real, self.centre.imag, self.covariance[:, 0, 0], self.covariance[:, 1, 1])
+        columns = {"omega_rad_s": self.omega_rad_s, **dict(zip(_COLUMNS, parts, strict=True))}
+        table = pd.DataFrame({**columns, _CROSS: self.covariance[:, 0, 1]})
+        table.to_csv(path, index=False, lineterminator="\n")
 
     def _matching(self, response: npt.ArrayLike) -> ComplexArray:
         response = np.asarray(response, dtype=np.complex128)

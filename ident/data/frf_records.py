@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
-from ident.data.frequency_data import frequencies
-from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.ellipses import chi2_radius
+from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
 from ident.data.record_files import read_table
 
 _PARTS = (("real", "imag"), ("gain", "phase_rad"))
@@ -18,7 +19,7 @@ _PARTS = (("real", "imag"), ("gain", "phase_rad"))
 
 @dataclass(frozen=True, eq=False)
 class FrfRepeats:
-    """Measured points of a frequency response: omega_rad_s (K,), response (K,), label (K,) of each point.
+    """Measured points of a frequency response: omega_rad_s (K,), response (K,), label (K,) or none.
 
     Points of equal frequency are repeats; the label says under which condition (date, amplitude) they were
     taken. Runs within a condition need not be told apart. Raises ValueError for other shapes or numbers that
@@ -27,13 +28,13 @@ class FrfRepeats:
 
     omega_rad_s: RealArray
     response: ComplexArray
-    label: tuple[str, ...]
+    label: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "omega_rad_s", readonly_real(self.omega_rad_s))
         object.__setattr__(self, "response", readonly_complex(self.response))
-        object.__setattr__(self, "label", tuple(self.label))
         size = self.omega_rad_s.size
+        object.__setattr__(self, "label", tuple(self.label) or ("",) * size)
         if self.omega_rad_s.shape != (size,) or self.response.shape != (size,) or len(self.label) != size:
             raise ValueError(
                 f"need omega, response and label of one length; got {self.omega_rad_s.shape}, "
@@ -100,16 +101,50 @@ class FrfRepeats:
         outlier_threshold: float | None = None,
         of: Literal["mean", "next run"] = "mean",
     ) -> FrequencyUncertainty:
-        """Mean over all points of each frequency, as `FrequencyUncertainty.from_frf_repeats`."""
-        return FrequencyUncertainty.from_frf_repeats(
-            self.omega_rad_s,
-            self.response,
-            dt_s,
-            level=level,
-            pool_neighbours=pool_neighbours,
-            outlier_threshold=outlier_threshold,
-            of=of,
-        )
+        """Centre and covariance of the mean over all points of each frequency.
+
+        Few repeats know their own scatter badly, so the covariance is widened until the ellipse of the
+        chi-square quantile at `level` equals Hotelling's T-square ellipse at that level (variance x 1.7 with
+        10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative covariances over m
+        frequencies on either side first, which suits a scatter that varies slowly with frequency and few
+        repeats. outlier_threshold = t drops points farther than t robust standard deviations from the median
+        of their frequency. of = "next run" gives the region of one more run instead: scatter of a run plus
+        error of the mean, widened to Hotelling's prediction region. Raises ValueError where a frequency is
+        left with too few repeats.
+        """
+        if pool_neighbours < 0:
+            raise ValueError(f"pool_neighbours must not be negative; got {pool_neighbours}")
+        if outlier_threshold is not None and not outlier_threshold > 0:
+            raise ValueError(f"outlier_threshold must be positive; got {outlier_threshold}")
+        grid, group = np.unique(self.omega_rad_s, return_inverse=True)
+        centre = np.empty(grid.size, dtype=np.complex128)
+        scatter = np.empty((grid.size, 2, 2))
+        count = np.empty(grid.size, dtype=np.int64)
+        for index in range(grid.size):
+            points = self.response[group == index]
+            if outlier_threshold is not None:
+                points = _inliers(points, outlier_threshold)
+            centre[index] = points.mean()
+            deviation = points - centre[index]
+            pair = np.stack([deviation.real, deviation.imag])
+            scatter[index], count[index] = pair @ pair.T, points.size
+        freedom = count - 1
+        if pool_neighbours:
+            scatter, freedom = _pooled(scatter, freedom, centre, pool_neighbours)
+        short = freedom < 2
+        if np.any(short):
+            at = int(np.argmax(short))
+            raise ValueError(
+                f"at omega = {grid[at]:.6g} rad/s there are {count[at]} repeats: a 2x2 covariance needs "
+                "at least 3 (or pool_neighbours > 0)"
+            )
+        # Hotelling: n (mean - G)^T S^-1 (mean - G) ~ 2 f / (f - 1) F(2, f - 1), f degrees of freedom in S.
+        hotelling = 2 * freedom / (freedom - 1) * f_distribution.ppf(level, 2, freedom - 1)
+        widening = hotelling / chi2_radius(level) ** 2
+        share = 1 / count if of == "mean" else 1 + 1 / count
+        covariance = scatter * (widening * share / freedom)[:, None, None]
+        method = "repeated measurements" if of == "mean" else "one more run"
+        return FrequencyUncertainty(grid, centre, covariance, dt_s, level, method)
 
     def _chosen(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FrfRepeats:
         if not np.any(keep):
@@ -119,3 +154,32 @@ class FrfRepeats:
             self.response[keep],
             tuple(name for name, kept in zip(self.label, keep, strict=True) if kept),
         )
+
+
+def _inliers(points: ComplexArray, threshold: float) -> ComplexArray:
+    """Points within `threshold` robust standard deviations of the median.
+
+    In one pass: repeated on ten points or so, the spread shrinks by chance until good points fall.
+    """
+    distance = np.abs(points - (np.median(points.real) + 1j * np.median(points.imag)))
+    # The median distance of a circular Gaussian cloud (Rayleigh) is 1.1774 standard deviations.
+    spread = float(np.median(distance)) / 1.1774
+    return points[distance <= threshold * spread] if spread > 0 else points
+
+
+def _pooled(
+    scatter: RealArray, freedom: np.ndarray[tuple[int], np.dtype[np.int64]], centre: ComplexArray, m: int
+) -> tuple[RealArray, np.ndarray[tuple[int], np.dtype[np.int64]]]:
+    """Sums over m neighbours on either side of scatter relative to the centre, turned back to each centre."""
+    if np.any(centre == 0):
+        raise ValueError("pooling uses relative scatter, but a mean response is exactly zero")
+    rotation = np.stack(
+        [np.stack([centre.real, -centre.imag], -1), np.stack([centre.imag, centre.real], -1)], -2
+    )
+    inverse = np.linalg.inv(rotation)
+    relative = inverse @ scatter @ inverse.transpose(0, 2, 1)
+    totals, degrees = np.empty_like(relative), np.empty_like(freedom)
+    for index in range(centre.size):
+        window = slice(max(0, index - m), index + m + 1)
+        totals[index], degrees[index] = relative[window].sum(axis=0), freedom[window].sum()
+    return rotation @ totals @ rotation.transpose(0, 2, 1), degrees

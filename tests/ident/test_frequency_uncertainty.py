@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import ncx2
 
 from ident.data.ellipses import offset_disc_radius
+from ident.data.frf_records import FrfRepeats
 from ident.uncertainty import FrequencyUncertainty
 
 DT = 0.01
@@ -201,9 +202,7 @@ def test_ellipse_from_repeats_covers_the_truth_at_its_level(repeats, pool):
     noise = rng.standard_normal((repeats, omega.size, 2)) @ factor.T
     # Scatter fixed relative to the response, so that pooling over neighbours is right.
     points = truth * (1 + noise[..., 0] + 1j * noise[..., 1])
-    record = FrequencyUncertainty.from_frf_repeats(
-        np.tile(omega, repeats), points.ravel(), 0.001, pool_neighbours=pool
-    )
+    record = FrfRepeats(np.tile(omega, repeats), points.ravel()).mean(0.001, pool_neighbours=pool)
     hits = record.contains(truth).sum()
     # Hotelling is exact without pooling; 4 binomial standard deviations of 200 at 0.95 are 12.
     assert abs(hits - 190) <= 12
@@ -211,10 +210,10 @@ def test_ellipse_from_repeats_covers_the_truth_at_its_level(repeats, pool):
 
 def test_repeats_need_three_points_and_outliers_can_be_dropped():
     with pytest.raises(ValueError, match=r"omega = 2 rad/s there are 2 repeats"):
-        FrequencyUncertainty.from_frf_repeats([1, 1, 1, 2, 2], [1, 2, 3, 1, 2], DT)
+        FrfRepeats([1, 1, 1, 2, 2], [1, 2, 3, 1, 2]).mean(DT)
     rng = np.random.default_rng(4)
     points = 1 + 0.01 * (rng.standard_normal(20) + 1j * rng.standard_normal(20))
     points[7] = 5.0
-    kept = FrequencyUncertainty.from_frf_repeats(np.ones(20), points, DT, outlier_threshold=5.0)
+    kept = FrfRepeats(np.ones(20), points).mean(DT, outlier_threshold=5.0)
     assert abs(kept.centre[0] - 1) < 0.02
     assert kept.enclosing_radius()[0] < 0.02

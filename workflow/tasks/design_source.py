@@ -443,9 +443,7 @@ def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
         return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level)
     repeats = FrfRepeats.from_csv(path)
     try:
-        return FrequencyUncertainty.from_frf_repeats(
-            repeats.omega_rad_s,
-            repeats.response,
+        return repeats.mean(
             about.dt_s,
             level=about.level,
             pool_neighbours=about.pool_neighbours,
