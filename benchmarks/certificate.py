@@ -21,11 +21,9 @@ frequency of the unstable draws in its own standard deviations.
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, median_s
 from benchmarks.random_designs import LOW_EFFORT, RADIUS, random_case
 from control_design import (
     Controller,
@@ -90,12 +88,7 @@ def bound_seconds(controller: Controller, plant: UncertainPlant, specification: 
 
 def certify_seconds(controller: Controller, plant: UncertainPlant, specification: Specification) -> float:
     """Median of five."""
-    spent = []
-    for _ in range(5):
-        begin = time.process_time()
-        certify(controller, [plant], specification)
-        spent.append(time.process_time() - begin)
-    return float(np.median(spent))
+    return median_s(lambda: certify(controller, [plant], specification), 5)
 
 
 def joint_line(

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, reading
 from control_design.analysis.certificate import Certificate, certify
 from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
@@ -50,15 +50,6 @@ PAYLOADS_KG = (0.0, 0.02, 0.04)
 BETWEEN_KG = (0.0, 0.01, 0.02, 0.03, 0.04)
 FRICTIONS_NM = (0.0, 0.02, 0.1, 0.3)
 SIZES_RAD = (0.003, 0.01, 0.03, 0.1, 0.2)
-
-FRICTION_WORDS = (
-    "The model behind the controller was identified at 0.02 N m and 0.5 rad. Dry friction takes a fixed",
-    "torque out of a motor torque that grows with the reference: at large size the loop is the predicted "
-    "one,",
-    "at small size the hub follows less than the model says, the loop gain falls and the peak with it; where",
-    "the hub sticks, the error is the reference and |S| is 1. At 0.003 rad the sensor's noise of 1 mrad",
-    "lifts the largest of the lines by a few percent (first row).",
-)
 
 
 def altered(config: RunConfig, *, seed: int | None = None, **effects: dict[str, Any]) -> RunConfig:
@@ -186,8 +177,7 @@ def friction(out: Print, config: RunConfig, folder: Path) -> None:
             found = measured(controller, config, rms=size, seed=3, coulomb_friction={"torque_Nm": level})
             cells.append(f"{100 * (found.peak[0] / bound - 1):+7.1f}    ")
         out(f"   {level:8.2f} N m  " + "  ".join(cells))
-    for line in FRICTION_WORDS:
-        out(f"   {line}")
+    out(reading("closed_loop_sensitivity"))
 
 
 def words(found: MeasuredSensitivity) -> str:

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, reading, timed
 from benchmarks.p2_plants import DT_S, Run, Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
@@ -30,24 +29,6 @@ OMEGA = np.geomspace(0.3, 300.0, 150)
 BANDS = ((0.3, 1), (1, 5), (5, 13), (13, 19), (19, 55), (55, 85), (66, 72), (85, 150), (150, 190), (190, 301))
 LEVEL = 0.95
 RADIUS_REACH = {(13, 19): 1.5, (19, 55): 2.2, (66, 72): 5.0, (190, 301): 32.0}
-
-HEADER = """
-95 % ellipses on P2 at 150 log-spaced frequencies 0.3-300 rad/s, poles and order n from the same record.
-  coverage     share of (run, frequency) with the true response inside the ellipse, per band, in %
-  worst        smallest share over the runs at a single frequency
-  radius       semi-major axis s1 of the 95 % ellipse (the enclosing disc) over |G|, median per band, in %
-  mean radius  the same of sqrt(s1 s2)
-  ratio        median over runs and frequencies of radius over actual error |G - centre|, three readings:
-               mean radius sqrt(s1 s2) (judged), radius in the direction of the error, semi-major axis; a
-               circular Gaussian has 2.08 in all, the third grows with elongation however good the ellipse
-  all inside   share of runs with ALL 150 frequencies inside: of the 95 % ellipses, and of the simultaneous
-               bands (`joint_level`: 95 % of 1000 responses drawn from the posterior are inside everywhere;
-               median squared radius beside it, 5.99 for one frequency)
-  order-4 nominal   disc |G - G_nom| <= rho with P = 95 % under the posterior (`offset_disc`), G_nom the
-               fit with 2 real poles and 1 pair, or those poles placed by `nominal_near` as the workflow does
-  order        how many pole pairs the data gave (pairs x runs)
-  cpu          median process time of the identification and of the posterior, ms; the machine was shared
-"""
 
 
 @dataclass(frozen=True)
@@ -138,8 +119,8 @@ def covariance_alone(run: Run, model: GobfModel) -> ResponsePosterior:
     columns = regressor(model.poles, run.record.input[:, 0])
     q, r = np.linalg.qr(np.column_stack([columns, np.ones(columns.shape[0])]))
     inner = q.T @ run.record.output[:, 0]
-    rest = run.record.output[:, 0] - q @ inner
-    s = np.sqrt(rest @ rest / (rest.size - inner.size))
+    residual = run.record.output[:, 0] - q @ inner
+    s = np.sqrt(residual @ residual / (residual.size - inner.size))
     inverse = np.linalg.inv(r)
     order = model.poles.order
     return ResponsePosterior(model.poles, (inverse @ inner)[:order], s * inverse[:order], DT_S)
@@ -164,15 +145,7 @@ def judge(run: Run, ellipses: FrequencyUncertainty, truth: np.ndarray, cpu_s: fl
 def with_joint(outcome: Outcome, posterior: ResponsePosterior, truth: np.ndarray, seed: int) -> Outcome:
     level = posterior.joint_level(OMEGA, LEVEL, np.random.default_rng(seed), n_draws=1000)
     everywhere = bool(np.all(posterior.at(OMEGA, level).contains(truth)))
-    return Outcome(
-        outcome.inside,
-        outcome.major,
-        outcome.mean,
-        outcome.ratios,
-        everywhere,
-        float(-2 * np.log1p(-level)),
-        outcome.cpu_s,
-    )
+    return replace(outcome, joint=everywhere, joint_radius2=float(-2 * np.log1p(-level)))
 
 
 def disc_outcome(nominal: np.ndarray, ellipses: FrequencyUncertainty, truth: np.ndarray) -> Outcome:
@@ -188,14 +161,10 @@ def one_run(name: str, seed: int) -> RunOutcome:
     case = CASES[name]
     run = draw(case.setting, np.random.default_rng(seed))
     truth = run.plant.response(OMEGA)
-    begin = time.process_time()
-    model = identify([run.record]).model
-    cpu_identify_s = time.process_time() - begin
+    model, cpu_identify_s = timed(lambda: identify([run.record]).model)
     options = EmbeddingOptions(coloured_noise=case.coloured_noise)
     alone = options.model_copy(update={"prior_missed_mode": 0.0})
-    begin = time.process_time()
-    posterior = tangent([run.record], model, options)
-    cpu_s = time.process_time() - begin
+    posterior, cpu_s = timed(lambda: tangent([run.record], model, options))
     ellipses = posterior.at(OMEGA, LEVEL)
     found: dict[str, Outcome] = {}
     low = None
@@ -204,9 +173,7 @@ def one_run(name: str, seed: int) -> RunOutcome:
             found[method] = with_joint(judge(run, ellipses, truth, cpu_s), posterior, truth, seed)
             continue
         if method == "no missed mode":
-            begin = time.process_time()
-            other = tangent([run.record], model, alone)
-            cpu_s = time.process_time() - begin
+            other, cpu_s = timed(lambda: tangent([run.record], model, alone))
             found[method] = with_joint(judge(run, other.at(OMEGA), truth, cpu_s), other, truth, seed)
             continue
         if low is None:
@@ -302,7 +269,7 @@ def run(
     # Processes started afresh: forking after the numerical libraries have started their threads can hang.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max(1, min(2, processes)), mp_context=context) as pool:
-        out(HEADER.strip())
+        out(reading("coverage_p2"))
         for name in cases:
             # Cases without a number to reach get half the seeds.
             count = max(1, seeds // 2) if CASES[name].reported_only else seeds

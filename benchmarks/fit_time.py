@@ -1,4 +1,4 @@
-"""CPU time of an order-4 fit and of its hot loop, the cost of candidate poles, beside their yardsticks.
+"""CPU time of an order-4 fit and of its hot loop, the cost of candidate poles, beside those of others.
 
     OMP_NUM_THREADS=1 python -m benchmarks.fit_time [--seeds 50]
 

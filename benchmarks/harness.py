@@ -135,6 +135,13 @@ def data_folder(*needed: str) -> Path:
     return folder
 
 
+def reading(name: str, **values: object) -> str:
+    """What is said about the numbers of a benchmark: benchmarks/readings/NAME.txt, values put in."""
+    return (
+        (Path(__file__).parent / "readings" / f"{name}.txt").read_text("utf-8").rstrip("\n").format(**values)
+    )
+
+
 def timed(call: Callable[[], R]) -> tuple[R, float]:
     """What the call returns, and CPU seconds of this process."""
     begin = time.process_time()

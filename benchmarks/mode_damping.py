@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import control
 import numpy as np
 
-from benchmarks.harness import RESULTS, Print, main
+from benchmarks.harness import RESULTS, Print, main, reading
 from control_design import (
     Controller,
     LoopFunction,
@@ -51,14 +51,6 @@ NAMES = {
 CONTROLLER_DAMPING = 0.3
 OPTIONS = SynthesisOptions(starts=2)
 BAND = (10.0, 22.5)
-READING = f"""
-Over the ellipses of B the weight W4 is met without damping the pole: the controller puts a
-lightly damped pole pair of its own beside the mode, nearly cancelled by its zeros; |G S| is
-small on every ellipse while one closed-loop pole stays about as it was. W4 asks no more. The
-search did not fail in gamma: it lies below what the Youla step is known to reach with W4; the
-lower bound is too loose to show it the least. With the controller's own poles damped
-({CONTROLLER_DAMPING} or more) those of the loop are too: row 'controller damped' is the price.
-"""
 
 
 @dataclass(frozen=True)
@@ -229,7 +221,7 @@ def summarise(out: Print, curves: dict[str, list[Point]]) -> None:
         ringing = max(p.own for p in weighted)
         out(f"{NAMES[part]:30s}  at most {floor:5.1f} % and {over:5.1f} % above;  {ringing:.3f}")
     out()
-    out(READING.strip())
+    out(reading("mode_damping", damping=CONTROLLER_DAMPING))
 
 
 def measure(out: Print, part: str, ratios: tuple[float, ...], seed: int) -> list[Point]:

@@ -12,15 +12,16 @@ is drawn from the Gaussian with that covariance, response and output linearised.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
 import scipy.signal
 
+from benchmarks.harness import timed
 from ident.data.record import Record
 from tests.ident.benchmark_plants import DT_S, Truth, max_length_sequence, p1, p1_friction, run
 
@@ -76,9 +77,7 @@ def score(
     y = run(truths[0].system, fresh)
     scores = []
     for truth in truths:
-        begin = time.process_time()
-        model, poles = fit(truth.record)
-        cpu_s = time.process_time() - begin
+        (model, poles), cpu_s = timed(partial(fit, truth.record))
         error = np.abs(model.frequency_response(GRID) / response - 1)
         natural = np.abs(np.log(poles[poles.imag > 0])) / DT_S
         scores.append(

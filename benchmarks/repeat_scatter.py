@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from benchmarks.harness import Print, data_folder, main
+from benchmarks.harness import Print, data_folder, main, reading
 from ident import IdentOptions, Record, band_limited, identify
 from ident.checks.validation import repeat_scatter
 from ident.closed_loop import indirect, two_stage
@@ -45,18 +45,6 @@ POINTS_PER_BAND = 20
 KYOTO_DT_S = 0.002
 KYOTO_BANDS = ((0.6, 3), (3, 20), (20, 28), (28, 60), (60, 200), (200, 600), (600, 1200))
 OUTLIER = 6.0
-
-
-SLFR_READING = """
-Reading. The interval is what honest noise bounds give with three repeats of two amplitudes (chi-square,
-degrees of freedom from the joint covariance of the posterior). Noise bounds leave out what changes between
-runs: the frequency of the second mode differs between sweeps and, seen at the tip, falls with amplitude
-(line above), and one sweep's noise says nothing about that; nor is the first stage's error in them.
-'Amplitudes apart' is the same seen between 50 and 75 counts. For a controller, bounds with the scatter
-between runs in them (last column: predicted by five sweeps, met by the sixth) are the ones to use. The
-hub's bounds are larger than its scatter around the first mode (2-4 Hz): what friction does in the same way
-in every sweep stands in the residuals, and so in the bounds, but does not scatter (likely, not proved).
-"""
 
 
 def slfr(folder: Path, channel: str, say: Print) -> None:
@@ -126,7 +114,7 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
         ("Too large", [b for b, row in zip(SLFR_BANDS_HZ, rows, strict=True) if row.ratio < row.ratio_low]),
     ):
         say(f"{words}: {', '.join(f'{low:g}-{high:g} Hz' for low, high in bands) or 'nowhere'}.")
-    say(SLFR_READING.rstrip())
+    say("\n" + reading("repeat_scatter_slfr"))
 
 
 def share(inside: np.ndarray, omega: np.ndarray) -> str:
@@ -210,21 +198,7 @@ def kyoto(path: Path, say: Print) -> None:
             here = ratio[(omega >= low) & (omega < high)]
             cells.append(f"{f'{np.median(here):.2f}/{here.max():.1f}':>9}")
         say(f"{date:<46}{''.join(cells)}")
-    say(KYOTO_READING.rstrip())
-
-
-KYOTO_READING = """
-Reading. Within a day the bounds hold: the scatter of a run is the same on both long dates to 200 rad/s, and
-runs of 2025-05-07 fall into the region of 2025-04-16 as often as promised from 3 to 200 rad/s (the other
-way round less often: a run's error is mostly one gain for all frequencies, so there are about ten
-independent errors and not a thousand). They fail below 3 rad/s, where the response changes from day to day
-by more than it scatters within one (dry friction is the likely cause); for 2025-05-09 and 2025-04-18, which
-were other plants (table of modes): no noise bound of another day can cover that; and above 200 rad/s, where
-single gross errors, kept out of the means, are counted. A fitted model averages over frequencies: its own
-ellipses are a fifth of the measured ones, right about noise and far too small for another day. Adding the
-gain that a date's runs share helps where gain is what differs. For other days use conditions
-(ident.uncertainty.conditions), with four or more of them.
-"""
+    say("\n" + reading("repeat_scatter_kyoto"))
 
 
 def days(plant: FrfRepeats, say: Print) -> None:

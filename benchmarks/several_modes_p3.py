@@ -10,11 +10,11 @@ CPU time after a warm-up fit.
 
 from __future__ import annotations
 
-import time
+from functools import partial
 
 import numpy as np
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, timed
 from ident import IdentOptions, identify
 from tests.ident.benchmark_plants import P3_MODES, max_length_sequence, p3
 from tests.ident.benchmark_plants import run as simulated
@@ -35,9 +35,8 @@ def run(out: Print, *, seeds: int = 8) -> None:
                 ratios, errors, cpu, pairs = [], [], [], []
                 y = simulated(truths[0].system, fresh)
                 for truth in truths:
-                    begin = time.process_time()
-                    result = identify([truth.record], options)
-                    cpu.append(1e3 * (time.process_time() - begin))
+                    result, seconds = timed(partial(identify, [truth.record], options))
+                    cpu.append(1e3 * seconds)
                     ratios.append(result.rss / (truth.clean.size * truth.noise_std**2))
                     error = y - result.model.simulate(fresh)
                     errors.append(float(np.linalg.norm(error) / np.linalg.norm(y - y.mean())))

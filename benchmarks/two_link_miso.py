@@ -21,14 +21,14 @@ Nothing is asked for in numbers; the reach is to be better than the fits channel
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 
 import control
 import numpy as np
 from scipy.signal import dlsim
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, timed
 from examples.two_link_arm import AMPLITUDE_V, DT_S, ELBOW_ANGLE_RAD, NOISE_M
 from ident import IdentOptions, Record, identify
 from ident.several_inputs import identify_miso
@@ -85,9 +85,8 @@ def run(out: Print, *, seeds: int = 20) -> None:
         at_once = [experiment(arm, N_SAMPLES, [0, 1], rng)]
         one_by_one = [experiment(arm, N_SAMPLES // 2, [motor], rng) for motor in (0, 1)]
         for name, (together, method) in METHODS.items():
-            begin = time.process_time()
-            response, frequencies = method(at_once if together else one_by_one)
-            cpu[name].append(time.process_time() - begin)
+            (response, frequencies), spent = timed(partial(method, at_once if together else one_by_one))
+            cpu[name].append(spent)
             square = np.abs(response / truth - 1) ** 2
             errors[name][seed] = np.sqrt([square[LOW].mean(axis=0), square[~LOW].mean(axis=0)])
             for channel, those in enumerate(frequencies):

@@ -8,9 +8,9 @@ numbers.
 
 from __future__ import annotations
 
-import time
+from functools import partial
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, timed
 from control_design.convex.youla import BracketProblem, YoulaOptions, youla_bracket
 from validation.example_plants import Scenario, flexible_link, flexible_link_specification
 
@@ -38,9 +38,7 @@ def run(out: Print, *, scenarios: tuple[Scenario, ...] = ("A", "B", "C"), fine: 
     for scenario in scenarios:
         plant, specification = flexible_link(scenario), flexible_link_specification(5)
         for name, options in settings.items():
-            begin = time.process_time()
-            bracket = youla_bracket(plant, specification, options)
-            spent = time.process_time() - begin
+            bracket, spent = timed(partial(youla_bracket, plant, specification, options))
             one = bracket.plants[0]
             values = (bracket.inscribed, bracket.ellipse, bracket.enclosing)
             cells = "  ".join(

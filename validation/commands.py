@@ -52,7 +52,7 @@ def blind(
         typer.Option(help="One sort of cases: none, faint, clear, pair or unlisted [default: a mix]."),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in --out; finished cases are taken up.")
+        bool, typer.Option("--resume", help="Continue the run in --out; completed cases are reused.")
     ] = False,
     as_json: Json = False,
 ) -> None:

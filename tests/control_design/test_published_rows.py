@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.mode_damping import PUBLISHED, damping, nominal_cost
-from benchmarks.prefilter import MODEL
+from benchmarks.reference_filter import MODEL
 from control_design import (
     PrefilterOptions,
     SynthesisOptions,

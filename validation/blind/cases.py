@@ -20,7 +20,7 @@ Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
 SORTS: tuple[Sort, ...] = ("none", "faint", "clear", "pair", "unlisted")
 Simulator = Literal["ritz", "exudyn"]
 SIMULATORS: tuple[Simulator, ...] = ("ritz", "exudyn")
-# Shares of a set of cases. The sets this imitates say nothing about the next one's mix; nor does this.
+# Shares of a set of cases. The sets this resembles say nothing about the next one's mix; nor does this.
 SHARES: dict[Sort, float] = {"none": 0.25, "clear": 0.25, "faint": 0.17, "pair": 0.17, "unlisted": 0.16}
 # Wanted largest gap over the noise.
 RANGES: dict[Sort, tuple[float, float]] = {
@@ -74,8 +74,8 @@ def schedule(
     shares = {sort: share * n_cases for sort, share in mix.items()}
     for sort, share in shares.items():
         sorts += [sort] * int(share)
-    rest = sorted(shares, key=lambda sort: -(shares[sort] % 1))
-    sorts += rest[: n_cases - len(sorts)]
+    by_remainder = sorted(shares, key=lambda sort: -(shares[sort] % 1))
+    sorts += by_remainder[: n_cases - len(sorts)]
     decks: dict[str, list[str]] = {}
     plan = []
     for k, sort in enumerate(sorts):

@@ -120,10 +120,10 @@ def regularised_fir(
         return _model(records, delay_samples, Polynomials(_ONE, np.zeros(n_taps), _ONE, _ONE))
     q, r = np.linalg.qr(regressor)
     projected = q.T @ y
-    rest = float(np.sum((y - q @ projected) ** 2))
+    unexplained = float(np.sum((y - q @ projected) ** 2))
 
     def evidence(log_time: float) -> tuple[float, RealArray]:
-        return _tuned_taps(r, projected, rest, y.size, np.exp(-1 / np.exp(log_time)))
+        return _tuned_taps(r, projected, unexplained, y.size, np.exp(-1 / np.exp(log_time)))
 
     # lam as a decay time in samples, from one sample to ten times the length of the response.
     times = np.linspace(0.0, np.log(10.0 * n_taps), 25)
@@ -134,7 +134,7 @@ def regularised_fir(
 
 
 def _tuned_taps(
-    r: RealArray, projected: RealArray, rest: float, n_samples: int, lam: float
+    r: RealArray, projected: RealArray, unexplained: float, n_samples: int, lam: float
 ) -> tuple[float, RealArray]:
     """-2 log marginal likelihood at the best alpha and noise variance for one lam, and the taps (L,)."""
     n_taps = r.shape[1]
@@ -144,7 +144,9 @@ def _tuned_taps(
     left, values, right = np.linalg.svd(np.cumsum(r, axis=1) * steps, full_matrices=False)
     target = left.T @ projected
     # Rounding would make noise-free data infinitely likely at alpha -> infinity.
-    floor = rest + float(np.sum((projected - left @ target) ** 2)) + 1e-24 * float(projected @ projected)
+    floor = (
+        unexplained + float(np.sum((projected - left @ target) ** 2)) + 1e-24 * float(projected @ projected)
+    )
 
     def deviance(log_alpha: float) -> float:
         gain = 1 + np.exp(log_alpha) * values**2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,25 +94,3 @@ class PolynomialModel:
         size = max(numerator.size, denominator.size)
         padded = [np.pad(part, (0, size - part.size)) for part in (numerator, denominator)]
         return control.tf(*padded, self.dt_s, inputs=[self.input_name], outputs=[self.output_name])
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        return {
-            "a": self.a,
-            "b": self.b,
-            "c": self.c,
-            "f": self.f,
-            "delay_samples": np.array(self.delay_samples),
-            "dt_s": np.array(self.dt_s),
-            "names": np.array([self.input_name, self.output_name]),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> PolynomialModel:
-        return cls(
-            **{key: arrays[key] for key in ("a", "b", "c", "f")},
-            delay_samples=int(arrays["delay_samples"]),
-            dt_s=float(arrays["dt_s"]),
-            input_name=str(arrays["names"][0]),
-            output_name=str(arrays["names"][1]),
-        )

@@ -1,4 +1,4 @@
-"""The four methods of the paper at order 4 on one record, and the same yardsticks for all of them."""
+"""The four methods of the paper at order 4 on one record, and the same measures for all of them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Score:
 
 
 def score(machine: PaperMachine, trial: Trial, model: LinearModel, omega_rad_s: RealArray) -> Score:
-    """The yardsticks for one model; omega (F,) covers the judged band."""
+    """The measures for one model; omega (F,) covers the judged band."""
     low, high = JUDGED_BAND_RAD_S
     inside = omega_rad_s[(omega_rad_s >= low) & (omega_rad_s <= high)]
     truth = machine.response(inside)
