@@ -241,6 +241,13 @@ class Notes(Section):
     unknown: tuple[str, ...] = ()
 
 
+class SimulationConfig(Section):
+    """The experiments of a simulated machine alone. Load with `load_simulation`."""
+
+    run: RunSection = Field(default_factory=RunSection)
+    source: SimulatedSource
+
+
 class RunConfig(Section):
     """A whole run. Load with `load_config`."""
 
@@ -365,3 +372,11 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
     expected."""
     text, document = read_toml(path)
     return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
+
+
+def load_simulation(path: Path) -> RunConfig | SimulationConfig:
+    """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_config`."""
+    _, document = read_toml(path)
+    if document.keys() <= SimulationConfig.model_fields.keys():
+        return check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
+    return load_config(path)[0]

@@ -1,28 +1,4 @@
-"""Cases as files: a folder with `case.toml`, or any TOML file beside a user's own logs.
-
-    case = "shop_arm"                   # default: name of the folder, or of the file
-    rig = "rig.toml"                    # rig file beside this one; --rig NAME chooses another
-    dt_s = 0.005                        # only where the logs have no time column
-    suspected = ["coulomb_friction"]    # effects the page should speak of in any case
-
-    [columns]                           # quantity -> column; each defaults to the quantity's own name
-    time_s = "t"
-    voltage_V = "u"
-    hub_angle_rad = { column = "encoder_deg", scale = 0.017453292519943295 }
-    tip_m = { column = "tip_mm", scale = 0.001, offset = -0.0012 }      # quantity = scale * column + offset
-
-    [[experiments]]
-    file = "logs/prbs.csv"              # csv, txt, npz or mat, relative to this file; ${NAME} is expanded
-    role = "estimation"                 # or "held_out": judges the repaired model, never fitted
-    kind = "prbs"                       # free words, shown on the page
-    closed_loop = false                 # the voltage came from a feedback (its log is still exact)
-    samples = 1400                      # checked against the file where given
-    description = ""
-    columns = { voltage_V = "u2" }      # over [columns], for this file only
-
-Every record starts from rest at zero angle; voltage, angle and tip are those of the rig's page (volts,
-radians at the hub, metres along the arc plus deflection), which is what `scale` and `offset` are for.
-"""
+"""Cases as files: `case.toml`, or a TOML file like it beside a user's own logs (docs/case_files.md)."""
 
 from __future__ import annotations
 

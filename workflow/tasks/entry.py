@@ -22,7 +22,7 @@ from workflow.config.design_options import (
     CertificateOptions,
     ReferenceFilterSettings,
 )
-from workflow.config.run_config import RunConfig, SimulatedSource, load_config
+from workflow.config.run_config import RunConfig, SimulatedSource, load_config, load_simulation
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming, need
 from workflow.engine.progress import Progress
@@ -104,7 +104,7 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises
     InputError.
     """
-    config, _ = load_config(config_path) if config_path is not None else built_in_config()
+    config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
     if not isinstance(config.source, SimulatedSource):
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
     out = Path(out)
