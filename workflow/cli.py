@@ -35,8 +35,7 @@ from workflow.engine.errors import (
     need,
     one_line,
 )
-
-_BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+from workflow.engine.threads import one_thread_unless_told
 
 app = typer.Typer(
     name="flexlink",
@@ -428,10 +427,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=RenamedKeyWarning)
         warnings.showwarning = _warn
-    if argv is None and not any(name in os.environ for name in _BLAS_THREADS):
-        # Matrices here are small: threads would only wait for one another, beside another busy process for
-        # most of the time. Read by the libraries when they load, which is after this line.
-        os.environ.update(dict.fromkeys(_BLAS_THREADS, "1"))
+    if argv is None:
+        one_thread_unless_told()  # read by the libraries when they load, which is after this line
     if not arguments:
         arguments = ["--help"]
     try:

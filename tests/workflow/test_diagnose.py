@@ -21,8 +21,8 @@ from workflow.diagnose import command, outputs
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.command import diagnose_cases
 from workflow.diagnose.outputs import Options, files_of
-from workflow.diagnose.processes import Step, perform
 from workflow.engine.errors import InputError, StageError
+from workflow.engine.executor import LocalProcesses
 from workflow.figures.style import Picture
 from workflow.report import rendering
 
@@ -192,11 +192,12 @@ def cases(tmp_path):
 def here(monkeypatch):
     """Cases in this process and without pictures: what is tested is what happens around them."""
 
-    def run_all(work, jobs, watch):
-        for index, one in enumerate(work):
-            yield index, perform(one, lambda f, m, index=index: watch(index, Step(f, m)))
+    class Here(LocalProcesses):
+        def run(self, tasks, watch):
+            for index, one in enumerate(tasks):
+                yield index, one.run(lambda f, m, index=index: watch(index, f, m))
 
-    monkeypatch.setattr(command, "run_all", run_all)
+    monkeypatch.setattr(command, "LocalProcesses", Here)
     monkeypatch.setattr(outputs, "case_page", lambda content, report: "<html></html>\n")
 
 

@@ -275,14 +275,15 @@ def test_progress_counts_points(small_study, tmp_path):
 
 def children_of(pid: int) -> list[int]:
     """Child processes, from the system's own books."""
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def is_worker(pid: int) -> bool:
     try:
-        return "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except OSError:
-        return False
+        return []
+
+
+def workers_of(pid: int) -> list[int]:
+    """Processes forked off the one that has loaded the libraries."""
+    return [worker for child in children_of(pid) for worker in children_of(child)]
 
 
 def wait_until(condition, process, seconds: float = 120.0) -> None:
@@ -299,12 +300,13 @@ def test_killed_study_resumes_with_identical_numbers_and_leaves_no_process(small
     study = write_study(tmp_path)
     process = start_flexlink("study", "--config", study, "--out", out, "--jobs", 2)
     wait_until(lambda: list(out.glob("points/*/stages/closed_loop.*")), process)
-    workers = [pid for pid in children_of(process.pid) if is_worker(pid)]
+    workers = workers_of(process.pid)
+    assert workers
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert not (out / "study.html").exists()
     deadline = time.monotonic() + 20
-    while any(is_worker(pid) for pid in workers):
+    while any(Path(f"/proc/{pid}/statm").exists() for pid in workers):
         assert time.monotonic() < deadline, "a worker outlived the study"
         time.sleep(0.05)
     run_study(study, out, resume=True, jobs=2)
@@ -316,8 +318,8 @@ def test_killed_worker_is_replaced(small_study, tmp_path):
     out = tmp_path / "out"
     process = start_flexlink("study", "--config", write_study(tmp_path), "--out", out, "--jobs", 2)
     wait_until(lambda: list(out.glob("plants/*/manifest.json")), process)
-    wait_until(lambda: len([pid for pid in children_of(process.pid) if is_worker(pid)]) >= 2, process)
-    os.kill(next(pid for pid in children_of(process.pid) if is_worker(pid)), signal.SIGKILL)
+    wait_until(lambda: len(workers_of(process.pid)) >= 2, process)
+    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _, complaint = process.communicate(timeout=120)
     assert process.returncode == 0, complaint.decode()
     assert_same_study(small_study[0], out)

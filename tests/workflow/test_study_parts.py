@@ -25,17 +25,17 @@ from tests.workflow.report_examples import achievable, sampled_responses
 from tests.workflow.study_examples import assert_same_study, write_study
 from workflow.config.run_config import RunConfig, load_config
 from workflow.config.settings import check
+from workflow.engine.executor import LocalProcesses
 from workflow.figures.study import Mark, Panel, draw_pareto
 from workflow.figures.style import PREDICTED, render
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.keys import last_name, parse_key, with_values
-from workflow.study.local import LocalProcesses
 from workflow.study.page import point_tables
 from workflow.study.points import short
 from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
-from workflow.study.task import Job, Task, run_task
+from workflow.study.task import Job, Task
 from workflow.study.toml_text import toml_text
 from workflow.tasks.entry import built_in_config
 from workflow.tasks.results import (
@@ -256,7 +256,8 @@ def test_picture_of_nothing_is_drawn():
 
 
 def test_other_code_on_the_worker_is_refused():
-    (done,) = run_task(Task((Job("p", {}, {}),), {}, ("design",), "0" * 64))
+    task = Task((Job("p", {}, {}),), {}, ("design",), "0" * 64)
+    (done,) = task.run(lambda fraction, message: None)
     assert "code of the worker is not that of the study" in str(done.failure)
 
 
@@ -271,7 +272,7 @@ def test_a_task_that_kills_its_process_fails_alone():
     harmless = Task((Job("harmless", {}, {}),), {}, ("design",), "0" * 64)
     deadly = Task((Job("deadly", {}, {}),), {"bomb": Deadly()}, ("design",), "0" * 64)
     before = os.environ.get("OMP_NUM_THREADS")
-    with LocalProcesses(2) as processes:
+    with LocalProcesses(2, preload=["workflow.study.task"]) as processes:
         found = dict(processes.run([harmless, deadly, harmless, harmless]))
     assert os.environ.get("OMP_NUM_THREADS") == before
     assert found.keys() == {0, 1, 2, 3}

@@ -15,7 +15,7 @@ from workflow.diagnose.directory import DiagnosisDirectory, diagnosis_digest
 from workflow.diagnose.document import json_text
 from workflow.diagnose.outputs import Engine, Options, made_from
 from workflow.diagnose.overview import closure_words, overview_page, short_answer
-from workflow.diagnose.processes import Finished, Step, Work, run_all
+from workflow.diagnose.processes import Finished, Work
 from workflow.diagnose.words import parameter_words, probability_words, times_noise
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
@@ -26,6 +26,7 @@ from workflow.engine.errors import (
     StageError,
     one_line,
 )
+from workflow.engine.executor import LocalProcesses
 from workflow.engine.progress import Progress, Silence
 from workflow.report.formats import listing
 from workflow.tasks.summary import Row, RunSummary, Section
@@ -170,15 +171,16 @@ def _compute(
     timings = directory.timings()
     failures: list[Failure] = []
 
-    def watch(index: int, step: Step) -> None:
-        shares[index] = step.fraction
+    def watch(index: int, fraction: float, message: str) -> None:
+        shares[index] = fraction
         name = todo[index].case.name
         done = len(loaded) - len(todo) + sum(share >= 1.0 for share in shares.values())
-        words = f"{done} of {len(loaded)} done, {name}: {step.message}" if several else step.message
+        words = f"{done} of {len(loaded)} done, {name}: {message}" if several else message
         progress.update("cases", sum(shares.values()) / len(todo), words)
 
     work = [Work(one, options, code, engine) for one in todo]
-    for index, finished in run_all(work, width, watch):
+    processes = LocalProcesses(width, preload=["workflow.diagnose.processes"])
+    for index, finished in processes.run(work, watch):
         name = todo[index].case.name
         if finished.failure is not None:
             failures.append(Failure(name, finished.failure, finished.bad_input))
@@ -187,7 +189,7 @@ def _compute(
             answers[name] = json.loads(finished.files[f"{name}.json"])
             timings[name] = _timing(finished)
             directory.write("timings.json", json_text(timings).encode())
-        watch(index, Step(1.0, "done"))
+        watch(index, 1.0, "done")
     progress.finish("cases", time.monotonic() - started, taken_up=not todo)
     order = [one.case.name for one in loaded]
     failures.sort(key=lambda failure: order.index(failure.case))

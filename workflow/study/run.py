@@ -5,41 +5,30 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from workflow.engine import storage
+from workflow.engine.cluster import DaskCluster
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
+from workflow.engine.executor import Executor, LocalProcesses
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import RunDirectory
-from workflow.study.cluster import DaskCluster
 from workflow.study.columns import COLUMNS
 from workflow.study.directory import StudyDirectory, stage_files
-from workflow.study.local import LocalProcesses
 from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point, PointMaker, load_base
 from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_without_run
 from workflow.study.search import Grid, ParzenSearch, Strategy
 from workflow.study.settings import StudyConfig, load_study
-from workflow.study.task import Done, Job, Task
+from workflow.study.task import Job, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import Row, RunSummary, Section
 
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
-
-
-class Executor(Protocol):
-    """Runs tasks somewhere; results come as they finish."""
-
-    @property
-    def width(self) -> int:
-        """How many tasks run at once."""
-
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[int, tuple[Done, ...]]]:
-        """Position and result of every task."""
 
 
 def run_study(
@@ -81,7 +70,7 @@ def run_study(
     processes = jobs or os.cpu_count() or 1
     # A cluster that does not answer is found out before anything is written.
     with ExitStack() as stack:
-        here = stack.enter_context(LocalProcesses(processes))
+        here = stack.enter_context(LocalProcesses(processes, preload=["workflow.study.task"]))
         executor: Executor = here
         if scheduler is not None:
             executor = stack.enter_context(DaskCluster(scheduler))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError, one_line
+from workflow.engine.executor import Report
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import stage_input_hash
@@ -36,20 +36,6 @@ class Job:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """Jobs for one worker, one after the other: a result two of them share is computed once.
-
-    given: stage files (name to content) that every job starts from. stages: names of those to compute.
-    code: digest of the code of whoever asks.
-    """
-
-    jobs: tuple[Job, ...]
-    given: Mapping[str, bytes]
-    stages: tuple[str, ...]
-    code: str
-
-
-@dataclass(frozen=True, eq=False)
 class Done:
     """What became of a job: stage files by name, seconds and input hash by stage; or why it failed.
 
@@ -64,36 +50,51 @@ class Done:
     bad_input: bool = False
 
 
-def run_task(task: Task) -> tuple[Done, ...]:
-    """Compute a task. Whatever goes wrong inside a job is that job's failure and nobody else's."""
-    if task.code != code_digest():
-        return failed(
-            task, "the code of the worker is not that of the study: another version, or edited meanwhile"
-        )
-    done = []
-    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        earlier: list[RunDirectory] = []
-        for job in task.jobs:
-            run = RunDirectory(Path(folder) / str(len(earlier)))
-            try:
-                seconds, hashes = _fill(run, job, task, earlier)
-                files = {path.name: path.read_bytes() for path in map(run.stage_file, task.stages) if path}
-                done.append(Done(job.name, files, seconds, hashes))
-            except InputError as error:
-                done.append(Done(job.name, {}, {}, {}, str(error), bad_input=True))
-            except StageError as error:
-                done.append(Done(job.name, {}, {}, {}, str(error)))
-            except Exception as error:
-                reason = f"internal error: {type(error).__name__}: {one_line(error)}"
-                done.append(Done(job.name, {}, {}, {}, reason))
-            earlier.append(run)
-    return tuple(done)
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Jobs for one worker, one after the other: a result two of them share is computed once.
+
+    given: stage files (name to content) that every job starts from. stages: names of those to compute.
+    code: digest of the code of whoever asks.
+    """
+
+    jobs: tuple[Job, ...]
+    given: Mapping[str, bytes]
+    stages: tuple[str, ...]
+    code: str
+
+    def run(self, report: Report) -> tuple[Done, ...]:
+        """Every job in turn. Whatever goes wrong inside a job is that job's failure and nobody else's."""
+        if self.code != code_digest():
+            return self.failed(
+                "the code of the worker is not that of the study: another version, or edited meanwhile"
+            )
+        done: list[Done] = []
+        with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
+            earlier: list[RunDirectory] = []
+            for job in self.jobs:
+                run = RunDirectory(Path(folder) / str(len(earlier)))
+                done.append(_done(job, run, self, earlier))
+                earlier.append(run)
+        return tuple(done)
+
+    def failed(self, reason: str) -> tuple[Done, ...]:
+        """Every job of the task failed for the same reason."""
+        return tuple(Done(job.name, {}, {}, {}, reason) for job in self.jobs)
 
 
-def failed(task: Task, reason: str) -> tuple[Done, ...]:
-    """Every job of the task failed for the same reason."""
-    return tuple(Done(job.name, {}, {}, {}, reason) for job in task.jobs)
+def _done(job: Job, run: RunDirectory, task: Task, earlier: list[RunDirectory]) -> Done:
+    try:
+        seconds, hashes = _fill(run, job, task, earlier)
+        files = {path.name: path.read_bytes() for path in map(run.stage_file, task.stages) if path}
+        return Done(job.name, files, seconds, hashes)
+    except InputError as error:
+        return Done(job.name, {}, {}, {}, str(error), bad_input=True)
+    except StageError as error:
+        return Done(job.name, {}, {}, {}, str(error))
+    except Exception as error:
+        reason = f"internal error: {type(error).__name__}: {one_line(error)}"
+        return Done(job.name, {}, {}, {}, reason)
 
 
 def _fill(

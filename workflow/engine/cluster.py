@@ -14,8 +14,10 @@ from importlib import import_module
 from types import TracebackType
 from typing import Any, Self
 
+from threadpoolctl import threadpool_limits
+
 from workflow.engine.errors import InputError, StageError, one_line
-from workflow.study.task import Done, Task, failed, run_task
+from workflow.engine.executor import R, Task, Watch
 
 CONNECT_S = 10.0
 WITHOUT_WORKERS_S = 60.0
@@ -27,10 +29,11 @@ _ASK_S = 2.0
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def run_on_worker(task: Task) -> tuple[Done, ...]:
-    """`run_task`, one at a time in each worker."""
-    with _ONE_AT_A_TIME:
-        return run_task(task)
+def run_on_worker(task: Task[R]) -> R:
+    """One task at a time in each worker, one thread each."""
+    with _ONE_AT_A_TIME, threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return task.run(lambda fraction, message: None)
 
 
 async def _call(distributed: Any, address: str) -> None:
@@ -43,7 +46,7 @@ class DaskCluster:
     """The workers behind a scheduler's address. Use as a context manager.
 
     A worker that dies is the scheduler's business: its task goes to another one. A scheduler that dies ends
-    the study with one line.
+    the work with one line.
 
     Raises InputError when the extra is not installed, nobody answers, or there are no workers.
     """
@@ -106,9 +109,9 @@ class DaskCluster:
         """How many tasks run at once, as far as is known."""
         return max(1, self._workers() or 1)
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[int, tuple[Done, ...]]]:
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R]]:
         """Position and result of every task, as they finish. Raises StageError when the scheduler is lost."""
-        name = uuid.uuid4().hex  # results of another study on the same cluster are not ours
+        name = uuid.uuid4().hex  # results of other work on the same cluster are not ours
         with warnings.catch_warnings():
             warnings.simplefilter(
                 "ignore"
@@ -141,17 +144,17 @@ class DaskCluster:
                 index = futures.pop(future)
                 yield index, self._result(future, tasks[index])
 
-    def _result(self, future: Any, task: Task) -> tuple[Done, ...]:
+    def _result(self, future: Any, task: Task[R]) -> R:
         try:
-            done: tuple[Done, ...] = future.result(timeout=CONNECT_S)
+            done: R = future.result(timeout=CONNECT_S)
         except self._distributed.KilledWorker:
-            return failed(task, "every worker computing it died (out of memory?)")
+            return task.failed("every worker computing it died (out of memory?)")
         except (self._distributed.client.FutureCancelledError, TimeoutError, OSError):
             raise self._lost() from None
         except Exception as error:
-            # run_task catches everything of its own: this is a worker that cannot even load it.
+            # A task catches everything of its own: this is a worker that cannot even load it.
             reason = f"{type(error).__name__}: {one_line(error)}"
-            return failed(task, f"the worker cannot run flexlink ({reason})")
+            return task.failed(f"the worker cannot run flexlink ({reason})")
         return done
 
     def _workers(self) -> int | None:

@@ -1,0 +1,174 @@
+"""Tasks somewhere else: in processes of this machine (here), or on a Dask cluster (`engine.cluster`).
+
+Every task has a fresh process, so that one that dies takes nothing else with it, and the digits do not depend
+on how many there are: each meets freshly loaded kernels.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+from workflow.engine.threads import one_thread_each
+
+R_co = TypeVar("R_co", covariant=True)
+R = TypeVar("R")
+Report = Callable[[float, str], None]
+Watch = Callable[[int, float, str], None]
+
+MOST_ATTEMPTS = 3
+
+
+class Task(Protocol[R_co]):
+    """What can be done elsewhere: a value that can be sent there."""
+
+    def run(self, report: Report) -> R_co:
+        """The result; whatever goes wrong inside is part of it."""
+
+    def failed(self, reason: str) -> R_co:
+        """The result where nobody could compute it."""
+
+
+class Executor(Protocol):
+    """Runs tasks somewhere; results come as they finish."""
+
+    @property
+    def width(self) -> int:
+        """How many tasks run at once."""
+
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R]]:
+        """Position and result of every task. watch: told position, share done and a word, where that is
+        known."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    fraction: float
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer(Generic[R]):
+    result: R
+
+
+class LocalProcesses:
+    """Up to `jobs` processes of this machine, one thread each. Use as a context manager.
+
+    A process that dies (out of memory, a crash in compiled code) leaves its task to a new one, which from the
+    second time on has the machine for itself; after three times it is the task's failure. preload: modules
+    that are loaded once for all processes, where the system can fork.
+    """
+
+    def __init__(self, jobs: int, preload: Sequence[str] = ()) -> None:
+        if jobs < 1:
+            raise ValueError(f"jobs must be at least 1, got {jobs}")
+        self._jobs = jobs
+        self._context: ForkServerContext | SpawnContext
+        if sys.platform.startswith("linux"):
+            # Forked off a process that has loaded the libraries (seconds) and done nothing else.
+            self._context = multiprocessing.get_context("forkserver")
+            self._context.set_forkserver_preload([__name__, *preload])
+        else:
+            self._context = multiprocessing.get_context("spawn")
+        self._running: dict[Connection, tuple[int, BaseProcess]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    @property
+    def width(self) -> int:
+        return self._jobs
+
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R]]:
+        """Position and result of every task, as they finish."""
+        attempts = [0] * len(tasks)
+        waiting = deque(range(len(tasks)))
+        try:
+            while waiting or self._running:
+                while waiting and self._has_room(attempts, waiting[0]):
+                    index = waiting.popleft()
+                    attempts[index] += 1
+                    self._start(index, tasks[index])
+                for connection in [one for one in wait(list(self._running)) if isinstance(one, Connection)]:
+                    index, process = self._running[connection]
+                    said: Any = None
+                    with suppress(EOFError, OSError):
+                        said = connection.recv()
+                    if isinstance(said, _Step):
+                        if watch is not None:
+                            watch(index, said.fraction, said.message)
+                        continue
+                    del self._running[connection]
+                    connection.close()
+                    process.join()
+                    if isinstance(said, _Answer):
+                        yield index, said.result
+                    elif attempts[index] < MOST_ATTEMPTS:
+                        waiting.append(index)
+                    else:
+                        reason = f"the process computing it died {attempts[index]} times (out of memory?)"
+                        yield index, tasks[index].failed(reason)
+        finally:
+            self._end()
+
+    def _has_room(self, attempts: Sequence[int], index: int) -> bool:
+        """A task whose process died runs alone, so that there is as much memory for it as can be."""
+        alone = attempts[index] > 0 or any(attempts[other] > 1 for other, _ in self._running.values())
+        return not self._running if alone else len(self._running) < self._jobs
+
+    def _start(self, index: int, task: Task[Any]) -> None:
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_work, args=(theirs, task), daemon=True)
+        with one_thread_each():
+            process.start()
+        theirs.close()
+        self._running[ours] = (index, process)
+
+    def _end(self) -> None:
+        for connection, (_, process) in self._running.items():
+            process.terminate()
+            process.join()
+            connection.close()
+        self._running.clear()
+
+
+def _work(connection: Connection, task: Task[Any]) -> None:
+    # Interrupting from the keyboard reaches every process of the terminal; only the parent answers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with_parent, args=(connection,), daemon=True).start()
+
+    def send(message: object) -> None:
+        try:
+            connection.send(message)
+        except OSError:
+            os._exit(1)  # nobody waits any more
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        send(_Answer(task.run(lambda fraction, message: send(_Step(fraction, message)))))
+
+
+def _leave_with_parent(connection: Connection) -> None:
+    """Nothing is ever sent this way: reading ends when the other end is gone, closed or killed."""
+    with suppress(EOFError, OSError):
+        connection.recv_bytes()
+    os._exit(1)
