@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -72,63 +72,6 @@ class Certificate:
     not_checked: tuple[str, ...]
     gamma_bound: float | None = None
     joint: JointCoverage | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; infinities become None inside margins and the string "inf" elsewhere."""
-        data = asdict(self)
-        for verdict, plain in zip(self.plants, data["plants"], strict=True):
-            plain["nominal_margins"] = verdict.nominal_margins.to_dict()
-            plain["worst_margins"] = verdict.worst_margins.to_dict()
-        data["joint"] = None if self.joint is None else self.joint.to_dict()
-        cleaned: dict[str, Any] = _plain(data)
-        return cleaned
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Certificate:
-        """Inverse of `to_dict`."""
-        plants = []
-        for plain in data["plants"]:
-            values = {key: _number(value) for key, value in plain.items()}
-            values["closed_loop_modes"] = tuple(Mode(**mode) for mode in plain["closed_loop_modes"])
-            values["nyquist"] = NyquistCount(**plain["nyquist"])
-            values["nominal_margins"] = Margins.from_dict(plain["nominal_margins"])
-            values["worst_margins"] = Margins.from_dict(plain["worst_margins"])
-            own = plain["own_grid_rad_s"]
-            values["own_grid_rad_s"] = None if own is None else tuple(own)
-            proof = plain.get("all_frequencies")
-            if proof is not None:
-                bounds = {kind: _number(bound) for kind, bound in proof["bounds"].items()}
-                numbers = {key: _number(value) for key, value in proof.items()}
-                values["all_frequencies"] = AllFrequencies(**(numbers | {"bounds": bounds}))
-            plants.append(PlantVerdict(**values))
-        items = [
-            SpecificationItem(**{key: _number(value) for key, value in item.items()})
-            for item in data["items"]
-        ]
-        return cls(
-            certified=bool(data["certified"]),
-            gamma=_number(data["gamma"]),
-            plants=tuple(plants),
-            items=tuple(items),
-            checked=tuple(data["checked"]),
-            not_checked=tuple(data["not_checked"]),
-            gamma_bound=_number(data.get("gamma_bound")),
-            joint=JointCoverage.from_dict(data["joint"]) if data.get("joint") else None,
-        )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return "inf" if value > 0 else "-inf" if value < 0 else "nan"
-    return value
-
-
-def _number(value: Any) -> Any:
-    return float(value) if isinstance(value, str) and value in ("inf", "-inf", "nan") else value
 
 
 def certify(

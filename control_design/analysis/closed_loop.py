@@ -3,9 +3,8 @@ machine."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Protocol
 
 import control
 import numpy as np
@@ -104,18 +103,6 @@ class ClosedLoopTrajectory:
     def measured(self) -> Real:
         """The controlled output, (T,)."""
         return self.output[:, self.measured_index]
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Plain arrays for `numpy.savez`."""
-        return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> ClosedLoopTrajectory:
-        """Inverse of `to_arrays`."""
-        values: dict[str, Any] = {f.name: np.asarray(arrays[f.name]) for f in fields(cls)}
-        values["dt_s"] = float(values["dt_s"])
-        values["measured_index"] = int(values["measured_index"])
-        return cls(**values)
 
 
 def simulate(
@@ -313,9 +300,6 @@ class StepMetrics:
     steady_error: float
     peak_command: float
     limited_fraction: float
-
-    def to_dict(self) -> dict[str, float | None]:
-        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.02) -> StepMetrics:

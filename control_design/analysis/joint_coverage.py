@@ -9,9 +9,9 @@ the worst case of ellipses at one level, found by bisection: the worst case grow
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol, Self, runtime_checkable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -65,16 +65,6 @@ class JointCoverage:
     simultaneous_given: float
     simultaneous_level: float
     stable_share: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` is the inverse."""
-        return {key: value if np.isfinite(value) else "inf" for key, value in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`."""
-        plain: dict[str, Any] = {k: float("inf") if v == "inf" else v for k, v in data.items()}
-        return cls(**plain)
 
     def sentence(self) -> str:
         """One line for a report."""

@@ -7,7 +7,7 @@ delay).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -29,14 +29,6 @@ class Margins:
     phase_rad: float
     delay_s: float
     modulus: float
-
-    def to_dict(self) -> dict[str, float | None]:
-        """JSON-able: infinity becomes None."""
-        return {f.name: (v if np.isfinite(v := getattr(self, f.name)) else None) for f in fields(self)}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, float | None]) -> Margins:
-        return cls(**{key: float("inf") if value is None else value for key, value in data.items()})
 
     def worse(self, other: Margins) -> Margins:
         """The smaller of each."""

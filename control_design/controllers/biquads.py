@@ -8,9 +8,9 @@ stable controller (apart from the wanted integrator), whatever the optimiser tri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import control
 import numpy as np
@@ -63,16 +63,19 @@ class Cascade:
         values = np.asarray(x, dtype=np.float64)
         if values.shape != (self.parameters,):
             raise ValueError(f"need {self.parameters} parameters for {self.sections}; got {values.shape}")
+        return [(np.array(top), np.array(bottom)) for top, bottom in self.split_with(values, np.exp)]
+
+    def split_with(self, x: Any, exp: Callable[[Any], Any]) -> list[tuple[list[Any], list[Any]]]:
+        """`split` of a vector of numbers or symbols."""
         pairs, at = [], 0
         for kind in self.sections:
-            n_num, n_den = _NUMERATORS[kind], _DENOMINATORS[kind]
-            numerator = values[at : at + n_num]
-            logs = values[at + n_num : at + n_num + n_den]
-            tail = np.zeros(1) if kind == "integrator" else np.exp(logs)
+            logs = at + _NUMERATORS[kind]
+            numerator = [x[i] for i in range(at, logs)]
+            tail = [exp(x[i]) for i in range(logs, logs + _DENOMINATORS[kind])]
             if kind == "notch":  # parameters: log of the numerator's damping term, then the log denominator
-                numerator = np.array([1.0, np.exp(values[at]), tail[1]])
-            pairs.append((numerator, np.concatenate([[1.0], tail])))
-            at += n_num + n_den
+                numerator = [1.0, exp(x[at]), tail[1]]
+            pairs.append((numerator, [1.0, *(tail or [0.0])]))
+            at = logs + _DENOMINATORS[kind]
         return pairs
 
     def response(self, x: Sequence[float] | Real, omega_rad_s: Real) -> Complex:

@@ -3,9 +3,7 @@ delay."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,14 +13,12 @@ import numpy as np
 import scipy.io
 import scipy.linalg
 
+from control_design.controllers.law import Law
 from control_design.plants.ellipses import Complex, Real, readonly_real
-from control_design.plants.plant_set import frequency_response
-
-_FORMAT = "flexlink-controller-1"
 
 
 @dataclass(frozen=True, eq=False)
-class Controller:
+class Controller(Law):
     """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, all SISO.
 
     A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
@@ -32,11 +28,9 @@ class Controller:
     at t_k is applied from t_{k + delay} on.
     """
 
-    A: Real
-    B: Real
-    C: Real
-    D: Real
-    dt_s: float
+    kind = "controller"
+    equations = "u = C x + D e; x+ = A x + B e + M (u_limited - u); e = reference - measurement"
+
     computational_delay_samples: int = 1
     input_limit: float | None = None
     rate_limit: float | None = None
@@ -44,17 +38,8 @@ class Controller:
     name: str = "controller"
 
     def __post_init__(self) -> None:
-        for name in ("A", "B", "C", "D"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        n = self.A.shape[0]
-        shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
-        if shapes != {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}:
-            raise ValueError(f"controller needs A (n, n), B (n, 1), C (1, n), D (1, 1); got {shapes}")
-        for name in ("A", "B", "C", "D"):
-            if not np.all(np.isfinite(getattr(self, name))):
-                raise ValueError(f"controller matrix {name} has a value that is not finite")
-        if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
-            raise ValueError(f"dt_s must be positive; got {self.dt_s}")
+        super().__post_init__()
+        n = self.order
         if not self.computational_delay_samples >= 0:
             raise ValueError(
                 f"computational_delay_samples must not be negative; got {self.computational_delay_samples}"
@@ -77,21 +62,10 @@ class Controller:
                     f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
                 )
 
-    @property
-    def order(self) -> int:
-        return int(self.A.shape[0])
-
-    @property
-    def poles(self) -> Complex:
-        """Poles in z, (n,)."""
-        if self.order == 0:
-            return np.zeros(0, dtype=np.complex128)
-        return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
-
     def response(self, omega_rad_s: Real, *, with_delay: bool = True) -> Complex:
         """K(e^{j omega dt}), (F,), times z^-delay unless with_delay is False."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        value = frequency_response(self.to_control(), omega)
+        value = super().response(omega)
         if with_delay:
             value = value * np.exp(-1j * omega * self.dt_s * self.computational_delay_samples)
         return value
@@ -112,89 +86,11 @@ class Controller:
         """A fresh machine-side instance at rest."""
         return ControllerStepper(self)
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` restores it exactly (floats are written with all their digits)."""
-        assert self.anti_windup_gain is not None
-        return {
-            "format": _FORMAT,
-            "name": self.name,
-            "law": "u = C x + D e; x+ = A x + B e + M (u_limited - u); e = reference - measurement",
-            "dt_s": self.dt_s,
-            "computational_delay_samples": self.computational_delay_samples,
-            "input_limit": self.input_limit,
-            "rate_limit": self.rate_limit,
-            "A": self.A.tolist(),
-            "B": self.B.tolist(),
-            "C": self.C.tolist(),
-            "D": self.D.tolist(),
-            "anti_windup_gain": self.anti_windup_gain.tolist(),
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Controller:
-        """Inverse of `to_dict`.
-
-        Raises
-        ------
-        ValueError
-            If it is not a controller of this format, naming the missing key.
-        """
-        if data.get("format") != _FORMAT:
-            raise ValueError(f"not a controller file: format is {data.get('format')!r}, expected {_FORMAT!r}")
-        try:
-            d = np.array(data["D"], dtype=float).reshape(1, 1)
-            a = np.array(data["A"], dtype=float)
-            n = a.shape[0] if a.size else 0
-            return cls(
-                A=a.reshape(n, n),
-                B=np.array(data["B"], dtype=float).reshape(n, 1),
-                C=np.array(data["C"], dtype=float).reshape(1, n),
-                D=d,
-                dt_s=float(data["dt_s"]),
-                computational_delay_samples=int(data["computational_delay_samples"]),
-                input_limit=data["input_limit"],
-                rate_limit=data["rate_limit"],
-                anti_windup_gain=np.array(data["anti_windup_gain"], dtype=float).reshape(n, 1),
-                name=str(data["name"]),
-            )
-        except KeyError as error:
-            raise ValueError(f"controller file lacks the key {error.args[0]!r}") from error
-
-    def to_json(self) -> str:
-        """Readable JSON text."""
-        return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-
-    @classmethod
-    def from_json(cls, text: str) -> Controller:
-        """Inverse of `to_json`; ValueError with one line on bad input."""
-        try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(
-                f"controller JSON: {error.msg} at line {error.lineno}, column {error.colno}"
-            ) from error
-        if not isinstance(data, dict):
-            raise ValueError(f"controller JSON must be an object; got {type(data).__name__}")
-        return cls.from_dict(data)
-
     def save_mat(self, file: str | PathLike[str] | BinaryIO) -> None:
         """MATLAB 5 file (path or stream) with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
-        none = float("inf")
-        scipy.io.savemat(
-            Path(file) if isinstance(file, (str, PathLike)) else file,  # type: ignore[arg-type]  # streams, too
-            {
-                "A": self.A,
-                "B": self.B,
-                "C": self.C,
-                "D": self.D,
-                "anti_windup_gain": self.anti_windup_gain,
-                "dt_s": self.dt_s,
-                "computational_delay_samples": self.computational_delay_samples,
-                "input_limit": none if self.input_limit is None else self.input_limit,
-                "rate_limit": none if self.rate_limit is None else self.rate_limit,
-                "name": self.name,
-            },
-        )
+        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        plain = {name: float("inf") if value is None else value for name, value in values.items()}
+        scipy.io.savemat(Path(file) if isinstance(file, (str, PathLike)) else file, plain)  # type: ignore[arg-type]
 
     @classmethod
     def load_mat(cls, path: str | PathLike[str]) -> Controller:

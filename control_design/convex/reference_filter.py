@@ -9,16 +9,10 @@ of one.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
-from pathlib import Path
-from typing import Any
 
-import control
 import numpy as np
-import scipy.io
 import scipy.optimize
 import scipy.signal
 from pydantic import BaseModel, ConfigDict, Field
@@ -26,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
+from control_design.controllers.law import Law
 from control_design.convex.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
 from control_design.convex.orthonormal_basis import basis_response, basis_state_space
 from control_design.plants.ellipses import (
@@ -35,13 +30,11 @@ from control_design.plants.ellipses import (
     distance_to_minus_one,
     farthest_distance,
     nearest_distance,
-    readonly_real,
 )
 from control_design.plants.frequency_grid import frequency_grid, local_maxima, plant_grid
-from control_design.plants.plant_set import UncertainPlant, frequency_response
+from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
 
-_FORMAT = "flexlink-prefilter-1"
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
 
 
@@ -68,7 +61,7 @@ class PrefilterOptions(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Prefilter:
+class Prefilter(Law):
     """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable.
 
     A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. error_before, error_after: largest weighted
@@ -76,44 +69,20 @@ class Prefilter:
     the dense grid; worst_rad_s: where the second occurs.
     """
 
-    A: Real
-    B: Real
-    C: Real
-    D: Real
-    dt_s: float
+    kind = "prefilter"
+    equations = "x+ = A x + B r; filtered reference = C x + D r"
+
     error_before: float
     error_after: float
     worst_rad_s: float
 
     def __post_init__(self) -> None:
-        for name in ("A", "B", "C", "D"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        n = self.A.shape[0]
-        shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
-        if shapes != {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}:
-            raise ValueError(f"prefilter needs A (n, n), B (n, 1), C (1, n), D (1, 1); got {shapes}")
-        for name in ("A", "B", "C", "D"):
-            if not np.all(np.isfinite(getattr(self, name))):
-                raise ValueError(f"prefilter matrix {name} has a value that is not finite")
-        if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
-            raise ValueError(f"dt_s must be positive; got {self.dt_s}")
-        if n and not np.max(np.abs(np.linalg.eigvals(self.A))) < 1:
+        super().__post_init__()
+        if self.order and not np.max(np.abs(self.poles)) < 1:
             raise ValueError("the prefilter is not stable")
         for name in ("error_before", "error_after", "worst_rad_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"prefilter {name} must not be negative; got {getattr(self, name)}")
-
-    @property
-    def order(self) -> int:
-        return int(self.A.shape[0])
-
-    def to_control(self) -> control.StateSpace:
-        """As `control.StateSpace`."""
-        return control.ss(np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D), self.dt_s)
-
-    def response(self, omega_rad_s: Real) -> Complex:
-        """F(e^{j omega dt}), (F,)."""
-        return frequency_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
 
     def filtered(self, reference: Real) -> Real:
         """The reference (T,) behind the prefilter, from rest: what `closed_loop.simulate` takes as
@@ -127,57 +96,6 @@ class Prefilter:
             out[index] = c @ state + d * value
             state = self.A @ state + b * value
         return out
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` restores it exactly."""
-        matrices = {name: getattr(self, name).tolist() for name in ("A", "B", "C", "D")}
-        numbers = {n: getattr(self, n) for n in ("dt_s", "error_before", "error_after", "worst_rad_s")}
-        return {
-            "format": _FORMAT,
-            "law": "x+ = A x + B r; filtered reference = C x + D r",
-            **matrices,
-            **numbers,
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Prefilter:
-        """Inverse of `to_dict`; ValueError naming the missing key."""
-        if data.get("format") != _FORMAT:
-            raise ValueError(f"not a prefilter file: format is {data.get('format')!r}, expected {_FORMAT!r}")
-        try:
-            n = np.array(data["C"], dtype=float).size
-            return cls(
-                np.array(data["A"], dtype=float).reshape(n, n),
-                np.array(data["B"], dtype=float).reshape(n, 1),
-                np.array(data["C"], dtype=float).reshape(1, n),
-                np.array(data["D"], dtype=float).reshape(1, 1),
-                float(data["dt_s"]),
-                float(data["error_before"]),
-                float(data["error_after"]),
-                float(data["worst_rad_s"]),
-            )
-        except KeyError as error:
-            raise ValueError(f"prefilter file lacks the key {error.args[0]!r}") from error
-
-    def to_json(self) -> str:
-        """Readable JSON text."""
-        return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-
-    @classmethod
-    def from_json(cls, text: str) -> Prefilter:
-        """Inverse of `to_json`; ValueError with one line on bad input."""
-        try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"prefilter JSON: {error.msg} at line {error.lineno}") from error
-        if not isinstance(data, dict):
-            raise ValueError(f"prefilter JSON must be an object; got {type(data).__name__}")
-        return cls.from_dict(data)
-
-    def save_mat(self, path: str | PathLike[str]) -> None:
-        """MATLAB 5 file with A, B, C, D, dt_s and the certified errors."""
-        data = self.to_dict()
-        scipy.io.savemat(Path(path), {key: data[key] for key in data if key not in ("format", "law")})
 
 
 def worst_matching_error(

@@ -16,9 +16,9 @@ the example link from 57 to 91 functions): that is how far the lower bound of a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import control
 import numpy as np
@@ -137,26 +137,6 @@ class YoulaBracket:
             reach = f"a controller of any order is known to reach {self.ellipse:.4g}"
         word = f"{share:.2g} % above" if share >= 0 else f"{-share:.2g} % below"
         return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; {floor}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; inf as None."""
-        return {
-            "plants": [
-                {key: None if value == float("inf") else value for key, value in asdict(plant).items()}
-                for plant in self.plants
-            ]
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> YoulaBracket:
-        """Inverse of `to_dict`."""
-        read: list[PlantBracket] = []
-        for plant in data["plants"]:
-            known: dict[str, Any] = {
-                k: float("inf") if value is None else value for k, value in plant.items()
-            }
-            read.append(PlantBracket(**known))
-        return cls(tuple(read))
 
 
 def youla_bracket(

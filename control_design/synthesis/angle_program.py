@@ -158,35 +158,12 @@ class AngleProgram:
         size = np.maximum(1.0, v)
         re: Symbol = ca.SX.ones(omega.size)
         im: Symbol = ca.SX.zeros(omega.size)
-        num: tuple[Symbol, Symbol]
-        den: tuple[Symbol, Symbol]
-        at = 0
-        for kind in self.cascade.sections:
-            if kind == "second_order":
-                n2, n1, n0, a, b = (x[at + i] for i in range(5))
-                at += 5
-                w2, w1, w0 = (v / size) ** 2, v / size**2, 1 / size**2
-                num = -n2 * w2 + n0 * w0, n1 * w1
-                den = -w2 + ca.exp(b) * w0, ca.exp(a) * w1
-            elif kind == "notch":
-                c, a, b = x[at], x[at + 1], x[at + 2]
-                at += 3
-                w2, w1, w0 = (v / size) ** 2, v / size**2, 1 / size**2
-                num = -w2 + ca.exp(b) * w0, ca.exp(c) * w1
-                den = -w2 + ca.exp(b) * w0, ca.exp(a) * w1
-            else:
-                n1, n0 = x[at], x[at + 1]
-                at += 2
-                w1, w0 = v / size, 1 / size
-                num = n0 * w0, n1 * w1
-                if kind == "first_order":
-                    den = ca.exp(x[at]) * w0, ca.SX(w1)
-                    at += 1
-                else:
-                    den = ca.SX(np.zeros(omega.size)), ca.SX(w1)
-            square = den[0] ** 2 + den[1] ** 2
-            f_re = (num[0] * den[0] + num[1] * den[1]) / square
-            f_im = (num[1] * den[0] - num[0] * den[1]) / square
+        for numerator, denominator in self.cascade.split_with(x, ca.exp):
+            # Of degree 2 or 1, both divided by the same power of max(1, |p|).
+            (n_re, n_im), (d_re, d_im) = (_over(part, v, size) for part in (numerator, denominator))
+            square = d_re**2 + d_im**2
+            f_re = (n_re * d_re + n_im * d_im) / square
+            f_im = (n_im * d_re - n_re * d_im) / square
             re, im = re * f_re - im * f_im, re * f_im + im * f_re
         return re, im
 
@@ -213,6 +190,14 @@ class AngleProgram:
         return NlpPoint(
             values[:n], float(values[n]), tuple(angles), str(stats["return_status"]), int(stats["iter_count"])
         )
+
+
+def _over(coefficients: Sequence[Symbol], v: Real, size: Real) -> tuple[Symbol, Symbol]:
+    """Real and imaginary part of a polynomial at p = jv, highest power first, over size^degree."""
+    if len(coefficients) == 2:
+        return coefficients[1] * (1 / size), coefficients[0] * (v / size)
+    two, one, zero = coefficients
+    return -two * (v / size) ** 2 + zero * (1 / size**2), one * (v / size**2)
 
 
 def parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:

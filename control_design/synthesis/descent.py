@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.plants.ellipses import Complex, Real
@@ -259,7 +260,7 @@ class _Boundary:
             else:
                 shared[at] += own
         more, factor = self._bent(relative, k, shared, self._nearest(k), np.zeros(k.size))
-        return total + more + self._section_curvature(x, relative, second + factor + of_controller)
+        return total + more + self._section_curvature(x, second + factor + of_controller)
 
     @staticmethod
     def _bent(
@@ -343,61 +344,46 @@ class _Boundary:
             angle = angle + np.clip(change, -0.5 * width, 0.5 * width)
         return member(best)
 
-    def _section_curvature(self, x: Real, relative: Complex, factor: Complex) -> Real:
-        """Real part of sum factor (F,) times the second derivative of log K, (n, n): block by section."""
+    def _sections(self, x: Real) -> list[tuple[Complex, Complex, Complex]]:
+        """Of every section, for its own parameters (F, m): derivatives of its numerator over the numerator,
+        of its denominator over the denominator, and second derivatives of log K but for products of those."""
         p = self._powers
-        total = np.zeros((x.size, x.size))
-        at = 0
-        for kind, (numerator, denominator) in zip(
-            self._cascade.sections, self._cascade.split(x), strict=True
-        ):
-            if kind == "notch":
-                top, bottom = np.polyval(numerator, p), np.polyval(denominator, p)
-                top = np.where(np.abs(top) < 1e-300, 1e-300, top)
-                in_top = np.stack([np.exp(x[at]) * p / top, 0 * p, denominator[2] / top], axis=1)
-                in_bottom = np.stack([0 * p, denominator[1] * p / bottom, denominator[2] / bottom], axis=1)
-                block = np.real(
-                    (in_bottom * factor[:, None]).T @ in_bottom - (in_top * factor[:, None]).T @ in_top
-                )
-                block += np.diag(np.real(factor @ (in_top - in_bottom)))
-                total[at : at + 3, at : at + 3] = block
-                at += 3
-                continue
-            n = numerator.size
-            tops = relative[:, at : at + n]
-            total[at : at + n, at : at + n] = -np.real((tops * factor[:, None]).T @ tops)
-            at += n
-            m = 0 if kind == "integrator" else n - 1
-            if m:
-                bottoms = relative[:, at : at + m]
-                block = np.real((bottoms * factor[:, None]).T @ bottoms)
-                total[at : at + m, at : at + m] = block + np.diag(np.real(factor @ bottoms))
-                at += m
-        return total
-
-    def _relative_slope(self, x: Real) -> Complex:
-        """(dK/dx)/K, (F, n)."""
-        p = self._powers
-        columns: list[Complex] = []
-        at = 0
+        found, at = [], 0
         for kind, (numerator, denominator) in zip(
             self._cascade.sections, self._cascade.split(x), strict=True
         ):
             top, bottom = np.polyval(numerator, p), np.polyval(denominator, p)
             top = np.where(np.abs(top) < 1e-300, 1e-300, top)
-            if kind == "notch":
-                columns.append(np.exp(x[at]) * p / top)
-                columns.append(-denominator[1] * p / bottom)
-                columns.append(denominator[2] * (1.0 / top - 1.0 / bottom))
-                at += 3
-                continue
+            zero = np.zeros(p.size, dtype=np.complex128)
             degree = numerator.size - 1
-            columns += [p ** (degree - power) / top for power in range(degree + 1)]
-            at += degree + 1
-            if kind != "integrator":
-                columns += [-denominator[1 + j] * p ** (degree - 1 - j) / bottom for j in range(degree)]
-                at += degree
-        return np.stack(columns, axis=1)
+            if kind == "notch":
+                above = [np.exp(x[at]) * p / top, zero, denominator[2] / top]
+                below = [zero, denominator[1] * p / bottom, denominator[2] / bottom]
+                linear = 0
+            else:
+                above = [p ** (degree - power) / top for power in range(degree + 1)]
+                logs = range(0 if kind == "integrator" else degree)
+                below = [denominator[1 + j] * p ** (degree - 1 - j) / bottom for j in logs]
+                linear = len(above)
+                above, below = above + [zero] * len(below), [zero] * len(above) + below
+            tops, bottoms = np.stack(above, axis=1), np.stack(below, axis=1)
+            bend = tops - bottoms  # parameters are logarithms: exp is its own derivative
+            bend[:, :linear] = 0
+            found.append((tops, bottoms, bend))
+            at += tops.shape[1]
+        return found
+
+    def _section_curvature(self, x: Real, factor: Complex) -> Real:
+        """Real part of sum factor (F,) times the second derivative of log K, (n, n): block by section."""
+        blocks = []
+        for tops, bottoms, bend in self._sections(x):
+            product = (bottoms * factor[:, None]).T @ bottoms - (tops * factor[:, None]).T @ tops
+            blocks.append(np.real(product) + np.diag(np.real(factor @ bend)))
+        return np.asarray(block_diag(*blocks))
+
+    def _relative_slope(self, x: Real) -> Complex:
+        """(dK/dx)/K, (F, n)."""
+        return np.concatenate([tops - bottoms for tops, bottoms, _ in self._sections(x)], axis=1)
 
 
 def natural_units(cascade: Cascade, x: Real) -> Real:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any
-
-import numpy as np
 
 from control_design.controllers.controller import Controller
 
@@ -113,31 +110,3 @@ class SynthesisResult:
         if self.outcome is not Outcome.MET_ON_GRID:
             raise SynthesisError(self.explain(), self)
         return self.controller
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        data = asdict(self) | {"outcome": self.outcome.name, "controller": self.controller.to_dict()}
-        data["gamma"] = self.gamma if np.isfinite(self.gamma) else None
-        data["gamma_history"] = [g if np.isfinite(g) else None for g in self.gamma_history]
-        data["blocking"] = [
-            asdict(b) | {"value": b.value if np.isfinite(b.value) else None} for b in self.blocking
-        ]
-        data["starts"] = [asdict(start) for start in self.starts]
-        return data
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> SynthesisResult:
-        """Inverse of `to_dict`."""
-
-        def number(value: float | None) -> float:
-            return float("inf") if value is None else value
-
-        return cls(
-            outcome=Outcome[data["outcome"]],
-            controller=Controller.from_dict(data["controller"]),
-            gamma=number(data["gamma"]),
-            blocking=tuple(BlockingPoint(**(b | {"value": number(b["value"])})) for b in data["blocking"]),
-            starts=tuple(StartReport(**start) for start in data["starts"]),
-            gamma_history=tuple(number(g) for g in data["gamma_history"]),
-            grid_points=int(data["grid_points"]),
-        )

@@ -92,14 +92,6 @@ def test_bad_signals_are_refused():
         LinearMachine(control.ss(0.5, 1, 1, 1, 0.1))
 
 
-def test_trajectory_round_trip():
-    trajectory = simulate(_controller(), LinearMachine(hub_arm()), np.ones(20))
-    copy = ClosedLoopTrajectory.from_arrays(trajectory.to_arrays())
-    for name, value in trajectory.to_arrays().items():
-        np.testing.assert_array_equal(getattr(copy, name), value)
-        assert value.dtype != object
-
-
 def test_step_metrics_of_a_known_second_order_response():
     """zeta 0.5, omega 10: overshoot exp(-pi zeta/sqrt(1 - zeta^2)) = 16.30 %; the rest by python-control."""
     system = control.tf([100], [1, 10, 100])

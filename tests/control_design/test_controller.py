@@ -96,7 +96,7 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
         ("{", "line 1, column 2"),
         ("[]", "must be an object"),
         ("{}", "expected 'flexlink-controller-1'"),
-        ('{"format": "flexlink-controller-1", "A": []}', "lacks the key 'D'"),
+        ('{"format": "flexlink-controller-1", "A": []}', "lacks the key 'B'"),
     ],
 )
 def test_files_that_are_no_controller_are_refused(text, message):

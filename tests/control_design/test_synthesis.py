@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import control
 import numpy as np
 import pytest
@@ -15,12 +13,12 @@ from control_design import (
     SpecificationError,
     SynthesisError,
     SynthesisOptions,
-    SynthesisResult,
     UncertainPlant,
     certify,
     synthesise,
 )
 from validation.example_plants import flexible_link, flexible_link_specification
+from workflow.engine import codec
 
 from .plants import RelativeDisc, hub_arm, tip_acceleration
 
@@ -66,17 +64,14 @@ def test_link_scenarios_at_order_5_with_the_default_search(scenario, limit):
     assert certificate.gamma <= limit
 
 
-def test_same_seed_same_controller_and_result_round_trips():
+def test_same_seed_same_controller():
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
     results = [synthesise([_hub()], specification, _QUICK, rng=np.random.default_rng(5)) for _ in range(2)]
     for name in ("A", "B", "C", "D"):
         np.testing.assert_array_equal(
             getattr(results[0].controller, name), getattr(results[1].controller, name)
         )
-    text = json.dumps(results[0].to_dict(), allow_nan=False)
-    copy = SynthesisResult.from_dict(json.loads(text))
-    assert copy.to_dict() == results[0].to_dict()
-    assert copy.gamma == results[0].gamma
+    assert codec.plain(results[0]) == codec.plain(results[1])
 
 
 @pytest.mark.parametrize("integrators", [1, 2])
@@ -169,8 +164,6 @@ def test_without_a_stable_design_the_unstable_pole_is_named():
     assert "stability of the nominal loop of 'unruly' at" in result.explain()
     with pytest.raises(SynthesisError, match="no start led to a stable loop"):
         result.controller_or_raise()
-    copy = SynthesisResult.from_dict(json.loads(json.dumps(result.to_dict(), allow_nan=False)))
-    assert copy.blocking == result.blocking
 
 
 def test_contradictions_are_refused_before_any_optimisation():

@@ -1,0 +1,101 @@
+"""What controller and reference filter have in common: a checked SISO state space, kept as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
+
+import control
+import numpy as np
+
+from control_design.plants.ellipses import Complex, Real, readonly_real
+from control_design.plants.plant_set import frequency_response
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """x+ = A x + B e, C x + D e: A (n, n), B (n, 1), C (1, n), D (1, 1), read-only; dt_s > 0."""
+
+    kind: ClassVar[str]
+    equations: ClassVar[str]
+
+    A: Real
+    B: Real
+    C: Real
+    D: Real
+    dt_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("A", "B", "C", "D"):
+            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        n = self.A.shape[0]
+        shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
+        if shapes != {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}:
+            raise ValueError(f"{self.kind} needs A (n, n), B (n, 1), C (1, n), D (1, 1); got {shapes}")
+        for name in ("A", "B", "C", "D"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise ValueError(f"{self.kind} matrix {name} has a value that is not finite")
+        if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
+            raise ValueError(f"dt_s must be positive; got {self.dt_s}")
+
+    @property
+    def order(self) -> int:
+        return int(self.A.shape[0])
+
+    @property
+    def poles(self) -> Complex:
+        """Poles in z, (n,)."""
+        if self.order == 0:
+            return np.zeros(0, dtype=np.complex128)
+        return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
+
+    def to_control(self) -> control.StateSpace:
+        """As `control.StateSpace`."""
+        return control.ss(np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D), self.dt_s)
+
+    def response(self, omega_rad_s: Real) -> Complex:
+        """Response at z = e^{j omega dt}, (F,)."""
+        return frequency_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; `from_dict` restores it exactly (floats are written with all their digits)."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        plain = {
+            key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in values.items()
+        }
+        return {"format": f"flexlink-{self.kind}-1", "law": self.equations, **plain}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`; ValueError if it is not of this format, naming a key it lacks."""
+        known = f"flexlink-{cls.kind}-1"
+        if data.get("format") != known:
+            raise ValueError(f"not a {cls.kind} file: format is {data.get('format')!r}, expected {known!r}")
+        missing = [field.name for field in fields(cls) if field.name not in data]
+        if missing:
+            raise ValueError(f"{cls.kind} file lacks the key {missing[0]!r}")
+        n = np.size(data["C"])
+        shapes = {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1), "anti_windup_gain": (n, 1)}
+        values: dict[str, Any] = {field.name: data[field.name] for field in fields(cls)}
+        for name in shapes.keys() & values.keys():
+            values[name] = np.array(values[name], dtype=float).reshape(shapes[name])
+        values["dt_s"] = float(values["dt_s"])
+        return cls(**values)
+
+    def to_json(self) -> str:
+        """Readable JSON text."""
+        return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Inverse of `to_json`; ValueError with one line on bad input."""
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            place = f"line {error.lineno}, column {error.colno}"
+            raise ValueError(f"{cls.kind} JSON: {error.msg} at {place}") from error
+        if not isinstance(data, dict):
+            raise ValueError(f"{cls.kind} JSON must be an object; got {type(data).__name__}")
+        return cls.from_dict(data)
