@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -95,62 +94,6 @@ class FrfIdentification:
     def warnings(self) -> tuple[str, ...]:
         """What to look at before trusting the model, one sentence each."""
         return self.search.warnings
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        arrays: dict[str, np.ndarray[Any, Any]] = {
-            name: getattr(self, name)
-            for name in (
-                "omega_rad_s",
-                "residual",
-                "distance",
-                "decay_std_per_s",
-                "omega_std_rad_s",
-                "zeta_std",
-            )
-        }
-        arrays["rss"] = np.array(self.rss)
-        arrays["degrees_of_freedom"] = np.array(self.degrees_of_freedom)
-        arrays["order_counts"] = np.array([(s.n_real, s.n_pairs) for s in self.order_table]).reshape(-1, 2)
-        arrays["order_values"] = np.array([(s.rss, s.criterion) for s in self.order_table]).reshape(-1, 2)
-        arrays["verdicts"] = np.array(self.verdicts, dtype=np.str_)
-        for prefix, part in (
-            ("model_", self.model.to_arrays()),
-            ("posterior_", self.posterior.to_arrays()),
-            ("search_", self.search.to_arrays()),
-        ):
-            arrays |= {prefix + key: value for key, value in part.items()}
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Self:
-        """Inverse of `to_arrays`."""
-
-        def under(prefix: str) -> dict[str, np.ndarray[Any, Any]]:
-            return {
-                key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)
-            }
-
-        return cls(
-            model=GobfModel.from_arrays(under("model_")),
-            posterior=ResponsePosterior.from_arrays(under("posterior_")),
-            omega_rad_s=arrays["omega_rad_s"],
-            residual=arrays["residual"],
-            distance=arrays["distance"],
-            rss=float(arrays["rss"]),
-            degrees_of_freedom=int(arrays["degrees_of_freedom"]),
-            decay_std_per_s=arrays["decay_std_per_s"],
-            omega_std_rad_s=arrays["omega_std_rad_s"],
-            zeta_std=arrays["zeta_std"],
-            order_table=tuple(
-                OrderStep(int(n_real), int(n_pairs), float(rss), float(criterion))
-                for (n_real, n_pairs), (rss, criterion) in zip(
-                    arrays["order_counts"], arrays["order_values"], strict=True
-                )
-            ),
-            verdicts=tuple(str(item) for item in arrays["verdicts"]),
-            search=SearchTrace.from_arrays(under("search_")),
-        )
 
 
 def identify_frf(

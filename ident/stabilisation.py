@@ -12,9 +12,9 @@ where they are, Ne ln(J0/J1) must exceed 4 ln Ne, the criterion by which `identi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -121,16 +121,6 @@ class Stabilisation:
                 omega, zeta = np.mean(self.omega_rad_s[here]), np.mean(self.zeta[here])
                 modes.append(StableMode(float(omega), float(zeta), int(here.size)))
         return tuple(sorted(modes))
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        return {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Stabilisation:
-        """Inverse of `to_arrays`."""
-        values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
-        return cls(**(values | {name: int(values[name]) for name in ("n_real", "chosen")}))
 
 
 def stabilisation(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import comb
 from typing import Any
@@ -140,32 +139,4 @@ class MisoModel:
             inputs=list(self.input_names),
             outputs=[self.output_name],
             remove_useless_states=False,
-        )
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        return {
-            "poles_real": self.poles.real,
-            "poles_pairs": self.poles.pairs,
-            "coefficients": self.coefficients,
-            "feedthrough": self.feedthrough,
-            "dt_s": np.array(self.dt_s),
-            "integrators": np.array(self.integrators),
-            "input_delay_samples": np.array(self.input_delay_samples),
-            "names": np.array([*self.input_names, self.output_name], dtype=np.str_),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> MisoModel:
-        """Inverse of `to_arrays`."""
-        *inputs, output = (str(name) for name in arrays["names"])
-        return cls(
-            poles=Poles(arrays["poles_real"], arrays["poles_pairs"]),
-            coefficients=arrays["coefficients"],
-            feedthrough=arrays["feedthrough"],
-            dt_s=float(arrays["dt_s"]),
-            input_names=tuple(inputs),
-            output_name=output,
-            integrators=int(arrays["integrators"]),
-            input_delay_samples=int(arrays["input_delay_samples"]),
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,29 +148,3 @@ class GobfModel:
         """Output (T,) for the input u (T,), from rest."""
         filtered = filter_input(u, self.integrators, self.input_delay_samples)
         return np.asarray(regressor(self.poles, filtered) @ self.coefficients + self.feedthrough * filtered)
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        return {
-            "poles_real": self.poles.real,
-            "poles_pairs": self.poles.pairs,
-            "coefficients": self.coefficients,
-            "dt_s": np.array(self.dt_s),
-            "feedthrough": np.array(self.feedthrough),
-            "integrators": np.array(self.integrators),
-            "input_delay_samples": np.array(self.input_delay_samples),
-            "names": np.array([self.input_name, self.output_name]),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> GobfModel:
-        return cls(
-            poles=Poles(arrays["poles_real"], arrays["poles_pairs"]),
-            coefficients=arrays["coefficients"],
-            dt_s=float(arrays["dt_s"]),
-            feedthrough=float(arrays["feedthrough"]),
-            integrators=int(arrays["integrators"]),
-            input_delay_samples=int(arrays["input_delay_samples"]),
-            input_name=str(arrays["names"][0]),
-            output_name=str(arrays["names"][1]),
-        )

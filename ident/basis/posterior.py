@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -183,45 +181,3 @@ class ResponsePosterior:
         Those of `at` at the `joint_level`: their squared radius is 12 to 13 where that of one alone is 5.99.
         """
         return self.at(omega_rad_s, self.joint_level(omega_rad_s, level, rng, n_draws))
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Plain arrays for `np.savez`; `from_arrays` gives back exactly this record."""
-        arrays: dict[str, npt.NDArray[Any]] = {
-            "poles_real": self.poles.real,
-            "poles_pairs": self.poles.pairs,
-            "mean": self.mean,
-            "covariance_factor": self.covariance_factor,
-            "dt_s": np.array(self.dt_s),
-            "names": np.array([self.input_name, self.output_name]),
-        }
-        for name in ("fir_length", "has_feedthrough", "integrators", "input_delay_samples"):
-            arrays[name] = np.array(getattr(self, name))
-        if self.report is not None:
-            arrays |= {
-                f"report_{f.name}": np.array(getattr(self.report, f.name)) for f in fields(EmbeddingReport)
-            }
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[Any]]) -> Self:
-        """Inverse of `to_arrays`."""
-        report = None
-        if "report_method" in mapping:
-            # A report written before a field existed has its default.
-            names = {f.name for f in fields(EmbeddingReport) if f"report_{f.name}" in mapping}
-            values = {name: mapping[f"report_{name}"] for name in names}
-            numbers = {name: value.item() for name, value in values.items() if name != "ar_coefficients"}
-            report = EmbeddingReport(**numbers, ar_coefficients=tuple(values["ar_coefficients"].tolist()))
-        return cls(
-            poles=Poles(mapping["poles_real"], mapping["poles_pairs"]),
-            mean=mapping["mean"],
-            covariance_factor=mapping["covariance_factor"],
-            dt_s=float(mapping["dt_s"]),
-            fir_length=int(mapping["fir_length"]),
-            has_feedthrough=bool(mapping["has_feedthrough"]),
-            integrators=int(mapping["integrators"]),
-            input_delay_samples=int(mapping["input_delay_samples"]),
-            input_name=str(mapping["names"][0]),
-            output_name=str(mapping["names"][1]),
-            report=report,
-        )

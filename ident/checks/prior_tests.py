@@ -12,9 +12,8 @@ was left to the data (`relative_degree = "auto"`) is imposed only as far as the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -52,23 +51,6 @@ class PriorTest:
     limit: float
     degrees_of_freedom: int
     verdict: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` is the inverse."""
-        return {
-            "prior": self.prior,
-            "refused": self.refused,
-            "imposed": self.imposed,
-            "statistic": self.statistic,
-            "limit": self.limit,
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "verdict": self.verdict,
-        }
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> PriorTest:
-        """Inverse of `to_dict`."""
-        return cls(**document)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
 
 import numpy as np
 from scipy.signal import correlate
@@ -37,18 +36,6 @@ class ResidualTest:
             object.__setattr__(self, name, readonly_real(getattr(self, name)))
         if not (self.lags.shape == self.correlation.shape == self.band.shape and self.lags.ndim == 1):
             raise ValueError("lags, correlation and band must be (K,) arrays")
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` is the inverse."""
-        lists = {name: getattr(self, name).tolist() for name in ("lags", "correlation", "band")}
-        rest = {name: getattr(self, name) for name in ("name", "level", "probability", "passed", "verdict")}
-        return lists | rest
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`."""
-        lists = {name: np.array(document[name], dtype=np.float64) for name in ("lags", "correlation", "band")}
-        return cls(**(dict(document) | lists))
 
 
 def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99) -> ResidualTest:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol, Self
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -59,20 +59,6 @@ class FreshFit:
     def __post_init__(self) -> None:
         for name in ("simulated", "residual"):
             object.__setattr__(self, name, readonly_real(getattr(self, name)))
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays; `from_arrays` is the inverse."""
-        return {
-            "name": np.array(self.name),
-            "fit_percent": np.array(self.fit_percent),
-            "simulated": self.simulated,
-            "residual": self.residual,
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Self:
-        """Inverse of `to_arrays`."""
-        return cls(str(arrays["name"]), float(arrays["fit_percent"]), arrays["simulated"], arrays["residual"])
 
 
 def fit_on_fresh_data(
@@ -133,18 +119,6 @@ class Invalidation:
     def __post_init__(self) -> None:
         for name in ("omega_rad_s", "distance", "probability"):
             object.__setattr__(self, name, readonly_real(getattr(self, name)))
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` is the inverse."""
-        arrays = {name: getattr(self, name).tolist() for name in ("omega_rad_s", "distance", "probability")}
-        names = ("level", "n_outside", "worst_omega_rad_s", "joint_probability", "invalidated", "verdict")
-        return arrays | {name: getattr(self, name) for name in names}
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`."""
-        arrays = {name: np.array(document[name]) for name in ("omega_rad_s", "distance", "probability")}
-        return cls(**(dict(document) | arrays))
 
 
 def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) -> Invalidation:
@@ -215,10 +189,6 @@ class ScatterRow:
     degrees_of_freedom: float = float("nan")
     ratio_low: float = float("nan")
     ratio_high: float = float("nan")
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able (NaN where there is one group only)."""
-        return asdict(self)
 
 
 def repeat_scatter(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -59,27 +59,6 @@ class ErrorSurface:
         found = np.argwhere(lowest)
         order = np.argsort(inner[lowest], kind="stable")
         return [(int(i), int(j)) for i, j in found[order]]
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        return {
-            "first": self.first,
-            "second": self.second,
-            "names": np.array(self.names),
-            "mean_square": self.mean_square,
-            "pole": np.array(self.pole),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> ErrorSurface:
-        first, second = (str(name) for name in arrays["names"])
-        return cls(
-            arrays["first"],
-            arrays["second"],
-            (first, second),
-            arrays["mean_square"],
-            (float(arrays["pole"][0]), float(arrays["pole"][1])),
-        )
 
 
 def error_surface(

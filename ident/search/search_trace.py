@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray, readonly_real
@@ -61,47 +57,3 @@ class SearchTrace:
     minima: tuple[PolishedMinimum, ...]
     warnings: tuple[str, ...]
     evaluations: int
-
-    def to_arrays(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Plain arrays, exact round trip through `from_arrays`."""
-        arrays: dict[str, np.ndarray[Any, Any]] = {
-            "n_stages": np.array(len(self.stages)),
-            "n_minima": np.array(len(self.minima)),
-            "warnings": np.array(self.warnings, dtype=np.str_),
-            "evaluations": np.array(self.evaluations),
-            "minima_rss": np.array([minimum.rss for minimum in self.minima], dtype=np.float64),
-            "minima_stage": np.array([minimum.stage for minimum in self.minima], dtype=np.str_),
-        }
-        for i, stage in enumerate(self.stages):
-            arrays[f"stage{i}_title"] = np.array(stage.title)
-            arrays[f"stage{i}_names"] = np.array(stage.coordinate_names, dtype=np.str_)
-            arrays[f"stage{i}_points"] = stage.points
-            arrays[f"stage{i}_log_cost"] = stage.log_cost
-        for i, minimum in enumerate(self.minima):
-            arrays[f"minimum{i}_real"] = minimum.poles.real
-            arrays[f"minimum{i}_pairs"] = minimum.poles.pairs
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray[Any, Any]]) -> SearchTrace:
-        return cls(
-            stages=tuple(
-                SearchStage(
-                    str(arrays[f"stage{i}_title"]),
-                    tuple(str(name) for name in arrays[f"stage{i}_names"]),
-                    arrays[f"stage{i}_points"],
-                    arrays[f"stage{i}_log_cost"],
-                )
-                for i in range(int(arrays["n_stages"]))
-            ),
-            minima=tuple(
-                PolishedMinimum(
-                    str(arrays["minima_stage"][i]),
-                    Poles(arrays[f"minimum{i}_real"], arrays[f"minimum{i}_pairs"]),
-                    float(arrays["minima_rss"][i]),
-                )
-                for i in range(int(arrays["n_minima"]))
-            ),
-            warnings=tuple(str(item) for item in arrays["warnings"]),
-            evaluations=int(arrays["evaluations"]),
-        )

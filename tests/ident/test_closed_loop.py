@@ -44,7 +44,6 @@ def test_feedback_check_estimates_the_law_and_notices_when_it_does_not_hold():
     wrong = check_feedback(records, tolerance=1e-9, feedback_gain=GAIN + 0.1)
     assert not wrong.exact
     assert "does not obey" in wrong.verdict
-    assert found.to_dict()["exact"] is True
 
 
 def test_two_stage_is_free_of_the_direct_method_s_bias():

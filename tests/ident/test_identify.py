@@ -11,8 +11,9 @@ import scipy.signal
 from ident.basis.options import IdentOptions
 from ident.checks.input_checks import clipped_share, excitation_limit_rad_s
 from ident.fit.residual_colour import effective_samples
-from ident.identify import Identification, identify
+from ident.identify import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
+from tests.ident.storage import same, stored_and_read
 
 OMEGA = np.geomspace(0.1, 600, 400)
 MIDDLE = (OMEGA >= 1) & (OMEGA <= 100)
@@ -105,15 +106,9 @@ def test_p2_residuals_and_fit_belong_together(p2_fit):
     np.testing.assert_allclose(y - result.model.simulate(truth.record.input[:, 0]), residual, atol=1e-12)
 
 
-def test_identification_round_trip_through_npz(p2_fit, tmp_path):
+def test_identification_round_trip_through_npz(p2_fit):
     _, result = p2_fit
-    np.savez(tmp_path / "fit.npz", **result.to_arrays())
-    with np.load(tmp_path / "fit.npz", allow_pickle=False) as stored:
-        again = Identification.from_arrays(dict(stored))
-    first, second = result.to_arrays(), again.to_arrays()
-    assert first.keys() == second.keys()
-    for key, value in first.items():
-        np.testing.assert_array_equal(second[key], value)
+    again = stored_and_read(result)
     assert again.structure == result.structure
     assert again.order_table == result.order_table
 
@@ -121,9 +116,7 @@ def test_identification_round_trip_through_npz(p2_fit, tmp_path):
 def test_the_same_data_give_the_same_numbers():
     truth = p1(4)
     options = IdentOptions(n_real=2, n_pairs=1, algorithm="GN_DIRECT_L_RAND")
-    first, second = (identify([truth.record], options).to_arrays() for _ in range(2))
-    for key, value in first.items():
-        np.testing.assert_array_equal(second[key], value)
+    assert same(*(identify([truth.record], options) for _ in range(2)))
 
 
 def test_progress_is_reported():

@@ -7,6 +7,7 @@ import pytest
 from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
+from tests.ident.storage import stored_and_read
 
 MODEL = GobfModel(
     poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]),
@@ -46,7 +47,7 @@ def test_simulation_of_a_sine_settles_to_the_frequency_response():
 
 
 def test_round_trip_through_arrays_is_exact():
-    again = GobfModel.from_arrays(MODEL.to_arrays())
+    again = stored_and_read(MODEL)
     np.testing.assert_array_equal(again.frequency_response(OMEGA), MODEL.frequency_response(OMEGA))
     assert (again.input_name, again.output_name) == ("voltage", "angle")
 

@@ -9,9 +9,9 @@ import pytest
 import scipy.signal
 
 from ident.basis.options import IdentOptions
-from ident.checks.prior_tests import PriorTest
-from ident.identify import Identification, identify
+from ident.identify import identify
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction
+from tests.ident.storage import stored_and_read
 
 OMEGA = np.geomspace(0.1, 600, 400)
 KNOWN = {"integrators": 2, "relative_degree": 2, "n_real": 0, "n_pairs": 1}
@@ -175,14 +175,11 @@ def test_noise_free_data_speak_against_nothing_true():
     assert relative_error(truth, result.model) < 1e-5
 
 
-def test_tests_survive_storage(tmp_path):
+def test_tests_survive_storage():
     result = identify([p1_friction(0).record], IdentOptions(**KNOWN))
-    np.savez(tmp_path / "fit.npz", **result.to_arrays())
-    with np.load(tmp_path / "fit.npz", allow_pickle=False) as stored:
-        again = Identification.from_arrays(dict(stored))
+    again = stored_and_read(result)
     assert again.prior_tests == result.prior_tests
     assert again.structure == result.structure
-    assert [PriorTest.from_dict(test.to_dict()) for test in result.prior_tests] == list(result.prior_tests)
 
 
 @pytest.mark.parametrize(
