@@ -29,9 +29,7 @@ DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", 
 Model = Literal["stated", "refit", "repaired"]
 
 NOISE_FLOOR = 1.0
-# The evidence as it is; not calibrated on many cases of known answer.
-TEMPERATURE = 1.0
-# A stated value that has to be off by more tolerances than this is significant by itself.
+# A nominal parameter that has to be off by more tolerances than this is significant by itself.
 FAR_OFF = 3.0
 # Below this probability of the first answer, or with another one above that, the answer is called ambiguous.
 _SURE, _POSSIBLE = 0.8, 0.05
@@ -84,15 +82,15 @@ class Diagnosis:
     ambiguous_with : tuple of str
         Answers that the records cannot rule out beside the first.
     gap_before, gap_refit, gap_after : float
-        Pooled RMS of (measured - model)/noise over the held-out experiments: rig as stated, stated values
+        Pooled RMS of (measured - model)/noise over the held-out experiments: nominal rig, nominal parameters
         moved within their tolerances, accepted effects added.
     gap_closed, gap_closed_interval : float, (low, high)
         1 - (R_after - F)/(R_refit - F) with R, F the held-out mean squares and the noise floor's (design 6.2)
         and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
     deviations : key -> tolerances
-        How far the stated values are off, with the accepted effects in the model.
+        How far the nominal parameters are off, with the accepted effects in the model.
     rig, repair
-        The repaired model: stated values moved (a Rig, or a Plant of one's own), effects to add (of
+        The repaired model: nominal parameters moved (a Rig, or a Plant of one's own), effects to add (of
         `plant.effects`, or changes of the own plant).
     residuals_before, residuals_refit, residuals_after : experiment -> (T, 2)
         Whitened, every experiment; (T, Y) in the machine's order of outputs.
@@ -200,7 +198,6 @@ def diagnose(
     *,
     progress: Progress | None = None,
     rng: np.random.Generator | None = None,
-    temperature: float = TEMPERATURE,
 ) -> Diagnosis:
     """Search, weigh, and answer.
 
@@ -212,25 +209,23 @@ def diagnose(
         Called with the share done (0 to 1) and what is being done.
     rng
         Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
-    temperature
-        See `probabilities`.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     found = search(case, progress)
     model = ResidualModel(case)
     every: Sequence[Hypothesis]
     every = (*found.hypotheses, *look_alikes(model, found.hypotheses, found.base))
-    weighed = probabilities(every, temperature=temperature)
+    weighed = probabilities(every)
     accepted = _accepted(every, weighed.answer)
     seen = confronted(model, every, accepted) if weighed.answer != "unknown" else None
     if seen is not None:
         every = seen
-        weighed = probabilities(every, temperature=temperature)
+        weighed = probabilities(every)
         accepted = _accepted(every, weighed.answer)
     hypotheses = [h for h in every if h.is_answer]
     alike = [h for h in every if not h.is_answer]
     likeliest = max(every, key=lambda h: h.unknown_weight)
-    last = _polished(model, accepted.fit)
+    last = _refined(model, accepted.fit)
     before = model.by_experiment(np.zeros(model.nominal.count), ())
     refit = model.by_experiment(found.base.deviations, ())
     after = model.by_experiment(last.deviations, last.effects)
@@ -299,7 +294,7 @@ def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
     return max((h for h in hypotheses if h.names[:1] == names), key=lambda h: h.log_weight)
 
 
-def _polished(model: ResidualModel, end: Fit) -> Fit:
+def _refined(model: ResidualModel, end: Fit) -> Fit:
     if not end.candidates and not end.deviations.size:
         return end
     last = fit(model, end.candidates, end.coordinates, end.deviations, iterations=_LAST_ITERATIONS)
@@ -418,8 +413,8 @@ def _intervals(
 def _solver_variance(end: Fit, samples_per_record: float) -> float:
     """Variance of fitted values in units of what white noise gives, where contacts switch.
 
-    Two correct solvers of play drift apart once a contact falls differently, and stay apart to the end of a
-    record: an error of their usual disagreement that is correlated over the record.
+    Two correct solvers of backlash drift apart once a contact falls differently, and stay apart to the end of
+    a record: an error of their usual disagreement that is correlated over the record.
     """
     if not end.non_smooth:
         return 1.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, disagreement_gain
-from diagnosis.fit.discrepancy import Leftover, leftover
+from diagnosis.fit.discrepancy import Discrepancy, discrepancy
 from diagnosis.fit.fit import Fit, difference_quotients
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import solver_spread, without_drift
@@ -101,14 +101,14 @@ def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
     e, log_density = _unpredicted(model, end)
     segments = [len(record.output) for record in case.estimation]
     both = [*segments, *(len(record.output) for record in case.held_out)]
-    before = leftover(fitted, segments, outputs)
-    after = leftover(np.concatenate([fitted, e]), both, outputs)
+    before = discrepancy(fitted, segments, outputs)
+    after = discrepancy(np.concatenate([fitted, e]), both, outputs)
     allowed = disagreement_gain(end, after) - disagreement_gain(end, before)
     return _Prediction(log_density, allowed, _odds(end, after) - _odds(end, before))
 
 
-def _odds(end: Fit, rest: Leftover) -> float:
-    return rest.log_gain_some - disagreement_gain(end, rest)
+def _odds(end: Fit, left: Discrepancy) -> float:
+    return left.log_gain_some - disagreement_gain(end, left)
 
 
 def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.fit.discrepancy import Leftover
+from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.fit import Fit, log_evidence
 from diagnosis.fit.model_error import log_evidence_with_model_error
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
 from plant.effects import EFFECTS
 
-# Solver disagreement in noise deviations (half-normal scale); with play two correct solvers differ by 0.2.
+# Solver disagreement in noise deviations (half-normal scale); 0.2 between two solvers of backlash.
 DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
 _PRIOR_NONE, _PRIOR_UNKNOWN = 0.25, 0.1
@@ -31,8 +31,8 @@ _UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
 BESIDE_NON_SMOOTH = 20.0
 # log prior density lost per squared deviation beyond three: no evidence pays for that.
 _CUT = 1e3
-# Something unknown may have any size over four decades; what solvers of play disagree about has one known to
-# a factor of three: the log of the ratio of these ranges (in their logarithms).
+# Something unknown may have any size over four decades; what solvers of backlash disagree about has one known
+# to a factor of three: the log of the ratio of these ranges (in their logarithms).
 _KNOWN_SIZE = 2.0
 # An answer this far behind the best in log weight is none any more.
 STILL_POSSIBLE = 20.0
@@ -76,8 +76,8 @@ class Hypothesis:
         return self.log_weight if self.is_answer else self.unknown_weight
 
     @classmethod
-    def of(cls, fit: Fit, rest: Leftover, drift: Drift = NO_DRIFT) -> Hypothesis:
-        """rest: what the fit leaves over, of residuals without the drift of correct solvers."""
+    def of(cls, fit: Fit, left: Discrepancy, drift: Drift = NO_DRIFT) -> Hypothesis:
+        """left: what the fit leaves over, of residuals without the drift of correct solvers."""
         beside = len(fit.names) - 1
         allowed = BESIDE_NON_SMOOTH * beside if fit.non_smooth else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
@@ -86,8 +86,8 @@ class Hypothesis:
             exactly, besides = log_evidence_with_model_error(fit)
             return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
         evidence = log_evidence(fit) + drift.log_gain
-        exactly = evidence + disagreement_gain(fit, rest) + prior - allowed
-        besides = evidence + rest.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
+        exactly = evidence + disagreement_gain(fit, left) + prior - allowed
+        besides = evidence + left.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
         if any(c.at_edge(x) for c, x in zip(fit.candidates, fit.coordinates, strict=True)):
             # Something is described well, but not by what the effect is.
             return cls(fit, exactly - _AT_EDGE, max(besides, exactly + _UNKNOWN_BESIDE))
@@ -108,15 +108,15 @@ def log_prior_unknown() -> float:
     return float(np.log(_PRIOR_UNKNOWN))
 
 
-def disagreement_gain(fit: Fit, rest: Leftover) -> float:
+def disagreement_gain(fit: Fit, left: Discrepancy) -> float:
     """log evidence gained by the disagreement that two correct solvers of these effects may have.
 
     Its size has a half-normal prior, cut off beyond three deviations: more than that is no disagreement.
     """
     solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
-    z = rest.size / max(solvers)
+    z = left.size / max(solvers)
     expected = _KNOWN_SIZE if fit.non_smooth else 0.0
-    return max(0.0, rest.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
+    return max(0.0, left.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,20 +154,16 @@ class Probabilities:
         return max(self.cause, key=self.cause.__getitem__)
 
 
-def probabilities(hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0) -> Probabilities:
+def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     """Probabilities from the evidence of everything that was fitted.
-
-    temperature > 1 makes the answer less sure than the bare evidence.
 
     Raises
     ------
     ValueError
-        If there is no hypothesis, or the temperature is not above zero.
+        If there is no hypothesis.
     """
     if not hypotheses:
         raise ValueError("probabilities need at least one hypothesis")
-    if not temperature > 0:
-        raise ValueError(f"temperature must be above zero; got {temperature}")
     best: dict[tuple[str, ...], Hypothesis] = {}
     for hypothesis in (h for h in hypotheses if h.is_answer):
         key = tuple(sorted(hypothesis.names))
@@ -175,7 +171,7 @@ def probabilities(hypotheses: Sequence[Hypothesis], *, temperature: float = 1.0)
             best[key] = hypothesis
     unknown = max(h.unknown_weight for h in hypotheses)
     keys = [*best, _UNKNOWN]
-    logs = np.array([*(h.log_weight for h in best.values()), unknown]) / temperature
+    logs = np.array([*(h.log_weight for h in best.values()), unknown])
     weight = np.exp(logs - np.max(logs))
     weight /= weight.sum()
     sets = {key: float(p) for key, p in zip(keys, weight, strict=True)}

@@ -60,23 +60,23 @@ class Screening:
             ]
         return sorted(found, key=lambda start: start.cost)
 
-    def beside(self, lead: Fit, starts: list[Start]) -> list[Start]:
-        """The same starts judged beside the effects of `lead`, changes simply added; best first.
+    def beside(self, parent: Fit, starts: list[Start]) -> list[Start]:
+        """The same starts judged beside the effects of `parent`, changes simply added; best first.
 
         No simulation: a second effect large enough for superposition to fail shows all the same. The nominal
-        parameters and the sizes of the lead follow along its Jacobian.
+        parameters and the sizes of the parent follow along its Jacobian.
         """
-        around = _Around(lead)
-        found = [around.start(start, lead.residuals + start.change) for start in starts]
+        around = _Around(parent)
+        found = [around.start(start, parent.residuals + start.change) for start in starts]
         return sorted(found, key=lambda start: start.cost)
 
-    def simulated_beside(self, lead: Fit, candidate: Candidate, starts: list[Start]) -> list[Start]:
+    def simulated_beside(self, parent: Fit, candidate: Candidate, starts: list[Start]) -> list[Start]:
         """As `beside`, from simulations of both together: for one that acts through the other."""
-        around = _Around(lead)
+        around = _Around(parent)
         found = []
         for start in starts:
-            effects = (*lead.effects, candidate.effect_at(start.coordinates))
-            e = self.model.of(lead.deviations, effects)
+            effects = (*parent.effects, candidate.effect_at(start.coordinates))
+            e = self.model.of(parent.deviations, effects)
             if np.all(np.isfinite(e)):
                 found.append(around.start(start, e))
         return sorted(found, key=lambda start: start.cost)
@@ -177,21 +177,21 @@ class Screening:
 class _Around:
     """Linearisation of everything a fit holds, in which it follows a further effect."""
 
-    def __init__(self, lead: Fit) -> None:
-        self.lead = lead
-        A = lead.hessian
+    def __init__(self, parent: Fit) -> None:
+        self.parent = parent
+        A = parent.hessian
         scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
         self._factor = cho_factor(A + 1e-8 * np.diag(scale**2))
 
     def start(self, start: Start, e: Real) -> Start:
         """The start with cost and deviations that go with the residuals e (N,) before anything follows."""
-        lead = self.lead
-        P = lead.deviations.size
-        gradient = lead.jacobian.T @ e
-        gradient[:P] += prior_slope(lead.deviations)
+        parent = self.parent
+        P = parent.deviations.size
+        gradient = parent.jacobian.T @ e
+        gradient[:P] += prior_slope(parent.deviations)
         step = -cho_solve(self._factor, gradient)
-        cost = float(e @ e + gradient @ step) + prior_cost(lead.deviations)
-        return replace(start, cost=cost, deviations=lead.deviations + np.clip(step[:P], -1.5, 1.5))
+        cost = float(e @ e + gradient @ step) + prior_cost(parent.deviations)
+        return replace(start, cost=cost, deviations=parent.deviations + np.clip(step[:P], -1.5, 1.5))
 
 
 def smallest_size(candidate: Candidate, starts: list[Start], ratio: float) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from diagnosis.evidence.hypotheses import BESIDE_NON_SMOOTH, DISAGREEMENT, Hypothesis
 from diagnosis.evidence.screening import Screening, Start, smallest_size
-from diagnosis.fit.discrepancy import leftover
+from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.fit.fit import Fit, cost_at, fit
 from diagnosis.fit.non_smooth import refined
 from diagnosis.fit.residual import ResidualModel
@@ -38,9 +38,9 @@ _HOPELESS = 0.1
 _SETS_TO_REDUCE = 3
 # Further effects that are fitted beside the best hypothesis, by the cost their screening promises.
 _BESIDE = 6
-# Starts of a further effect that are simulated beside a lead; fewer where a record takes ten times as long.
+# Starts of a further effect that are simulated beside a parent; fewer where a record takes ten times as long.
 _STARTS_TO_SIMULATE, _NON_SMOOTH_TO_SIMULATE = 40, 8
-# A stated value pulled this far (tolerances) may stand for an effect.
+# A nominal parameter pulled this far (tolerances) may stand for an effect.
 _BEYOND_BELIEF = 2.0
 # Single effects, and pairs, that are extended where no set explains everything.
 _BEAM = {1: 3, 2: 1}
@@ -87,12 +87,12 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     found += _fitted(model, base, first, _part(report, 0.35, 0.35))
     for count in range(1, _MOST_EFFECTS):
         found.sort(key=lambda h: -h.log_weight)
-        best, leads = found[0], _leads(found, count)
-        if not leads or len(best.names) < (count if _explained(found) else 1):
+        best, parents = found[0], _parents(found, count)
+        if not parents or len(best.names) < (count if _explained(found) else 1):
             break
-        if count > 1 and (_hopeless(leads[0], base) or _as_solvers_differ(model, leads[0])):
+        if count > 1 and (_hopeless(parents[0], base) or _as_solvers_differ(model, parents[0])):
             break
-        further = _further(screening, leads, listed, explained=_explained(found))
+        further = _further(screening, parents, listed, explained=_explained(found))
         found += _fitted(model, base, further, _part(report, 0.6 + 0.1 * count, 0.1))
         found += _reduced(model, base, found, [candidate for candidate, _ in listed])
     found.sort(key=lambda h: -h.log_weight)
@@ -118,7 +118,7 @@ def _explained(found: Sequence[Hypothesis]) -> bool:
     return max(h.log_weight for h in found) >= max(h.unknown_weight for h in found)
 
 
-def _leads(found: Sequence[Hypothesis], count: int) -> list[Fit]:
+def _parents(found: Sequence[Hypothesis], count: int) -> list[Fit]:
     """Sets of so many effects to which one more is added, best first.
 
     The best one as soon as a set explains everything. Before, what is left over says little about which
@@ -128,68 +128,72 @@ def _leads(found: Sequence[Hypothesis], count: int) -> list[Fit]:
     if _explained(found):
         best = max(found, key=lambda h: h.log_weight)
         return [best.fit] if len(best.names) == count else []
-    leads: dict[frozenset[str], Fit] = {}
+    parents: dict[frozenset[str], Fit] = {}
     for h in sorted(found, key=lambda h: -h.unknown_weight):
         if len(h.names) == count:
-            leads.setdefault(frozenset(h.names), h.fit)
-    return list(leads.values())[: _BEAM[count]]
+            parents.setdefault(frozenset(h.names), h.fit)
+    return list(parents.values())[: _BEAM[count]]
 
 
 def _further(
     screening: Screening,
-    leads: Sequence[Fit],
+    parents: Sequence[Fit],
     listed: Sequence[tuple[Candidate, list[Start]]],
     *,
     explained: bool,
 ) -> list[_Trial]:
-    """The most promising effects beside the leads, every set and side of an effect once."""
+    """The most promising effects beside the parents, every set and side of an effect once."""
     model = screening.model
     trials = []
-    for lead in leads:
-        anew = Screening(model, lead)
+    for parent in parents:
+        anew = Screening(model, parent)
         for candidate, starts in listed:
-            if candidate.effect not in lead.names:
-                # Phases and amplitudes found without the lead are of no use beside it.
-                beside = anew.starts(candidate) if candidate.kind.harmonic else screening.beside(lead, starts)
-                trials.append(_Trial(lead, candidate, beside))
+            if candidate.effect not in parent.names:
+                # Phases and amplitudes found without the parent are of no use beside it.
+                beside = (
+                    anew.starts(candidate) if candidate.kind.harmonic else screening.beside(parent, starts)
+                )
+                trials.append(_Trial(parent, candidate, beside))
     chosen: dict[tuple[frozenset[str], int], _Trial] = {}
     for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
         chosen.setdefault((trial.effects, trial.candidate.sign), trial)
-    promising = list(chosen.values())[: _BESIDE + 2 * (len(leads) - 1)]
+    promising = list(chosen.values())[: _BESIDE + 2 * (len(parents) - 1)]
     if explained:
         # Nothing is left over; what linear estimates do not even promise is not fitted.
         promising = [t for t in promising if t.around.cost - t.starts[0].cost > _least_promise(t.around)]
-    pulled = [p for lead in leads for p in _pulled(model, lead, [candidate for candidate, _ in listed])]
+    pulled = [p for parent in parents for p in _pulled(model, parent, [candidate for candidate, _ in listed])]
     return [_simulated(screening, trial) for trial in promising] + pulled
 
 
-def _least_promise(lead: Fit) -> float:
-    """Beside play a further effect has to gain more (in log weight; half of that in linear estimates).
+def _least_promise(parent: Fit) -> float:
+    """Beside backlash a further effect has to gain more (in log weight; half of that in linear estimates).
 
     Where a machine states a model error, what is left over is weighed by the size that it shows in the end: a
     small promise may gain much.
     """
-    if lead.weighing.model_error > 0:
+    if parent.weighing.model_error > 0:
         return -np.inf
-    return _PROMISE + (BESIDE_NON_SMOOTH if lead.non_smooth else 0.0)
+    return _PROMISE + (BESIDE_NON_SMOOTH if parent.non_smooth else 0.0)
 
 
-def _pulled(model: ResidualModel, lead: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
-    """Effects that multiply a stated value, in place of that value pulled beyond belief."""
+def _pulled(model: ResidualModel, parent: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
+    """Effects that multiply a nominal parameter, in place of that value pulled beyond belief."""
     trials = []
-    factors = model.nominal.factors(lead.deviations)
+    factors = model.nominal.factors(parent.deviations)
     for k, key in enumerate(model.nominal.keys):
-        found = in_place_of(key, factors[key], listed) if abs(lead.deviations[k]) > _BEYOND_BELIEF else None
-        if found is None or found[0].effect in lead.names:
+        found = in_place_of(key, factors[key], listed) if abs(parent.deviations[k]) > _BEYOND_BELIEF else None
+        if found is None or found[0].effect in parent.names:
             continue
-        d = lead.deviations.copy()
+        d = parent.deviations.copy()
         d[k] = 0.0
-        trials.append(_Trial(lead, found[0], [Start(lead.cost, found[1], d, 1.0, np.zeros(1, np.float32))]))
+        trials.append(
+            _Trial(parent, found[0], [Start(parent.cost, found[1], d, 1.0, np.zeros(1, np.float32))])
+        )
     return trials
 
 
 def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
-    """The effect that multiplies a stated value by this factor, or by the nearest one worth a name."""
+    """The effect that multiplies a nominal parameter by this factor, or by the nearest one worth a name."""
     sign = 1 if factor > 1 else -1
     for candidate in listed:
         if candidate.kind.multiplies == key and candidate.sign == sign:
@@ -216,7 +220,7 @@ def _hopeless(end: Fit, base: Fit) -> bool:
 
 
 def _as_solvers_differ(model: ResidualModel, end: Fit) -> bool:
-    """Whether play is in the set and what is left is no more than correct solvers of it may differ by."""
+    """Whether backlash is in the set and what is left is no more than correct solvers of it may differ by."""
     if not end.non_smooth:
         return False
     e, drift = without_drift(end.residuals, solver_spread(model, end))
@@ -229,7 +233,7 @@ def weighed(model: ResidualModel, end: Fit, base: Fit) -> Hypothesis:
     e, drift = end.residuals, NO_DRIFT
     if _near(end, base):
         e, drift = without_drift(e, solver_spread(model, end))
-    return Hypothesis.of(end, leftover(e, segments, model.case.noise.size), drift)
+    return Hypothesis.of(end, discrepancy(e, segments, model.case.noise.size), drift)
 
 
 def _part(report: Progress, begin: float, share: float) -> Progress:
@@ -265,7 +269,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
         quick = all(c.dependence == "smooth" for c in item.candidates)
         promising = close and (quick or item.cost < around.cost - _LEAST_GAIN)
         promising = promising or (quick and not around.candidates)
-        # An imitation of something else by play takes as long as everything besides.
+        # An imitation of something else by backlash takes as long as everything besides.
         costly = item.non_smooth and not _near(item, base)
         if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
@@ -275,7 +279,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
 
 
 def _refined(model: ResidualModel, end: Fit, base: Fit) -> Fit:
-    """`refined` where play or the like may be the answer; beside much of a gap jags are no matter."""
+    """`refined` where backlash or the like may be the answer; beside much of a gap jags are no matter."""
     return refined(model, end) if _near(end, base) else end
 
 

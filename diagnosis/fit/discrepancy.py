@@ -23,7 +23,7 @@ _GRID = 1500
 
 
 @dataclass(frozen=True)
-class Leftover:
+class Discrepancy:
     """What is left over: log evidence gained by allowing it, and its size.
 
     log_gain : log Bayes factor of "any band may hold something" against white noise.
@@ -36,7 +36,7 @@ class Leftover:
     size: float
 
 
-def leftover(residuals: Real, segments: Sequence[int], outputs: int = 2) -> Leftover:
+def discrepancy(residuals: Real, segments: Sequence[int], outputs: int = 2) -> Discrepancy:
     """Bands of all records and outputs judged together.
 
     Parameters
@@ -79,7 +79,7 @@ def leftover(residuals: Real, segments: Sequence[int], outputs: int = 2) -> Left
     nothing = n.size * float(np.log1p(-_ACTIVE))
     some = log_gain + np.log1p(-np.exp(min(nothing - log_gain, -1e-12))) - np.log1p(-np.exp(nothing))
     held = np.where(factor > 0, np.maximum(S / n - 1, 0.0), 0.0)
-    return Leftover(log_gain, float(some), float(np.sqrt(np.sum(n * held) / np.sum(n))))
+    return Discrepancy(log_gain, float(some), float(np.sqrt(np.sum(n * held) / np.sum(n))))
 
 
 def _band(frequency: Real) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from diagnosis.machine.machine_protocol import Real, Stated
 
-# Where a stated value would have to be more wrong than this many tolerances nothing is believed any more.
+# A nominal parameter that would have to be wrong by more tolerances than this is not believed.
 LARGEST_DEVIATION = 8.0
 # Up to so many tolerances the prior is Gaussian. Beyond them it falls faster: a value that far off gets
 # noticed before it gets stated.
@@ -35,7 +35,7 @@ def prior_curvature(deviations: Real) -> Real:
 
 @dataclass(frozen=True, eq=False)
 class NominalParameters(Generic[Stated]):
-    """Deviations d (P,) of the stated values in units of their tolerances; `prior_cost` before any record.
+    """Deviations d (P,) of nominal parameters in units of their tolerances; `prior_cost` before any record.
 
     A rig or machine with tolerances t states values that are wrong by draws of that size: stated =
     true (1 + t d), so the true value is stated / (1 + t d).
@@ -52,7 +52,7 @@ class NominalParameters(Generic[Stated]):
         return len(self.stated.tolerances)
 
     def at(self, deviations: Real) -> Stated:
-        """The rig or machine whose stated values are off by these deviations (P,)."""
+        """The rig or machine whose nominal parameters are off by these deviations (P,)."""
         if not self.count:
             return self.stated
         return self.stated.scaled(self.factors(deviations))

@@ -32,8 +32,8 @@ class ResidualModel:
     ) -> Real:
         """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs.
 
-        Over `scale`, so that stated values and records weigh what they should beside a model error. Rounded
-        outputs enter by the chance of their cells (`diagnosis.machine.quantisation_grid`).
+        Over `scale`, so that nominal parameters and records weigh what they should beside a model error.
+        Rounded outputs enter by the chance of their cells (`diagnosis.machine.quantisation_grid`).
         """
         experiments = self.case.estimation if experiments is None else experiments
         simulator = self.nominal.at(deviations).simulator(effects)

@@ -1,9 +1,9 @@
-"""How far two correct solvers of a machine with play may drift apart, measured where it is to be judged.
+"""How far two correct solvers of a machine with backlash may drift apart, measured where it is to be judged.
 
 Contacts amplify: two solvers, or a solver and the machine, whose impacts differ by a hair follow different
 sequences of contacts some bounces later. Neither is wrong, and a trajectory that has drifted apart says
-little. How soon that happens depends on the machine, the size of its play and the motion, so it is measured:
-the same records with a play that differs in its third digit.
+little. How soon that happens depends on the machine, the size of its gap and the motion, so it is measured:
+the same records with a gap that differs in its third digit.
 """
 
 from __future__ import annotations

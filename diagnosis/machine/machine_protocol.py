@@ -55,7 +55,7 @@ class StatedValues(Protocol):
 
     @property
     def tolerances(self) -> Mapping[str, float]:
-        """Parameter -> relative standard deviation of its stated value."""
+        """Parameter -> relative standard deviation of its nominal parameter."""
 
     def scaled(self: Stated, factors: Mapping[str, float]) -> Stated:
         """The same with these parameters multiplied."""

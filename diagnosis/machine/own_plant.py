@@ -170,7 +170,7 @@ class Plant:
         `parameters` has every stated parameter, `effects` name -> parameter -> value of those to include.
         It must be a function of its arguments alone.
     parameters : name -> stated value
-    tolerances : name -> relative standard deviation of the stated value
+    tolerances : name -> relative standard deviation of the nominal parameter
         Parameters without one are exact. A value fitted to these same records is no knowledge beside them:
         give it a tolerance of 1 or more.
     output_names : (Y,)

@@ -14,7 +14,7 @@ from scipy.special import log_ndtr
 
 from diagnosis.machine.machine_protocol import Real
 
-# Records are written with so many significant digits at least; rounding in the file is no finding.
+# Records are written with so many significant digits at least; rounding in the file is not significant.
 _DIGITS = 6
 # A grid is believed when its step is this much coarser than what the file resolves.
 _COARSER = 20.0

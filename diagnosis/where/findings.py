@@ -113,7 +113,7 @@ class RegimePeak:
 class RegimeFinding:
     """Does the residual energy of a sensor depend on a regime variable?
 
-    axis: speed_sign, speed_size, reversal, angle, angle_in_period, deflection, command_size or time.
+    axis: speed_sign, speed_size, reversal, angle, deflection, command_size or time.
     `p_value` is by circular shifts of the energy against the regime within every experiment, which keeps the
     colour of the residuals. `contrast`: the largest deviation of a bin from what shifts give, in their
     standard deviations. `peak` is None where nothing is found, or too little to tell anybody.

@@ -98,9 +98,7 @@ class RegimeAxis:
     labels: Mapping[str, Integer]
 
 
-def regime_axes(
-    moved: Mapping[str, Motion], ripple_cycles_per_rev: float | None = None, bins: int = 5
-) -> tuple[RegimeAxis, ...]:
+def regime_axes(moved: Mapping[str, Motion], bins: int = 5) -> tuple[RegimeAxis, ...]:
     """Axes whose bins hold at least 60 samples each: bins of equal sample count, time in equal stretches."""
     names = list(moved)
 
@@ -133,8 +131,6 @@ def regime_axes(
         _quantiles("command_size", "V", of("command_V", True), bins, "at {}"),
         _stretches(of("time_s"), bins + 1),
     ]
-    if ripple_cycles_per_rev is not None:
-        axes.append(_period(of("angle_rad"), ripple_cycles_per_rev))
     return tuple(axis for axis in axes if axis is not None and _enough(axis))
 
 
@@ -190,17 +186,6 @@ def _stretches(time: Mapping[str, Real], bins: int) -> RegimeAxis:
     pairs = tuple((float(a), float(b)) for a, b in pairwise(edges))
     titles = tuple(f"{a:.2g} to {b:.2g} s after the start" for a, b in pairs)
     return RegimeAxis("time", "s", titles, pairs, labels)
-
-
-def _period(angle: Mapping[str, Real], cycles: float, bins: int = 8) -> RegimeAxis:
-    width = 2 * np.pi / bins
-    labels = {
-        name: np.minimum((np.mod(cycles * v, 2 * np.pi) / width).astype(np.int64), bins - 1)
-        for name, v in angle.items()
-    }
-    pairs = tuple((b * width, (b + 1) * width) for b in range(bins))
-    titles = tuple(f"{np.degrees(a):.0f} to {np.degrees(b):.0f} degrees into the ripple" for a, b in pairs)
-    return RegimeAxis("angle_in_period", "rad", titles, pairs, labels)
 
 
 def regime_findings(

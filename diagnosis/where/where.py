@@ -30,7 +30,6 @@ def where(
     residuals: Mapping[str, Real],
     probabilities: Mapping[str, float] | None = None,
     *,
-    ripple_cycles_per_rev: float | None = None,
     level: float = LEVEL,
     rng: np.random.Generator | None = None,
 ) -> Where:
@@ -43,8 +42,6 @@ def where(
         of the case.
     probabilities : effect id, "none" or "unknown" -> probability, optional
         Of the causes, for the grouping by subsystem.
-    ripple_cycles_per_rev
-        Adds the angle within one period of a known torque ripple to the regimes.
     level
         Chance of a false finding in each axis (frequency, regimes, drift, experiments, sensors) when the
         records hold only noise.
@@ -67,7 +64,7 @@ def where(
         sensors=sensor_gaps(e, level),
         experiments=experiment_gaps(e, level),
         bands=band_gaps(e, case.rig.sampling.dt_s, level),
-        regimes=regime_findings(e, regime_axes(moved, ripple_cycles_per_rev), level, rng),
+        regimes=regime_findings(e, regime_axes(moved), level, rng),
         drift=drift_findings(case, e, level),
         common=common_findings(case, e, level),
         curves=missing_functions(case, e, moved, level, rng),

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.evidence.search import in_place_of
-from diagnosis.fit.discrepancy import leftover
+from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.fit.fit import Fit
 from diagnosis.machine.case import Case, Experiment
 from plant.presets import paper_link
@@ -76,7 +76,7 @@ def _ripple(listed, cycles_per_rev):
     e = np.random.default_rng(5).standard_normal(200)
     jacobian = np.random.default_rng(6).standard_normal((200, 3))
     end = Fit((ripple,), np.zeros(0), (x,), e, jacobian, float(e @ e), True)
-    return Hypothesis.of(end, leftover(e, [100], 2))
+    return Hypothesis.of(end, discrepancy(e, [100], 2))
 
 
 def test_a_period_that_no_record_completes_is_rather_something_unknown(listed):

@@ -7,7 +7,7 @@ import pytest
 
 from diagnosis import Case, Experiment
 from diagnosis.evidence.hypotheses import disagreement_gain
-from diagnosis.fit.discrepancy import Leftover
+from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
@@ -80,5 +80,5 @@ def test_residuals_that_drift_as_predicted_are_white_over_it():
 
 def test_no_evidence_pays_for_a_rest_that_no_solver_leaves(tmp_path):
     _, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.02}, seed=1)
-    assert disagreement_gain(end, Leftover(2e4, 2e4, 0.3)) > 1.9e4
-    assert disagreement_gain(end, Leftover(2e4, 2e4, 2.0)) < 2e3
+    assert disagreement_gain(end, Discrepancy(2e4, 2e4, 0.3)) > 1.9e4
+    assert disagreement_gain(end, Discrepancy(2e4, 2e4, 2.0)) < 2e3

@@ -194,15 +194,6 @@ def test_a_wrong_sensor_gain_is_an_error_over_the_tip_position():
     assert found.linear.share > 0.9
 
 
-def test_a_known_ripple_period_is_a_regime_of_its_own():
-    residuals = white(np.random.default_rng(2))
-    case = made(residuals)
-    axes = {r.axis: r for r in where(case, residuals, ripple_cycles_per_rev=20.0).regimes}
-    assert len(axes["angle_in_period"].bins) == 8
-    assert sum(b.samples for b in axes["angle_in_period"].bins) == sum(e.shape[0] for e in residuals.values())
-    assert "angle_in_period" not in {r.axis for r in where(case, residuals).regimes}
-
-
 def test_a_disturbance_is_the_same_whatever_the_input():
     frequency = 3.1
     found = _of_effect(PeriodicDisturbance(amplitude_Nm=0.01, frequency_Hz=frequency, phase_rad=0.4))

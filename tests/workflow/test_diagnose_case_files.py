@@ -152,7 +152,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(what, folder, refused, tmp_pat
 
 def test_wrong_calls_are_one_line(folder, refused, tmp_path):
     out = tmp_path / "out"
-    assert "no case is there" in refused("diagnose", tmp_path / "nowhere", "--out", out)
+    assert "no such file or directory" in refused("diagnose", tmp_path / "nowhere", "--out", out)
     line = refused("diagnose", folder, "--out", out, "--rig", "rig_exact.toml")
     assert "rig_exact.toml: no such rig file" in line
     assert "rig_uncertain.toml" in line

@@ -22,7 +22,6 @@ _REGIMES = {
     "speed_size": "size of the hub speed",
     "reversal": "time from the last reversal",
     "angle": "hub angle",
-    "angle_in_period": "angle within one period",
     "deflection": "deflection of the link",
     "command_size": "size of the command",
     "time": "time since start",

@@ -8,7 +8,7 @@ import scipy.signal
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from diagnosis.fit.discrepancy import _log_factor, leftover
+from diagnosis.fit.discrepancy import _log_factor, discrepancy
 
 SEGMENTS = [1400, 1001, 1200]
 
@@ -18,7 +18,9 @@ def _noise(rng):
 
 
 def test_white_noise_leaves_nothing():
-    gains = np.array([leftover(_noise(np.random.default_rng(seed)), SEGMENTS).log_gain for seed in range(60)])
+    gains = np.array(
+        [discrepancy(_noise(np.random.default_rng(seed)), SEGMENTS).log_gain for seed in range(60)]
+    )
     # A Bayes factor above 20 against the truth comes in fewer than 1 of 20 cases, whatever the alternatives.
     assert np.mean(gains > np.log(20)) <= 0.05
     assert np.median(gains) < 0
@@ -31,9 +33,9 @@ def test_a_quarter_of_the_noise_in_one_octave_is_plain(output):
     b, a = scipy.signal.butter(4, [0.035, 0.058], "bandpass")
     added = scipy.signal.lfilter(b, a, rng.standard_normal(e.shape[0] + 500))[500:]
     added *= 0.25 / np.std(added)
-    plain = leftover(e.ravel(), SEGMENTS)
+    plain = discrepancy(e.ravel(), SEGMENTS)
     e[:, output] += added
-    found = leftover(e.ravel(), SEGMENTS)
+    found = discrepancy(e.ravel(), SEGMENTS)
     # Of all samples this is 3 % more energy: 1.9 standard deviations of 7202 squares.
     assert np.mean(e**2) < 1 + 3 * np.sqrt(2 / e.size)
     assert found.log_gain > 10 > plain.log_gain
@@ -42,7 +44,7 @@ def test_a_quarter_of_the_noise_in_one_octave_is_plain(output):
 
 def test_size_of_white_energy_is_its_rms():
     rng = np.random.default_rng(2)
-    found = leftover(3.0 * _noise(rng), SEGMENTS)
+    found = discrepancy(3.0 * _noise(rng), SEGMENTS)
     # Energies of all lines add up to the sum of squares: sqrt(9 - 1), to the scatter of 7202 squares.
     assert found.size == pytest.approx(np.sqrt(8), rel=4 * np.sqrt(2 / 7202))
 
@@ -65,7 +67,7 @@ def test_factor_of_a_band_is_the_integral_over_its_size(n, ratio):
 
 
 def test_some_and_any_differ_by_the_case_of_nothing():
-    found = leftover(_noise(np.random.default_rng(5)), SEGMENTS)
+    found = discrepancy(_noise(np.random.default_rng(5)), SEGMENTS)
     nothing = 18 * np.log(1 - 0.15)
     some = np.log((np.exp(found.log_gain) - np.exp(nothing)) / (1 - np.exp(nothing)))
     assert found.log_gain_some == pytest.approx(some, abs=1e-9)
@@ -73,4 +75,4 @@ def test_some_and_any_differ_by_the_case_of_nothing():
 
 def test_wrong_length_is_refused():
     with pytest.raises(ValueError, match="segments"):
-        leftover(np.zeros(10), [6])
+        discrepancy(np.zeros(10), [6])
