@@ -230,7 +230,7 @@ def _rows(document: Mapping[str, Any]) -> list[Row]:
     rows.append(
         Row(
             "residual / noise",
-            f"{gaps[0]} as stated, {gaps[1]} values moved, {gaps[2]} with effects, floor {gaps[3]}",
+            f"{gaps[0]} nominal, {gaps[1]} re-estimated, {gaps[2]} with effects, floor {gaps[3]}",
         )
     )
     if document["combination"]:

@@ -1,6 +1,6 @@
-"""What a gap means for a controller: designed on the rig as stated, and again on the repaired one.
+"""What a gap means for a controller: designed on the nominal rig, and again on the repaired one.
 
-Both designs have the same specification, made from the rig as stated: bandwidth a tenth of its first flexible
+Both designs have the same specification, made from the nominal rig: bandwidth a tenth of its first flexible
 mode, modulus margin 0.5, voltages as large as in the records. Predicted is the linear model the design saw;
 achieved is the repaired machine with all its effects, which stands for the real one. Costs are the integral
 of the squared tip error over the squared move, for a step of the hub angle and then a short push by the
@@ -89,6 +89,11 @@ class ControllerCheck:
     certified: tuple[bool, bool]
     runs: tuple[Run, Run, Run, Run]
 
+    @property
+    def reference_m(self) -> Real:
+        """Tip position (T,) asked for."""
+        return np.asarray(self.arm_m * self.reference_rad)
+
     def document(self) -> dict[str, Any]:
         return {
             "specification": {
@@ -156,7 +161,7 @@ def _plant(name: str, rig: Rig, effects: tuple[Effect, ...]) -> _Plant:
 def _specification(case: Case, plant: _Plant) -> Specification:
     modes = modes_of(plant.uncertain.poles, plant.uncertain.dt_s)
     if not modes:
-        raise NoControllerError("the rig as stated has no lightly damped mode to set a bandwidth by")
+        raise NoControllerError("the nominal rig has no lightly damped mode to set a bandwidth by")
     first = modes[0].omega_rad_s
     return Specification(
         bandwidth_rad_s=_BANDWIDTH_SHARE * first,

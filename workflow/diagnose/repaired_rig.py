@@ -1,4 +1,4 @@
-"""The repaired machine as files: a rig file with the values moved, and the effects beside it."""
+"""The repaired machine as files: a rig file with the parameters re-estimated, and the effects beside it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,9 @@
-"""The answer in two pictures: how probable each cause is, and how far the gap shrinks with it."""
+"""The answer in pictures: how probable each cause is, how far the gap shrinks, several cases at once."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,35 +22,25 @@ def draw_probabilities(found: Diagnosis) -> Figure:
     """Bars of the likeliest causes, the accepted ones in colour; all others are added up in a last bar."""
     ranked = sorted(found.probabilities.items(), key=lambda item: -item[1])
     accepted = set(found.combination) or {"none" if found.verdict == "none" else "unknown"}
-    bars = [
-        (
-            style.plain(in_words(name), 52),
-            p,
-            gap_style.MODELS["repaired"]["color"] if name in accepted else gap_style.PALE,
-        )
-        for name, p in ranked[: min(_MOST_BARS, sum(p >= 0.005 for _, p in ranked) or 1)]
-    ]
-    others = len(ranked) - len(bars)
-    if others:
-        rest = max(0.0, 1.0 - sum(p for _, p, _ in bars))
-        bars.append((f"all {others} others together", rest, gap_style.PALE))
+    shown = ranked[: min(_MOST_BARS, sum(p >= 0.005 for _, p in ranked) or 1)]
+    names = [style.plain(in_words(name), 52) for name, _ in shown]
+    percent = [100 * p for _, p in shown]
+    own = gap_style.MODELS["repaired"]["color"]
+    colours = [own if name in accepted else gap_style.PALE for name, _ in shown]
+    if len(ranked) > len(shown):
+        names.append(f"all {len(ranked) - len(shown)} others together")
+        percent.append(max(0.0, 100 - sum(percent)))
+        colours.append(gap_style.PALE)
     with style.house_style():
-        figure = style.new_figure(1.0 + 0.34 * len(bars))
+        figure = style.new_figure(1.0 + 0.34 * len(names))
         axes = figure.subplots()
-        at = np.arange(len(bars))
-        axes.barh(at, [100 * p for _, p, _ in bars], color=[colour for _, _, colour in bars], height=0.62)
-        for y, (_, p, _) in zip(at, bars, strict=True):
-            text = "under 0.1 %" if p < 1e-3 else f"{100 * p:.3g} %"
-            axes.annotate(
-                text, (100 * p, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9
-            )
-        axes.set_yticks(at, [name for name, _, _ in bars])
+        bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
+        labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
+        axes.bar_label(bars, labels, padding=4, fontsize=9)
         axes.invert_yaxis()
-        axes.set_xlim(0, 112)
-        axes.set_xticks([0, 20, 40, 60, 80, 100])
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel("probability [%]")
+        axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel="probability [%]")
         axes.set_title("Which cause, given the records")
+        axes.grid(visible=False, axis="y")
     return figure
 
 
@@ -58,44 +51,57 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     with style.house_style():
         figure = style.new_figure(max(3.4, 1.8 + 0.3 * len(rows)))
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
-        at = np.arange(len(gaps))
-        left.bar(at, list(gaps.values()), color=[gap_style.MODELS[name]["color"] for name in gaps], width=0.6)
-        for x, value in zip(at, gaps.values(), strict=True):
-            left.annotate(
-                f"{value:.3f}" if value < 10 else f"{value:.1f}",
-                (x, value),
-                xytext=(0, 3),
-                textcoords="offset points",
-                ha="center",
-                fontsize=10,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
-            )
-        left.axhline(floor, **gap_style.FLOOR, zorder=1)
-        left.set_xticks(
-            at, [gap_style.WORDS[name].replace(", ", ",\n").replace(" ", "\n", 1) for name in gaps]
+        bars = left.bar(
+            np.arange(len(gaps)),
+            list(gaps.values()),
+            color=[gap_style.MODELS[model]["color"] for model in gaps],
+            width=0.6,
+            tick_label=[gap_style.WORDS[model].replace(" ", "\n") for model in gaps],
         )
-        left.set_xlim(-0.6, max(len(gaps), 3) - 0.4)
-        left.set_ylim(0, 1.15 * max(*gaps.values(), floor))
+        left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
+        left.axhline(floor, **gap_style.FLOOR, zorder=1)
+        left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
+        left.set(ylabel="residual over noise, RMS [1]", title="Held-out experiments together")
         left.grid(visible=False, axis="x")
-        left.set_ylabel("residual over noise, RMS [1]")
-        left.set_title("Held-out experiments together")
-        for name in gaps:
-            marker, offset = _LOOKS[name]
-            right.plot(
-                [entry[name] for entry in rows.values()],
-                np.arange(len(rows)) + offset,
-                marker,
-                ms=6,
-                color=gap_style.MODELS[name]["color"],
-                label=gap_style.WORDS[name],
-            )
+        for model in gaps:
+            marker, offset = _LOOKS[model]
+            at = np.arange(len(rows)) + offset
+            right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
         right.axvline(floor, **gap_style.FLOOR)
-        right.set_xscale("log")
         largest = max(max(entry.values()) for entry in rows.values())
-        right.set_xlim(0.8 * floor, 1.3 * max(largest, 2 * floor))
+        right.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(largest, 2 * floor)))
         right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
-        right.set_ylim(len(rows) - 0.5, -0.5)
-        right.set_xlabel("residual over noise, RMS [1]")
+        right.set(ylim=(len(rows) - 0.5, -0.5), xlabel="residual over noise, RMS [1]")
         right.set_title("Every experiment alone")
         style.finish(figure, (right, left))
     return figure
+
+
+@drawing("gap_overview")
+def draw_case_gaps(
+    names: Sequence[str],
+    answers: Sequence[str],
+    before: Sequence[float],
+    after: Sequence[float],
+    floors: Sequence[float],
+) -> Figure:
+    """One line per case: RMS over noise (C,) with the nominal parameters, and with the effects added."""
+    at, floor = np.arange(len(names)), float(np.median(floors))
+    with style.house_style():
+        figure = style.new_figure(1.5 + 0.32 * len(names))
+        axes = figure.subplots()
+        axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
+        for model, values in (("stated", before), ("repaired", after)):
+            axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
+        axes.axvline(floor, **gap_style.FLOOR, zorder=0)
+        axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
+        labels = [f"{style.plain(n, 34)}: {style.plain(a, 44)}" for n, a in zip(names, answers, strict=True)]
+        axes.set_yticks(at, labels)
+        axes.set(ylim=(len(names) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
+        axes.set_title("How far each gap shrinks")
+        style.finish(figure, axes)
+    return figure
+
+
+def _label(model: str) -> dict[str, Any]:
+    return {"color": gap_style.MODELS[model]["color"], "label": gap_style.WORDS[model]}

@@ -54,11 +54,8 @@ def draw_bands_and_experiments(where: Where) -> Figure:
                 )
                 left.plot([middle, middle], np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
             left.plot([], [], color=colour, lw=4.0, label=name)
-        left.set_xscale("log")
-        left.set_yscale("log")
+        left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="gap over noise, RMS [1]")
         left.set_ylim(bottom=_SMALLEST)
-        left.set_xlabel("frequency [Hz]")
-        left.set_ylabel("gap over noise, RMS [1]")
         left.set_title("By frequency")
         for row, entry in enumerate(experiments):
             for sensor, part, offset in zip(SENSORS, entry.sensors, (-0.15, 0.15), strict=True):
@@ -66,10 +63,9 @@ def draw_bands_and_experiments(where: Where) -> Figure:
                 right.barh(row + offset, part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
                 right.plot(part.interval, [row + offset] * 2, **_WHISKER)
         right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-        right.set_ylim(len(experiments) - 0.5, -0.5)
-        right.grid(visible=False, axis="y")
-        right.set_xlabel("gap over noise, RMS [1]")
+        right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel="gap over noise, RMS [1]")
         right.set_title("By experiment and sensor")
+        right.grid(visible=False, axis="y")
         left.plot([], [], **_WHISKER, label="95 % interval")
         style.finish(figure, (left, right))
     return figure
