@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 
 from workflow.figures.registry import drawings
 from workflow.report import rendering
+from workflow.report.environment import environment as shared
+from workflow.report.environment import render_text
 from workflow.report.formats import (
     count,
     decibels,
@@ -108,7 +110,7 @@ def line(monkeypatch):
         figure.subplots().plot(values)
         return figure if values else None
 
-    environment = rendering.environment()
+    environment = shared()
     loader = ChoiceLoader(
         [DictLoader({"test.html.j2": PAGE, "test.txt.j2": "{{ name }}"}), environment.loader]
     )
@@ -130,11 +132,11 @@ def test_a_template_draws_its_figures_and_escapes_what_it_is_given(line):
 
 
 def test_texts_are_not_escaped(line):
-    assert rendering.render_text("test.txt.j2", name="a < b & c") == "a < b & c"
+    assert render_text("test.txt.j2", name="a < b & c") == "a < b & c"
 
 
 def test_every_figure_that_a_template_names_can_be_drawn():
-    environment = rendering.environment()
+    environment = shared()
     for template in environment.list_templates(extensions=["j2"]):
         assert environment.loader is not None
         source = environment.loader.get_source(environment, template)[0]

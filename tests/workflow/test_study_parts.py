@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +32,7 @@ from workflow.figures.study import Mark, Panel, draw_pareto
 from workflow.figures.style import PREDICTED, render
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.keys import last_name, parse_key, with_values
-from workflow.study.page import point_tables
+from workflow.study.page import StudyView, study_page
 from workflow.study.points import short
 from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
@@ -355,10 +357,15 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
         "settled_draws": 1,
         "draws": 2,
     }
-    row = PointRow(1, "a", {axis.key: 1.0}, "does not settle", "why", numbers)
-    certified, achieved = point_tables((axis,), [row], {})
-    assert certified.head == ("point", "asked", "worst-case gamma", "gamma of any order", "state")
-    assert certified.rows == (("1", "1", "0.9", "0.8", "does not settle"),)
-    assert achieved.head == ("point", "asked", "peak of S, predicted", "peak of S, measured", "settle")
-    assert achieved.rows == (("1", "1", "1.4", "1.42", "1 of 2"),)
-    assert (certified.met, achieved.met) == ((False,), (False,))
+    row = PointRow(1, "a", {axis.key: 1.0}, "does not come to rest", "why", numbers)
+    search = SimpleNamespace(method="grid")
+    config: Any = SimpleNamespace(axes=(axis,), pareto=(), search=search)
+    page = study_page("a study", StudyView(config, "[study]", "the arm", [row], [], {})).html
+    tables = re.findall(r"<thead>(.*?)</thead>\s*<tbody>(.*?)</tbody>", page, re.DOTALL)
+    heads = [re.findall(r"<th[^>]*>(.*?)</th>", head) for head, _ in tables]
+    rows = [re.findall(r"<td>(.*?)</td>", body) for _, body in tables]
+    assert heads[0] == ["point", "asked", "worst-case gamma", "gamma of any order", "state"]
+    assert rows[0] == ["1", "1", "0.9", "0.8", "does not come to rest"]
+    assert heads[1] == ["point", "asked", "peak of S, predicted", "peak of S, measured", "come to rest"]
+    assert rows[1] == ["1", "1", "1.4", "1.42", "1 of 2"]
+    assert all('<tr class="no">' in body for _, body in tables)

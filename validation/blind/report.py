@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from validation.blind.truth import LISTED
-from workflow.report.rendering import environment
+from workflow.report.environment import environment
 from workflow.tasks.summary import Row, RunSummary, Section
 
 _SLICES = ("all", "exact", "uncertain")

@@ -12,7 +12,8 @@ from validation.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
 from validation.paper.quotes import OPEN_CHOICES, REPORTED, SOURCE
 from validation.paper.table import Row
 from workflow.figures.style import Picture
-from workflow.report.rendering import embedded, environment
+from workflow.report.environment import environment
+from workflow.report.rendering import embedded
 
 
 def headlines_of(results: PaperResults, findings: Findings) -> list[str]:

@@ -8,36 +8,15 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from workflow.figures.registry import drawings
 from workflow.figures.style import Picture, inline_svg, render
-from workflow.report.formats import FILTERS, TESTS
-from workflow.report.page import Plot, Section
-
-
-@cache
-def environment(package: str = "workflow") -> Environment:
-    """The one environment of all pages and texts; another package's templates come before ours.
-
-    Everything that comes from the user is escaped.
-    """
-    made = Environment(
-        loader=ChoiceLoader([PackageLoader(name) for name in dict.fromkeys((package, "workflow"))]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    made.filters.update(FILTERS)
-    made.tests.update(TESTS)
-    return made
+from workflow.report.environment import environment
 
 
 @dataclass(frozen=True)
@@ -72,29 +51,6 @@ def render_page(
 
     page = environment().get_template(template).render(draw=draw, contents=[], **values)
     return RenderedPage(page.strip() + "\n", pictures)
-
-
-def render_text(template: str, **values: Any) -> str:
-    """Plain text by template: for terminals and files. Nothing is escaped."""
-    return Markup(environment().get_template(template).render(**values)).unescape()
-
-
-def page(
-    template: str,
-    *,
-    title: str,
-    sections: Sequence[Section],
-    pictures: Mapping[str, Picture],
-    **values: Any,
-) -> str:
-    """A page of sections that Python made; pictures by the names that the sections' plots give them."""
-    drawn = {
-        block.name: embedded(block.name, block.caption, pictures[block.name])
-        for section in sections
-        for block in section.blocks
-        if isinstance(block, Plot)
-    }
-    return environment().get_template(template).render(title=title, sections=sections, drawn=drawn, **values)
 
 
 def embedded(name: str, label: str, picture: Picture) -> Markup:

@@ -16,7 +16,7 @@ from workflow.tasks.achievable_performance import order_advice
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import verdict_of
 
-State = Literal["certified", "does not settle", "not certified", "impossible", "failed"]
+State = Literal["certified", "does not come to rest", "not certified", "impossible", "failed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     elif not certify.certified:
         state = "not certified"
     elif loop.check is None or loop.check.settled_draws != loop.check.draws:
-        state = "does not settle"
+        state = "does not come to rest"
     else:
         state = "certified"
     numbers = numbers_of(

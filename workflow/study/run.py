@@ -26,7 +26,7 @@ from workflow.study.settings import StudyConfig, load_study
 from workflow.study.task import Job, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
-from workflow.tasks.summary import Row, RunSummary, Section
+from workflow.tasks.summary import RunSummary
 
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
 
@@ -234,7 +234,7 @@ def _write_up(
     directory: StudyDirectory, study: StudyConfig, text: str, base: Base, rows: Sequence[PointRow]
 ) -> RunSummary:
     """Table, picture and page, the page last."""
-    from workflow.study.page import findings, headline, study_page, study_pictures
+    from workflow.study.page import StudyView, study_page, study_summary
 
     fronts = [pareto_front(rows, plot) for plot in study.pareto]
     title = study.study.title or base.config.run.title or base.config.run.name
@@ -253,43 +253,13 @@ def _write_up(
     storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, fronts))
     table = json.dumps(storage.strict_json(storage.encode(document)), indent=1, ensure_ascii=False)
     storage.write_text(directory.path / "table.json", table + "\n")
-    units = _units(directory, rows)
-    pictures = study_pictures(study.pareto, rows, fronts, units)
-    for name, picture in pictures.items():
-        storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
-    storage.write_text(
-        directory.page_path,
-        study_page(title, study, text, where, rows, fronts, pictures, units),
-    )
-    return RunSummary(
-        title=title,
-        sections=(
-            Section("study", (Row("points", headline(rows)),)),
-            *(
-                (Section("best", tuple(Row("", words) for words in best)),)
-                if (best := findings(study.axes, rows))
-                else ()
-            ),
-            Section("points", tuple(_line(study, row) for row in rows)),
-        ),
-        numbers=document,
-        certified=any(row.good for row in rows),
-        verdict=headline(rows) if any(row.good for row in rows) else f"no point is certified: {rows[0].why}",
-        report_path=str(directory.page_path),
-    )
-
-
-def _line(study: StudyConfig, row: PointRow) -> Row:
-    from workflow.study.points import short
-
-    asked = ", ".join(f"{axis.name} {short(row.values[axis.key])}" for axis in study.axes)
-    words: list[str] = [row.state]
-    for name in ("worst_gamma", "modulus_margin", "bandwidth_rad_s"):
-        value = row.numbers[name]
-        if value is not None:
-            words.append(f"{COLUMNS[name].label} {value:.4g} {COLUMNS[name].unit}".rstrip())
-    return Row(f"{row.number}: {asked}", ", ".join(words))
+    view = StudyView(study, text, where, rows, fronts, _units(directory, rows))
+    page = study_page(title, view)
+    for name, picture in page.pictures.items():
+        storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)
+    storage.write_text(directory.page_path, page.html)
+    return study_summary(title, view, document, str(directory.page_path))
 
 
 def _units(directory: StudyDirectory, rows: Sequence[PointRow]) -> dict[str, str]:

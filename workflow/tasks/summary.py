@@ -42,6 +42,11 @@ class Section:
     rows: tuple[Row, ...]
 
 
+def sections_of(parts: Sequence[tuple[str, Sequence[tuple[str, str]]]]) -> tuple[Section, ...]:
+    """Of a table that a template made."""
+    return tuple(Section(title, tuple(Row(*row) for row in rows)) for title, rows in parts)
+
+
 @dataclass(frozen=True)
 class RunSummary:
     """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.

@@ -1,0 +1,61 @@
+"""The one environment of all templates; it loads no matplotlib, so texts for terminals come from it too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from workflow.report.formats import FILTERS, TESTS
+
+
+@cache
+def environment(package: str = "workflow") -> Environment:
+    """The one environment of all pages and texts; another package's templates come before ours.
+
+    Everything that comes from the user is escaped.
+    """
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader(name) for name in dict.fromkeys((package, "workflow"))]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters.update(FILTERS)
+    made.tests.update(TESTS)
+    return made
+
+
+def render_text(template: str, **values: Any) -> str:
+    """Plain text by template: for terminals and files. Nothing is escaped."""
+    return Markup(environment().get_template(template).render(**values)).unescape()
+
+
+def rows_of(template: str, **values: Any) -> list[tuple[str, list[tuple[str, str]]]]:
+    """A table by template: titles with their (label, value) rows, plain text on one line each.
+
+    The template calls part("title") and {% call line("label") %}value{% endcall %}; an empty value is no row.
+    """
+    parts: list[tuple[str, list[tuple[str, str]]]] = []
+
+    def part(title: str) -> str:
+        parts.append((_plain(title), []))
+        return ""
+
+    def line(label: str, caller: Callable[[], str]) -> str:
+        value = _plain(caller())
+        if value:
+            parts[-1][1].append((_plain(label), value))
+        return ""
+
+    environment().get_template(template).render(part=part, line=line, **values)
+    return [(title, rows) for title, rows in parts if rows]
+
+
+def _plain(text: str) -> str:
+    """Without escapes, on one line."""
+    return " ".join((text.unescape() if isinstance(text, Markup) else str(text)).split())
