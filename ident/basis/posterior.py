@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from ident.basis.functions import basis_response, regressor
 from ident.basis.poles import Poles
-from ident.basis.structure import filter_input
+from ident.basis.structure import filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import ellipse_distance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -102,12 +102,7 @@ class ResponsePosterior:
         if self.has_feedthrough:
             parts.append(np.ones((omega.size, 1), dtype=np.complex128))
         parts.append(np.exp(-1j * self.dt_s * np.outer(omega, np.arange(1, self.fir_length + 1))))
-        # 1 - z^-1 written with sin, which keeps its digits near omega = 0 where the difference would lose
-        # them.
-        half = 0.5 * omega * self.dt_s
-        common = np.exp(-1j * omega * self.dt_s * self.input_delay_samples)
-        if self.integrators:
-            common = common / (2j * np.sin(half) * np.exp(-1j * half)) ** self.integrators
+        common = front_response(omega, self.dt_s, self.integrators, self.input_delay_samples)
         return np.asarray(common[:, None] * np.hstack(parts))
 
     def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.data.arrays import RealArray
+from ident.data.arrays import ComplexArray, RealArray
 
 
 @dataclass(frozen=True)
@@ -59,3 +59,13 @@ def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArra
     for _ in range(integrators):
         delayed = np.cumsum(delayed)
     return delayed
+
+
+def front_response(omega_rad_s: RealArray, dt_s: float, integrators: int, delay_samples: int) -> ComplexArray:
+    """(z/(z - 1))^integrators z^-delay at omega (F,) in rad/s (not 0 with integrators), (F,)."""
+    response = np.exp(-1j * omega_rad_s * dt_s * delay_samples)
+    if integrators:
+        # 1 - z^-1 written with sin keeps its digits near omega = 0 where the difference would lose them.
+        half = 0.5 * omega_rad_s * dt_s
+        response = response / (2j * np.sin(half) * np.exp(-1j * half)) ** integrators
+    return np.asarray(response, dtype=np.complex128)

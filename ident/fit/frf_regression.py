@@ -16,7 +16,7 @@ import numpy as np
 from ident.basis.coordinates import SearchSpace
 from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.poles import Poles
-from ident.basis.posterior import ResponsePosterior
+from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import standard_axes
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -192,7 +192,7 @@ def prepare_response(
     z = np.exp(1j * omega * response.dt_s)
     frame = FrfRegression(
         z=z,
-        common=common_factor(omega, response.dt_s, integrators, delay_samples),
+        common=front_response(omega, response.dt_s, integrators, delay_samples),
         turn=turn,
         weight=weight,
         y=np.zeros(2 * omega.size),
@@ -201,20 +201,6 @@ def prepare_response(
     )
     y = frame.whiten(response.centre[:, np.newaxis])[:, 0]
     return FrfRegression(z, frame.common, turn, weight, y, feedthrough, response.dt_s)
-
-
-def common_factor(omega_rad_s: RealArray, dt_s: float, integrators: int, delay_samples: int) -> ComplexArray:
-    """(z / (z - 1))^integrators z^-delay at omega (F,)."""
-    alone = ResponsePosterior(  # a direct term of 1 and no poles: the known factor alone
-        Poles(),
-        np.ones(1),
-        np.zeros((1, 1)),
-        dt_s,
-        has_feedthrough=True,
-        integrators=integrators,
-        input_delay_samples=delay_samples,
-    )
-    return alone.centre(omega_rad_s)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ident.basis.functions import basis_response
 from ident.basis.miso_model import MisoModel
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure
+from ident.basis.structure import Structure, front_response
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
@@ -77,7 +77,7 @@ def response_uncertainty(
     z = np.exp(1j * omega * model.dt_s)
     centre = model.frequency_response(omega)
     basis = basis_response(model.poles, z)
-    front = z ** (-model.input_delay_samples) * (1 - 1 / z) ** (-model.integrators)
+    front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
     states = _block_responses(model.poles, z)[:, free]
     result = []
     n, n_inputs = model.order, model.n_inputs

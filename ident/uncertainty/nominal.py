@@ -9,6 +9,7 @@ from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
+from ident.basis.structure import front_response
 from ident.data.ellipses import standard_axes
 
 # An ellipse thinner than this part of the response would let one frequency overrule all the others.
@@ -35,15 +36,7 @@ def nominal_near(
     columns = basis_response(poles, np.exp(1j * omega * posterior.dt_s))
     if direct:
         columns = np.column_stack([columns, np.ones(omega.size)])
-    common = ResponsePosterior(  # the integrators and the delay alone: one direct term of 1 and no poles
-        Poles(),
-        np.ones(1),
-        np.zeros((1, 1)),
-        posterior.dt_s,
-        has_feedthrough=True,
-        integrators=posterior.integrators,
-        input_delay_samples=posterior.input_delay_samples,
-    ).centre(omega)
+    common = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
     s1, s2, u1 = standard_axes(uncertainty.covariance)
     floor = _THINNEST * np.abs(uncertainty.centre)
     aligned = (common * u1.conj())[:, None] * columns
