@@ -81,8 +81,8 @@ def run(seed=0):
 def main() -> None:
     found = run()
     print(f"verdict: {found.verdict}, {' and '.join(found.combination)}")
-    print(f"gap on the held-out record, in noise deviations: {found.gap_before:.1f} as stated,")
-    print(f"    {found.gap_refit:.1f} with stated values moved, {found.gap_after:.2f} with these effects")
+    print(f"gap on the held-out record, in noise deviations: {found.gap_before:.1f} with nominal parameters,")
+    print(f"    {found.gap_refit:.1f} with these re-estimated, {found.gap_after:.2f} with the effects added")
     for effect in found.effects[: len(found.combination)]:
         for key, value in effect.parameters.items():
             low, high = effect.intervals[key]

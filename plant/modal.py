@@ -32,7 +32,7 @@ Real = npt.NDArray[np.float64]
 
 INPUT_NAMES = ("voltage_V", "hub_torque_Nm", "tip_force_N")
 OUTPUT_NAMES = ("hub_angle_rad", "tip_m")
-# Share of the hub inertia on the motor side of a gear with play.
+# Share of the hub inertia on the motor side of a gear with backlash.
 MOTOR_SIDE_SHARE = 0.3
 
 

@@ -1,6 +1,6 @@
 """From a machine to the arrays the compiled stepper works on.
 
-Method. Dry friction (an elastic element whose force is limited) and contact in a gear with play are
+Method. Dry friction (an elastic element whose force is limited) and contact in a gear with backlash are
 *piecewise linear*: in each of their modes the arm is one linear system, stepped exactly with its matrix
 exponential. A step at whose end some element no longer holds its mode is halved, down to 1/512 of the basic
 step, and only there the mode changes; step sizes are the basic one divided by powers of two, so their

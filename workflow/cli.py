@@ -367,7 +367,7 @@ def diagnose(
     ] = False,
     controller: Annotated[
         bool,
-        typer.Option(help="Compare controllers designed on the rig as stated and on the repaired one."),
+        typer.Option(help="Compare controllers designed on the nominal rig and on the repaired one."),
     ] = True,
     as_json: Json = False,
 ) -> None:

@@ -40,7 +40,7 @@ STILL_POSSIBLE = 20.0
 _AT_EDGE = 2.0
 # What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
 # records determine: an effect that contains another (Stribeck and Coulomb friction) costs nothing where it
-# imitates it, and the simpler name is the better one then.
+# looks like it, and the simpler name is the better one then.
 _PER_PARAMETER = 1.0
 
 

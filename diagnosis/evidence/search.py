@@ -32,7 +32,7 @@ _LEAST_GAIN = 10.0
 _PROMISE = 5.0
 _ROUGH_ITERATIONS, _FINE_ITERATIONS = 8, 15
 _MOST_EFFECTS = 3
-# Where two effects leave more than this share of the gap, a third would only imitate something unknown.
+# Where two effects leave more than this share of the gap, a third would only follow something unknown.
 _HOPELESS = 0.1
 # Sets whose members are tried without one of them.
 _SETS_TO_REDUCE = 3
@@ -269,7 +269,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
         quick = all(c.dependence == "smooth" for c in item.candidates)
         promising = close and (quick or item.cost < around.cost - _LEAST_GAIN)
         promising = promising or (quick and not around.candidates)
-        # An imitation of something else by backlash takes as long as everything besides.
+        # A backlash that only looks like something else takes as long as everything besides.
         costly = item.non_smooth and not _near(item, base)
         if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
             fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
@@ -279,7 +279,7 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
 
 
 def _refined(model: ResidualModel, end: Fit, base: Fit) -> Fit:
-    """`refined` where backlash or the like may be the answer; beside much of a gap jags are no matter."""
+    """`refined` where backlash or the like may be the answer; beside much of a gap jumps do not matter."""
     return refined(model, end) if _near(end, base) else end
 
 

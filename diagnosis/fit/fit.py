@@ -277,7 +277,7 @@ def _inside(x: float, slope: float, spread: float, low: float, high: float) -> f
     """log of the integral of exp(-slope t - t^2/(2 spread^2)) inside the box, over spread sqrt(2 pi)."""
     if not np.isfinite(low):
         return min(0.0, float(np.log(2 * np.pi / (spread * np.sqrt(2 * np.pi)))))
-    # Complete the square only where a bound holds the coordinate; elsewhere the slope is rounding, or a jag.
+    # Complete the square only where a bound holds the coordinate; elsewhere the slope is rounding, or a jump.
     held = (x <= low and slope > 0) or (x >= high and slope < 0)
     centre = x - slope * spread**2 if held else x
     shift = 0.5 * (slope * spread) ** 2 if held else 0.0

@@ -17,9 +17,8 @@ from diagnosis.where.findings import Where
 from diagnosis.where.linear_correction import linear_correction
 from diagnosis.where.missing_function import missing_functions
 from diagnosis.where.regimes import motions, regime_axes, regime_findings
-from diagnosis.where.where_common import common_findings
 from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
-from diagnosis.where.where_trends import amplitude_finding, drift_findings
+from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings
 from plant.effects import EFFECTS
 
 LEVEL = 0.01

@@ -10,8 +10,8 @@ from diagnosis import Case, Experiment, ResidualModel
 from diagnosis.where.distortion import period_of, periodic_findings
 from diagnosis.where.regimes import motions
 from diagnosis.where.where import subsystem_mass, where
-from diagnosis.where.where_common import common_findings
 from diagnosis.where.where_energy import band_gaps, sensor_gaps
+from diagnosis.where.where_trends import common_findings
 from plant import EFFECTS, multisine, multisine_lines, simulate
 from plant.effects import (
     CoulombFriction,

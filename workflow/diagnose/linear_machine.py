@@ -22,8 +22,8 @@ def sampled_linear_machine(rig: Rig, effects: Sequence[Effect]) -> control.State
     """voltage_V -> (hub_angle_rad, tip_m), the voltage held over the rig's sampling period.
 
     Rig values, compliances, gain, delay (any fraction of a sample) and lag of the actuator are in it. Dry
-    friction, play, dead zone, saturation, ripple, the hardening spring, gravity and everything behind the tip
-    sensor are not: they have no linear model, or none that is fed back.
+    friction, backlash, dead zone, saturation, ripple, the hardening spring, gravity and everything behind the
+    tip sensor are not: they have no linear model, or none that is fed back.
     """
     machine = make_machine(rig, effects)
     if machine.joint.backlash_gap_rad is not None:
