@@ -37,23 +37,20 @@ from workflow.config.design_options import (
     ReferenceFilterSettings,
 )
 from workflow.engine.errors import InputError
+from workflow.report.environment import said
 from workflow.tasks.achievable_performance import (
-    achievable_words,
     bracket_numbers,
     find_bracket,
-    order_advice,
 )
 from workflow.tasks.controller_files import filter_bytes, filter_file
 from workflow.tasks.joint_coverage import (
     certify_asked,
     joint_numbers,
-    joint_words,
-    open_words,
     synthesise_asked,
     undrawable,
 )
 from workflow.tasks.proportions import wilson_interval
-from workflow.tasks.reference_filter import filter_words, find_filter, model_answer
+from workflow.tasks.reference_filter import find_filter, model_answer
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -98,19 +95,17 @@ def test_wilson_interval_refuses_more_than_all():
 
 def test_words_of_the_achievable_performance():
     found = achievable(0.8)
-    words = achievable_words(found, 0.88, 4)
-    assert words is not None
-    assert "order 4: gamma 0.88, 10 % above" in words
-    assert "0.8;" in words
+    words = said("any_order", found, 0.88, 4)
+    assert "is 0.88 with this controller of order 4: 10 % above the 0.8 that" in words
     assert bracket_numbers(found, 0.88)["above_percent"] == pytest.approx(10.0)
-    assert "known to reach gamma 0.8" in str(achievable_words(found, float("inf"), 4))
-    assert achievable_words(AchievablePerformance(), 0.88, 4) is None
+    assert "known to reach gamma 0.8" in said("any_order", found, float("inf"), 4)
+    assert said("any_order", AchievablePerformance(), 0.88, 4) == ""
 
 
 def test_advice_on_the_order():
-    assert "controller_order = 3 is too low" in str(order_advice(achievable(0.8), 1.2, 3))
-    assert "a higher order does not help" in str(order_advice(achievable(1.1), 1.2, 3))
-    assert order_advice(AchievablePerformance(), 1.2, 3) is None
+    assert "controller_order = 3 is too low" in said("order_advice", achievable(0.8), 1.2, 3)
+    assert "a higher order does not help" in said("order_advice", achievable(1.1), 1.2, 3)
+    assert said("order_advice", AchievablePerformance(), 1.2, 3) == ""
 
 
 def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
@@ -166,11 +161,11 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
     assert raised.certificate.gamma > kept.certificate.gamma, "ellipses of 99 % are larger"
     assert not raised.certified, "99 % of the draws are stable, and 99.9 % are an item"
     assert (kept.sampled.calibrated, raised.sampled.calibrated) == (False, True)
-    assert "calibrate = true" in str(joint_words(kept.sampled))
-    assert "certified over ellipses of 99 %" in str(joint_words(raised.sampled))
+    assert "calibrate = true" in said("calibration", kept.sampled)
+    assert "certified over ellipses of 99 %" in said("calibration", raised.sampled)
     left = kept.certificate.not_checked
-    assert any("joint level: sampled" in words for words in open_words(left, kept.sampled))
-    assert open_words(left, SampledResponses()) == list(left)
+    assert any("joint level: sampled" in said("not_checked", words, kept.sampled) for words in left)
+    assert [said("not_checked", words, SampledResponses()) for words in left] == list(left)
 
 
 def test_calibration_is_designed_for(monkeypatch):
@@ -196,15 +191,18 @@ def test_calibration_is_designed_for(monkeypatch):
     assert asked == ["jointly", "plain", "plain"]
 
 
-def test_words_of_whole_responses():
-    words = str(joint_words(sampled_responses(0.9)))
-    assert "1000 whole responses" in words
-    assert "holds for 99 % (95 % interval 98.17 to 99.46 %)" in words
-    assert "100 % stable" in words
-    assert joint_words(SampledResponses()) is None
-    lost = sampled_responses(0.9)
-    lost = replace(lost, joint=replace(lost.joint, gamma_given=float("inf")))
-    assert "no worst case of the ellipses" in str(joint_words(lost))
+def test_words_of_sampled_responses():
+    def words(found):
+        return said("sampled", found, joint_numbers(found))
+
+    found = sampled_responses(0.9)
+    assert "of 1000 responses sampled" in words(found)
+    assert "99 % stay within the worst case" in words(found)
+    assert "98.17 % to 99.46 % with 95 % confidence" in words(found)
+    assert "100 % give a stable loop" in words(found)
+    assert words(SampledResponses()) == ""
+    lost = replace(found, joint=replace(found.joint, gamma_given=float("inf")))
+    assert "no worst case of the ellipses" in words(lost)
 
 
 def test_what_cannot_be_drawn_says_why():
@@ -219,7 +217,7 @@ def test_what_cannot_be_drawn_says_why():
         controller(), [exact], spec(), CertificateOptions.model_validate({}), np.random.default_rng(1)
     )
     assert found.certificate.joint is None
-    assert "not sampled: no uncertainty" in str(joint_words(found.sampled))
+    assert "no uncertainty is stated" in said("sampled", found.sampled, {})
 
 
 def test_options_that_contradict_themselves():
@@ -282,14 +280,14 @@ def test_prefilter_follows_the_model_better_than_none(filtered):
     s = 2j / DT_S * np.tan(omega * DT_S / 2)
     error = np.abs(found.response(omega) * loop / (1 + loop) - 1 / (s + 1) ** 2)
     assert error.max() <= found.error_after * 1.001
-    assert "times smaller" in str(filter_words(filtered))
+    assert "times smaller" in said("reference_filter", filtered)
 
 
 def test_prefilter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0})
     result = find_filter(controller(500.0), [plant()], settings)
     assert result.filter is None
-    assert str(filter_words(result)).startswith("no reference filter: plant 'hub'")
+    assert said("reference_filter", result).startswith("no reference filter: plant 'hub'")
     assert find_filter(controller(), [plant()], None).reason is None
     with pytest.raises(InputError, match=r"reference_filter\.corner_rad_s: 1000 lies beyond the Nyquist"):
         find_filter(controller(), [plant()], ReferenceFilterSettings.model_validate({"corner_rad_s": 1e3}))

@@ -143,7 +143,7 @@ def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexl
     assert found["files"] == [str(out), str(beside)]
     assert np.array_equal(Prefilter.from_json(beside.read_text()).A, filtered["A"])
     table = {row["label"]: row["value"] for row in json.loads(answer.out)["table"]}
-    assert "what a controller of any order is known to reach" in table["against any order"]
+    assert "that a controller of any order is known to reach" in table["achievable performance"]
     assert "times smaller" in table["model matching"]
 
 

@@ -35,6 +35,11 @@ def render_text(template: str, **values: Any) -> str:
     return Markup(environment().get_template(template).render(**values)).unescape()
 
 
+def said(macro: str, *values: Any) -> str:
+    """A sentence of sentences.j2 by the name of its macro, on one line; empty where nothing is to be said."""
+    return _plain(getattr(environment().get_template("sentences.j2").module, macro)(*values))
+
+
 def rows_of(template: str, **values: Any) -> list[tuple[str, list[tuple[str, str]]]]:
     """A table by template: titles with their (label, value) rows, plain text on one line each.
 

@@ -99,6 +99,16 @@ def decibels(factor: float) -> str:
     return f"{number(factor)} ({20 * math.log10(factor):+.1f} dB)" if factor > 0 else "no lower limit"
 
 
+def in_decibels(factor: float) -> float:
+    """A gain factor (above 0) in dB."""
+    return 20 * math.log10(factor)
+
+
+def unit(text: str, name: str) -> str:
+    """A unit behind numbers that are text already."""
+    return f"{text} {name}".rstrip()
+
+
 def listing(items: Iterable[object]) -> str:
     """a, b and c."""
     words = [str(item) for item in items]
@@ -163,6 +173,8 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "ln": math.log,
     "degrees": degrees,
     "decibels": decibels,
+    "in_decibels": in_decibels,
+    "unit": unit,
     "listing": listing,
     "count": count,
     "sentence": sentence,

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from workflow.engine.run_directory import RunDirectory
+from workflow.report.environment import said
 from workflow.study.columns import COLUMNS, Number, numbers_of
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot
-from workflow.tasks.achievable_performance import order_advice
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import verdict_of
 
@@ -68,7 +68,7 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
-        advice = order_advice(achievable, design.gamma, specification.controller_order)
+        advice = said("order_advice", achievable, design.gamma, specification.controller_order)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         why = verdict_of(replace(design, met=True), certify, loop)

@@ -60,39 +60,5 @@ def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[s
     }
 
 
-def achievable_words(found: AchievablePerformance, gamma: float | None, order: int) -> str | None:
-    """One sentence on the order chosen; None where there is nothing to say."""
-    bracket = found.bracket
-    if bracket is None:
-        return f"not compared with other orders: {found.reason}" if found.reason else None
-    if gamma is None or not math.isfinite(gamma):
-        if not math.isfinite(bracket.ellipse):
-            return "no controller of any order is known to stabilise every member of the ellipses"
-        return f"a controller of any order is known to reach gamma {bracket.ellipse:.4g}"
-    return bracket.sentence(gamma, order)
-
-
-def order_advice(found: AchievablePerformance, gamma: float, order: int) -> str | None:
-    """Whether a higher order could meet what was missed; None where the bracket says nothing.
-
-    The bracket knows neither structure nor damping of the controller's poles, and with several plants it is
-    what one controller per plant reaches: more than that no order gives.
-    """
-    bracket = found.bracket
-    if bracket is None or not math.isfinite(bracket.ellipse):
-        return None
-    reached = bracket.ellipse
-    if reached > 1.0:
-        return (
-            f"a higher order does not help: a controller of very high order reaches {reached:.4g} here "
-            f"(this one {gamma:.4g}, 1 is needed); ask for less"
-        )
-    several = ", one for each plant" if len(bracket.plants) > 1 else ""
-    return (
-        f"controller_order = {order} is too low: controllers of very high order{several} reach {reached:.4g} "
-        f"(this one {gamma:.4g}, at most 1 is needed)"
-    )
-
-
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -28,10 +28,11 @@ from workflow.engine.errors import InputError, naming, need
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.engine.run_directory import RunDirectory, default_directory
-from workflow.tasks.achievable_performance import bracket_numbers, find_bracket, order_advice
+from workflow.report.environment import rows_of, said
+from workflow.tasks.achievable_performance import bracket_numbers, find_bracket
 from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
-from workflow.tasks.design_source import DesignFile, DesignSource, load_sources, read_design_file
-from workflow.tasks.joint_coverage import certify_asked, joint_numbers, open_words
+from workflow.tasks.design_source import DesignFile, load_sources, read_design_file
+from workflow.tasks.joint_coverage import certify_asked, joint_numbers
 from workflow.tasks.pipeline import config_of, run_pipeline
 from workflow.tasks.reference_filter import check_filter, find_filter
 from workflow.tasks.results import (
@@ -43,16 +44,7 @@ from workflow.tasks.results import (
 )
 from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 from workflow.tasks.stages.design import find_design
-from workflow.tasks.summary import (
-    Row,
-    RunSummary,
-    Section,
-    achievable_rows,
-    certificate_rows,
-    design_rows,
-    filter_sections,
-    sampled_rows,
-)
+from workflow.tasks.summary import RunSummary, sections_of
 
 BetweenPoints = Literal["nothing", "linear"]
 
@@ -268,10 +260,20 @@ def design_controller(
         files = write_controller(out, done.controller, found, certified=certified)
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
-        advice = order_advice(done.achievable, gamma, order)
+        advice = said("order_advice", done.achievable, gamma, order) or None
     reason = _reason(done, advice)
-    verdict = CertifyResult(certificate, certified, reason)
     sampled = SampledResponses() if done.certify is None else done.certify.sampled
+    shares = joint_numbers(sampled)
+    rows = rows_of(
+        "summary/design.j2",
+        sources=sources_found,
+        done=done,
+        order=order,
+        advice=advice,
+        verdict=CertifyResult(certificate, certified, reason, sampled),
+        shares=shares,
+        files=files,
+    )
     names = [plant.name for plant in plants]
     about = [
         {"file": str(path), "plant": source.plant.name, "origin": source.origin, "remarks": source.remarks}
@@ -279,23 +281,7 @@ def design_controller(
     ]
     return RunSummary(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
-        sections=(
-            Section("plants", tuple(row for source in sources_found for row in _plant_rows(source))),
-            Section(
-                "design",
-                (
-                    *design_rows(done.design),
-                    *achievable_rows(done.achievable, done.design, order),
-                    *([Row("order", advice)] if advice else []),
-                ),
-            ),
-            Section(
-                "certificate",
-                (*certificate_rows(verdict), *sampled_rows(sampled), *_not_checked_rows(done)),
-            ),
-            *filter_sections(done.reference_filter),
-            *([Section("written", tuple(Row("", str(path)) for path in files))] if files else []),
-        ),
+        sections=sections_of(rows),
         numbers={
             "plants": about,
             "design": {**codec.plain(done.design), "order_advice": advice},
@@ -303,7 +289,7 @@ def design_controller(
             "certificate": codec.plain(certificate),
             "certified": certified,
             "reason": reason,
-            "sampled_responses": joint_numbers(sampled),
+            "sampled_responses": shares,
             "reference_filter": codec.plain(done.reference_filter.filter),
             "file": str(files[0]) if files else None,
             "files": [str(path) for path in files],
@@ -330,18 +316,6 @@ def _reason(done: _Designed, advice: str | None) -> str:
         return reason if done.design.synthesis is None else f"{reason}; {_NO_CONTROLLER}"
     if certificate.certified:
         return reason
-    missed = [item.sentence() for item in certificate.items if not item.met]
+    missed = [said("requirement", item) for item in certificate.items if not item.met]
     text = "not certified: " + ("; ".join(missed) or "unstable, or an ellipse reaches -1")
     return f"{text}; {advice}" if advice else text
-
-
-def _not_checked_rows(done: _Designed) -> list[Row]:
-    found = done.certify
-    if found is None or found.certificate is None:
-        return []
-    words = open_words(found.certificate.not_checked, found.sampled)
-    return [Row("not checked" if number == 0 else "", text) for number, text in enumerate(words)]
-
-
-def _plant_rows(source: DesignSource) -> list[Row]:
-    return [Row(source.plant.name, source.origin), *(Row("", remark) for remark in source.remarks)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -108,16 +107,9 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
                     if plant.own_grid is not None
                     else "a bound, not a distribution"
                 )
-                return f"whole responses of {plant.name} cannot be drawn: its uncertainty is {known}"
+                return f"responses of {plant.name} cannot be sampled: its uncertainty is {known}"
             drawn = True
     return None if drawn else "no uncertainty is stated: there is nothing to draw from"
-
-
-def open_words(not_checked: Sequence[str], found: SampledResponses) -> list[str]:
-    """What a certificate did not check, with what sampling said of it meanwhile."""
-    sampled = "joint level: sampled, not certified; see the whole responses"
-    known = found.joint is not None
-    return [sampled if known and words.startswith("joint level") else words for words in not_checked]
 
 
 def joint_numbers(found: SampledResponses) -> dict[str, Any]:
@@ -136,44 +128,5 @@ def joint_numbers(found: SampledResponses) -> dict[str, Any]:
     }
 
 
-def joint_words(found: SampledResponses) -> str | None:
-    """One sentence on whole responses; None where there is nothing to say."""
-    joint = found.joint
-    if joint is None:
-        return f"not sampled: {found.reason}" if found.reason else None
-    of = f"{joint.draws} whole responses drawn from the posterior"
-    _, stable = _counted(joint.stable_share, joint.draws)
-    loop = f"{_percent(joint.stable_share)} stable (95 % interval {_between(stable)})"
-    if not math.isfinite(joint.gamma_given):
-        return f"{of}: {loop}; no worst case of the ellipses to compare with"
-    _, held = _counted(joint.coverage_given, joint.draws)
-    words = (
-        f"{of}: the worst case of the {_percent(joint.given_level)} ellipses, gamma {joint.gamma_given:.4g}, "
-        f"holds for {_percent(joint.coverage_given)} (95 % interval {_between(held)}), {loop}"
-    )
-    wanted = _percent(joint.coverage)
-    if found.calibrated and joint.level <= joint.given_level:
-        return f"{words}; the ellipses were certified as they are: {_percent(joint.level)} would do"
-    if found.calibrated:
-        return (
-            f"{words}; certified over ellipses of {_percent(joint.level)}, whose worst case "
-            f"{joint.gamma:.4g} holds for {wanted}"
-        )
-    if joint.level > joint.given_level:
-        return (
-            f"{words}, short of {wanted}: ellipses of {_percent(joint.level)} (gamma {joint.gamma:.4g}) "
-            "would hold for that many ([certificate] calibrate = true)"
-        )
-    return words
-
-
 def _counted(share: float, draws: int) -> tuple[float, tuple[float, float]]:
     return share, wilson_interval(round(share * draws), draws)
-
-
-def _between(interval: tuple[float, float]) -> str:
-    return f"{_percent(interval[0]).removesuffix(' %')} to {_percent(interval[1])}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.4g} %"

@@ -23,6 +23,8 @@ from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress, Silence
+from workflow.report.environment import rows_of
+from workflow.report.formats import count
 from workflow.tasks.results import IdentifiedChannel, IdentifiedPlant, UncertainChannel
 from workflow.tasks.stages.identify import settled
 from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
@@ -32,15 +34,7 @@ from workflow.tasks.stages.uncertainty import (
     residual_tests,
     uncertain_channel,
 )
-from workflow.tasks.summary import (
-    Row,
-    RunSummary,
-    Section,
-    channel_rows,
-    model_numbers,
-    uncertainty_numbers,
-    uncertainty_rows,
-)
+from workflow.tasks.summary import RunSummary, model_numbers, sections_of, uncertainty_numbers
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
@@ -309,17 +303,9 @@ def _summary(
     result: LogIdentification, out: Path | None, report: Path | None, export: Path | None
 ) -> RunSummary:
     about, spread = result.about, result.spread
-    careful = tuple(Row(f"{i}", text) for i, text in enumerate(result.careful, 1))
-    sections = [
-        Section("model", channel_rows(about, spread.intervals)),
-        Section("uncertainty", uncertainty_rows(spread)),
-    ]
-    if careful:
-        sections.append(Section("look at", careful))
-    count = len(careful)
     return RunSummary(
         title=f"{about.input} to {about.output}",
-        sections=tuple(sections),
+        sections=sections_of(rows_of("summary/identification.j2", result=result)),
         numbers={
             **model_numbers(about),
             "warnings": list(result.careful),
@@ -327,9 +313,7 @@ def _summary(
             "file": None if out is None else str(out),
             "model_file": None if export is None else str(export),
         },
-        verdict="no warnings"
-        if not count
-        else f"{count} {'thing' if count == 1 else 'things'} to look at before trusting this model",
+        verdict=count(len(result.careful), "warning"),
         report_path=None if report is None else str(report),
     )
 

@@ -60,20 +60,6 @@ def check_filter(settings: ReferenceFilterSettings | None, dt_s: float, source: 
         )
 
 
-def filter_words(result: ReferenceFilterResult) -> str | None:
-    """One sentence on what the reference filter buys; None where none was asked for."""
-    found = result.filter
-    if found is None:
-        return result.reason
-    gain = found.error_before / found.error_after if found.error_after > 0 else np.inf
-    verdict = f", {gain:.3g} times smaller" if gain >= 1.005 else ": it buys nothing here"
-    return (
-        f"order {found.order}: largest weighted model-matching error over the ellipses "
-        f"{found.error_after:.4g} with it, {found.error_before:.4g} without{verdict} (largest at "
-        f"{found.worst_rad_s:.4g} rad/s)"
-    )
-
-
 def model_answer(
     model: RationalWeight, reference: npt.NDArray[np.float64], dt_s: float
 ) -> npt.NDArray[np.float64]:
