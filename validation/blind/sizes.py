@@ -77,11 +77,38 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     def log(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
-    def simple(parameter: str, unit: float, first: float, largest: float) -> Sizable:
+    # name -> (parameter, its value at size 1, first size tried, largest)
+    simple = {
+        "coulomb_friction": ("torque_Nm", s.torque, 0.05, 0.6),
+        "viscous_friction": ("coefficient_Nms", s.viscous, 0.5, 20.0),
+        "backlash": ("gap_rad", 1.0, 0.01, 0.06),
+        "actuator_dead_zone": ("width_V", s.voltage, 0.03, 0.7),
+        "actuator_lag": ("time_constant_s", s.dt, 0.5, 12.0),
+        "sensor_lag": ("time_constant_s", s.dt, 0.5, 12.0),
+        "input_delay": ("delay_s", s.dt, 0.5, 8.0),
+        "tip_payload": ("mass_kg", s.link_mass, 0.05, 1.5),
+        "hardening_spring": ("cubic_Nm_rad3", s.inertia, 5.0, 3000.0),
+        "gravity": ("acceleration_m_s2", 1.0, 0.05, 9.81),
+        "sensor_drift": ("rate_m_s", sign * s.tip_noise, 0.5, 20.0),
+        "quantisation": ("step_m", s.tip_noise, 3.0, 60.0),
+        "air_drag": ("coefficient_Ns2_m3", 4 * (s.viscous + s.braking) / s.length**4, 0.1, 20.0),
+        "ground_spring": ("stiffness_Nm_rad", s.inertia, 0.1, 60.0),
+        "winding_heat": ("rate_1_s", 1.0, 0.03, 0.3),
+        # Monotone up to the largest voltage also with a falling gain.
+        "amplifier_cubic": ("cubic_1_V2", sign / s.peak**2, 0.05, 0.3),
+    }
+    ratios = {
+        "actuator_gain": (0.1, 1.0),
+        "hub_inertia": (0.1, 1.0),
+        "link_stiffness": (0.05, 1.0),
+        "structural_damping": (1.0, 9.0),
+        "sensor_gain": (0.02, 0.5),
+    }
+    if name in simple:
+        parameter, unit, first, largest = simple[name]
         return Sizable(name, first, largest, lambda size: {parameter: size * unit})
-
-    if name == "coulomb_friction":
-        return simple("torque_Nm", s.torque, 0.05, 0.6)
+    if name in ratios:
+        return Sizable(name, *ratios[name], ratio)
     if name == "stribeck_friction":
         share, speed = rng.uniform(0.35, 0.75), log(0.02, 0.3)
         return Sizable(
@@ -94,26 +121,8 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
                 "stribeck_velocity_rad_s": speed,
             },
         )
-    if name == "viscous_friction":
-        return simple("coefficient_Nms", s.viscous, 0.5, 20.0)
-    if name == "backlash":
-        return simple("gap_rad", 1.0, 0.01, 0.06)
     if name == "actuator_saturation":
         return Sizable(name, 0.2, 3.0, lambda size: {"limit_V": s.peak * np.exp(-size)})
-    if name == "actuator_dead_zone":
-        return simple("width_V", s.voltage, 0.03, 0.7)
-    if name in ("actuator_lag", "sensor_lag"):
-        return simple("time_constant_s", s.dt, 0.5, 12.0)
-    if name == "input_delay":
-        return simple("delay_s", s.dt, 0.5, 8.0)
-    if name in ("actuator_gain", "hub_inertia"):
-        return Sizable(name, 0.1, 1.0, ratio)
-    if name == "link_stiffness":
-        return Sizable(name, 0.05, 1.0, ratio)
-    if name == "structural_damping":
-        return Sizable(name, 1.0, 9.0, ratio)
-    if name == "sensor_gain":
-        return Sizable(name, 0.02, 0.5, ratio)
     if name == "torque_ripple":
         cycles = float(rng.integers(4, 41))
         return Sizable(
@@ -133,16 +142,6 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
                 "damping_Nms": time * s.link_spring / size,
             },
         )
-    if name == "tip_payload":
-        return simple("mass_kg", s.link_mass, 0.05, 1.5)
-    if name == "hardening_spring":
-        return simple("cubic_Nm_rad3", s.inertia, 5.0, 3000.0)
-    if name == "gravity":
-        return simple("acceleration_m_s2", 1.0, 0.05, 9.81)
-    if name == "sensor_drift":
-        return simple("rate_m_s", sign * s.tip_noise, 0.5, 20.0)
-    if name == "quantisation":
-        return simple("step_m", s.tip_noise, 3.0, 60.0)
     if name == "periodic_disturbance":
         frequency = log(0.5, 12.0)
         return Sizable(
@@ -169,9 +168,6 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
 
 
 def _unlisted(name: str, s: _Scales, sign: float, phase: float, rng: np.random.Generator) -> Sizable:
-    if name == "air_drag":
-        unit = 4 * (s.viscous + s.braking) / s.length**4
-        return Sizable(name, 0.1, 20.0, lambda size: {"coefficient_Ns2_m3": size * unit})
     if name == "cogging":
         cycles = float(rng.integers(6, 31))
         return Sizable(
@@ -180,8 +176,6 @@ def _unlisted(name: str, s: _Scales, sign: float, phase: float, rng: np.random.G
             0.7,
             lambda size: {"relative_amplitude": size, "cycles_per_rev": cycles, "phase_rad": phase},
         )
-    if name == "ground_spring":
-        return Sizable(name, 0.1, 60.0, lambda size: {"stiffness_Nm_rad": size * s.inertia})
     if name == "inductance":
         return Sizable(
             name,
@@ -203,13 +197,8 @@ def _unlisted(name: str, s: _Scales, sign: float, phase: float, rng: np.random.G
                 "torque_negative_Nm": size * s.torque * (1 - sign * uneven),
             },
         )
-    if name == "amplifier_cubic":
-        # Monotone up to the largest voltage also with a falling gain.
-        return Sizable(name, 0.05, 0.3, lambda size: {"cubic_1_V2": sign * size / s.peak**2})
     if name == "sensor_clipping":
         return Sizable(name, 0.2, 2.0, lambda size: {"limit_m": s.tip_peak * np.exp(-size)})
-    if name == "winding_heat":
-        return Sizable(name, 0.03, 0.3, lambda size: {"rate_1_s": size})
     if name == "encoder_eccentricity":
         # Phases that would mostly scale the angle are left out: a gain is another effect.
         offset = 0.5 * pi * sign + rng.uniform(-0.6, 0.6)
