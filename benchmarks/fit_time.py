@@ -36,10 +36,9 @@ from validation.comparators.comparators import oe
 FOURTH_ORDER = IdentOptions(n_real=2, n_pairs=1)
 FIRST_FIT = """
 from benchmarks.fit_time import FOURTH_ORDER, identify, p1
+from benchmarks.harness import timed
 record = p1(0).record
-begin = time.process_time()
-identify([record], FOURTH_ORDER)
-print(time.process_time() - begin)
+print(timed(lambda: identify([record], FOURTH_ORDER))[1])
 """
 
 
