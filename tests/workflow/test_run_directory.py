@@ -47,12 +47,12 @@ def test_non_empty_directory_is_refused_without_resume(tmp_path):
 def test_no_run_is_offered_where_there_is_none(tmp_path):
     (tmp_path / "01_prbs.csv").write_text("t,u\n")
     with pytest.raises(InputError, match=r"not empty \(it holds '01_prbs\.csv'\); choose another --out$"):
-        RunDirectory.check_free(tmp_path)
+        RunDirectory(tmp_path).refuse_unless_free()
 
 
 def test_a_place_that_takes_no_files_is_refused_before_the_work():
     with pytest.raises(InputError, match=r"cannot write /proc/run: [^/]*$"):
-        RunDirectory.check_free(Path("/proc/run"))
+        RunDirectory(Path("/proc/run")).refuse_unless_free()
 
 
 def test_a_living_run_is_not_replaced(tmp_path):
@@ -66,7 +66,7 @@ def test_a_living_run_is_not_replaced(tmp_path):
 @pytest.mark.parametrize("how", [{"resume": True}, {"replace": True}])
 def test_somebody_elses_directory_is_never_touched(tmp_path, how):
     (tmp_path / "thesis.txt").write_text("years of work")
-    with pytest.raises(InputError, match=r"not a run directory.*thesis\.txt"):
+    with pytest.raises(InputError, match=r"no run is there.*thesis\.txt"):
         begin(tmp_path, **how)
     assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.txt"]
 
@@ -105,9 +105,9 @@ def test_directory_killed_before_its_manifest_is_begun_afresh(tmp_path):
 def test_output_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot write.*is not a directory"):
-        RunDirectory.check_free(tmp_path / "file" / "run")
+        RunDirectory(tmp_path / "file" / "run").refuse_unless_free()
     with pytest.raises(InputError, match="cannot write"):
-        RunDirectory.check_free(tmp_path / "file")
+        RunDirectory(tmp_path / "file").refuse_unless_free()
 
 
 def test_open_refuses_what_is_no_run(tmp_path):

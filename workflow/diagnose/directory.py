@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -26,10 +25,10 @@ from workflow.engine import storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import first_difference
+from workflow.engine.store import Store
 
 LAYOUT_VERSION = 1
 MANIFEST = "diagnose.json"
-_OTHER_FILES = (MANIFEST, "index.html", "timings.json", "lock")
 _ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv")
 
 
@@ -44,10 +43,19 @@ def diagnosis_digest() -> str:
 
 
 @dataclass(frozen=True)
-class DiagnosisDirectory:
+class DiagnosisDirectory(Store):
     """Where answers are kept. Make one with `begin`."""
 
-    path: Path
+    what = "diagnosis"
+    manifest_name = MANIFEST
+    own_files = ("index.html", "timings.json")
+
+    def own_entries(self) -> Sequence[str]:
+        """Files of the cases that the manifest names, and the overview."""
+        if not self.manifest_path.is_file():
+            return self.own_files
+        cases = storage.read_json(self.manifest_path).get("inputs", {})
+        return (*(f"{case}{ending}" for case in cases for ending in _ENDINGS), *self.own_files)
 
     @classmethod
     def begin(
@@ -61,34 +69,16 @@ class DiagnosisDirectory:
         """
         place = cls(path)
         document = {"layout": LAYOUT_VERSION, "inputs": dict(inputs), "options": dict(options)}
-        held = place._held()
-        if held and MANIFEST not in held:
-            what = "no diagnosis is there" if resume or replace else "not empty"
-            raise InputError(f"{path}: {what} (it holds {min(held)!r}); choose another --out")
-        if held and not (resume or replace):
-            raise InputError(
-                f"{path}: an earlier diagnosis is there; choose another --out, continue it with --resume or "
-                "start it afresh with --replace"
-            )
-        if held and not replace:
-            changed = first_difference(storage.read_json(path / MANIFEST), document)
+        if place.prepare(resume=resume, replace=replace):
+            changed = first_difference(storage.read_json(place.manifest_path), document)
             if changed:
                 raise InputError(
                     f"{path}: cannot resume, other inputs: {changed}; choose another --out or --replace"
                 )
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
-        with naming(f"cannot write {path}"), place.locked():
-            if held and replace:
-                place._clear(held)
+            return place
+        with naming(f"cannot write {path}"):
             place.write(MANIFEST, (json.dumps(document, indent=1) + "\n").encode())
         return place
-
-    def locked(self) -> AbstractContextManager[None]:
-        """Hold the diagnosis against a second writer."""
-        return storage.locked(self.path, "diagnosis")
 
     def write(self, name: str, content: bytes) -> None:
         storage.write_bytes(self.path / name, content)
@@ -128,23 +118,5 @@ class DiagnosisDirectory:
 
     def discard_if_empty(self) -> None:
         """Take back what `begin` wrote if there is no answer: a corrected case may come. Hold the lock."""
-        if self._held() <= {MANIFEST}:
-            (self.path / MANIFEST).unlink(missing_ok=True)
-            (self.path / "lock").unlink(missing_ok=True)
-            self.path.rmdir()
-
-    def _held(self) -> set[str]:
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"cannot write {self.path}: it is not a directory")
-        try:
-            entries = {entry.name for entry in self.path.iterdir()} if self.path.exists() else set()
-        except OSError as error:
-            raise InputError(f"cannot read {self.path}: {error.strerror or error}") from error
-        return {name for name in entries if not name.endswith(storage.TEMPORARY_SUFFIX) and name != "lock"}
-
-    def _clear(self, held: set[str]) -> None:
-        """Files of the earlier diagnosis but its manifest, by which a second attempt knows what is left."""
-        earlier = storage.read_json(self.path / MANIFEST)
-        own = {f"{case}{ending}" for case in earlier.get("inputs", {}) for ending in _ENDINGS}
-        for name in sorted(held & (own | set(_OTHER_FILES)) - {MANIFEST}):
-            (self.path / name).unlink(missing_ok=True)
+        if self.held() <= {MANIFEST}:
+            self.discard()

@@ -16,10 +16,7 @@ it). File and hash appear in one rename, so there is no instant at which one is 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -31,6 +28,7 @@ import numpy as np
 
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
+from workflow.engine.store import Store
 
 LAYOUT_VERSION = 3  # 3: results by codec
 T = TypeVar("T")
@@ -39,27 +37,19 @@ _RESULT = "result"
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")
 
 
-# The manifest goes first when a run is deleted: what is left by a kill in between is then no run any more.
 CONTROLLER_FILES = tuple(
     f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in (".json", ".c", ".h")
-)
-_OWN_ENTRIES = (
-    "manifest.json",
-    "config.toml",
-    "config.json",
-    "stages",
-    "figures",
-    "report.html",
-    *CONTROLLER_FILES,
-    "lock",
 )
 
 
 @dataclass(frozen=True)
-class RunDirectory:
+class RunDirectory(Store):
     """A run's files. Make one with `begin` (to write) or `open` (to read)."""
 
-    path: Path
+    what = "run"
+    manifest_name = "manifest.json"
+    folders = ("stages", "figures")
+    own_files = ("report.html", *CONTROLLER_FILES, "config.toml", "config.json")
 
     # -- opening ---------------------------------------------------------------------------------------------
 
@@ -74,38 +64,6 @@ class RunDirectory:
         if run.manifest().get("layout") != LAYOUT_VERSION:
             raise InputError(f"{path}: written by another version of flexlink; start a new run")
         return run
-
-    @classmethod
-    def check_free(cls, path: Path, *, resume: bool = False, replace: bool = False) -> None:
-        """Refuse, before any work is done, a place where the run could not be written; nothing is left there.
-
-        Raises InputError: not writable, not a directory, not empty with neither `resume` nor `replace`, or
-        holding something that is no run (which is never replaced).
-        """
-        path = Path(path)
-        try:
-            ancestor = path.absolute()
-            while not ancestor.exists():
-                ancestor = ancestor.parent
-            if not ancestor.is_dir():
-                raise InputError(f"cannot write {path}: {ancestor} is not a directory")
-            # Permission bits do not tell of read-only file systems, nor bind the administrator: try.
-            trial = ancestor / f".flexlink.{os.getpid()}{storage.TEMPORARY_SUFFIX}"
-            trial.mkdir()
-            trial.rmdir()
-            entries = {entry.name for entry in path.iterdir()} if path.is_dir() else set()
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
-        entries = {name for name in entries if not name.endswith(storage.TEMPORARY_SUFFIX)}
-        strangers = sorted(entries - set(_OWN_ENTRIES))
-        if strangers and "manifest.json" not in entries:
-            what = "not a run directory" if resume or replace else "not empty"
-            raise InputError(f"{path}: {what} (it holds {strangers[0]!r}); choose another --out")
-        if entries and not (resume or replace):
-            raise InputError(
-                f"{path}: not empty, an earlier run is there; choose another --out, continue it with "
-                "--resume or start it afresh with --replace"
-            )
 
     @classmethod
     def begin(
@@ -123,24 +81,12 @@ class RunDirectory:
         afresh.
 
         `config` is the resolved configuration (JSON-able), `inputs` maps every input file as the user named
-        it to its SHA-256. Raises InputError: see `check_free`; on resuming also a changed configuration
+        it to its SHA-256. Raises InputError: see `prepare`; on resuming also a changed configuration
         (naming the key) or a changed input file (naming the file).
         """
         path = Path(path)
-        cls.check_free(path, resume=resume, replace=replace)
         run = cls(path)
-        if replace and (path / "lock").is_file():
-            with run.locked():  # never under the hands of a living run
-                run.discard()
-        elif replace:
-            run.discard()
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            run.stages_path.mkdir(exist_ok=True)
-            run.figures_path.mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
-        if run.manifest_path.is_file():
+        if run.prepare(resume=resume, replace=replace):
             run._check_same(config, inputs)
             return run
         storage.write_text(path / "config.toml", config_text)
@@ -176,23 +122,6 @@ class RunDirectory:
                     f"{self.path}: cannot resume, the input file {name} changed since the run began"
                 )
 
-    def locked(self) -> AbstractContextManager[None]:
-        """Hold the directory against a second writer."""
-        return storage.locked(self.path, "run", self.stages_path, self.figures_path)
-
-    def discard(self) -> None:
-        """Delete what flexlink wrote here, and the directory itself if nothing else is in it."""
-        if not self.path.is_dir():
-            return
-        for name in _OWN_ENTRIES:
-            entry = self.path / name
-            if entry.is_dir():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink(missing_ok=True)
-        if not any(self.path.iterdir()):
-            self.path.rmdir()
-
     # -- places ----------------------------------------------------------------------------------------------
 
     @property
@@ -206,10 +135,6 @@ class RunDirectory:
     @property
     def report_path(self) -> Path:
         return self.path / "report.html"
-
-    @property
-    def manifest_path(self) -> Path:
-        return self.path / "manifest.json"
 
     # -- stages ----------------------------------------------------------------------------------------------
 

@@ -14,9 +14,7 @@ match what they would be made from now, so a killed study goes on where it stood
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, first_difference
+from workflow.engine.store import Store
 from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point
 from workflow.study.task import Done
 from workflow.study.toml_text import toml_text
@@ -35,24 +34,15 @@ from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1
 
-# study.json goes last when a study is deleted: after a kill in between it is still a study, with less in it.
-_OWN_ENTRIES = (
-    "study.html",
-    "table.csv",
-    "table.json",
-    "pareto.svg",
-    "points",
-    "plants",
-    "study.toml",
-    "study.json",
-)
-
 
 @dataclass(frozen=True)
-class StudyDirectory:
+class StudyDirectory(Store):
     """Where a study is kept. Make one with `begin`."""
 
-    path: Path
+    what = "study"
+    manifest_name = "study.json"
+    folders = ("points", "plants")
+    own_files = ("study.html", "table.csv", "table.json", "pareto.svg", "study.toml")
 
     @classmethod
     def begin(
@@ -72,34 +62,17 @@ class StudyDirectory:
             "inputs": dict(base.inputs),
             "stages_taken_over": base.digests,
         }
-        held = study._held()
-        if held and "study.json" not in held:
-            what = "no study is there" if resume or replace else "not empty"
-            raise InputError(f"{path}: {what} (it holds {min(held)!r}); choose another --out")
-        if held and not (resume or replace):
-            raise InputError(
-                f"{path}: an earlier study is there; choose another --out, continue it with --resume or "
-                "start it afresh with --replace"
-            )
-        if held and replace:
+        if replace:
             study._refuse_own_base(base)
-            with study.locked():  # never under the hands of a living study
-                study._discard()
-        elif held:
-            earlier = storage.read_json(study.path / "study.json")
-            changed = first_difference(earlier, storage.encode(document))
+        if study.prepare(resume=resume, replace=replace):
+            changed = first_difference(storage.read_json(study.manifest_path), storage.encode(document))
             if changed:
                 raise InputError(
                     f"{path}: cannot resume, the base changed at {changed}; choose another --out or start "
                     "afresh with --replace"
                 )
-        try:
-            for folder in (study.path, study.plants_path, study.points_path):
-                folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror or error}") from error
         storage.write_text(study.path / "study.toml", text)
-        storage.write_json(study.path / "study.json", document)
+        storage.write_json(study.manifest_path, document)
         return study
 
     def _refuse_own_base(self, base: Base) -> None:
@@ -108,25 +81,10 @@ class StudyDirectory:
                 f"{self.path}: --replace would delete the base, {base.run.path}; choose another --out"
             )
 
-    def _discard(self) -> None:
-        """Delete what a study wrote here; files of others stay."""
-        for name in _OWN_ENTRIES:
-            entry = self.path / name
-            if entry.is_dir():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink(missing_ok=True)
-
     def discard_if_empty(self) -> None:
         """Take back what `begin` wrote if neither a plant nor a point is there: a corrected base may come."""
-        if any(self.plants_path.iterdir()) or any(self.points_path.iterdir()):
-            return
-        for name in ("study.json", "study.toml", "lock"):
-            (self.path / name).unlink(missing_ok=True)
-        self.plants_path.rmdir()
-        self.points_path.rmdir()
-        if not any(self.path.iterdir()):
-            self.path.rmdir()
+        if not (any(self.plants_path.iterdir()) or any(self.points_path.iterdir())):
+            self.discard()
 
     @property
     def plants_path(self) -> Path:
@@ -139,10 +97,6 @@ class StudyDirectory:
     @property
     def page_path(self) -> Path:
         return self.path / "study.html"
-
-    def locked(self) -> AbstractContextManager[None]:
-        """Hold the study against a second writer."""
-        return storage.locked(self.path, "study")
 
     def plant(self, point: Point) -> RunDirectory:
         """The run directory of the plant that a point shares."""
@@ -185,18 +139,6 @@ class StudyDirectory:
     def plant_files(self, point: Point) -> dict[str, bytes]:
         """The stage files of the plant that a point shares, by file name."""
         return stage_files(self.plant(point), [stage.name for stage in PLANT_STAGES])
-
-    def _held(self) -> set[str]:
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"cannot write {self.path}: it is not a directory")
-        ancestor = self.path.absolute()
-        while not ancestor.exists():
-            ancestor = ancestor.parent
-        storage.check_writable(ancestor / f"trial-{os.getpid()}")
-        if not self.path.is_dir():
-            return set()
-        names = {entry.name for entry in self.path.iterdir()}
-        return {name for name in names if not name.endswith(storage.TEMPORARY_SUFFIX)}
 
 
 def stage_files(run: RunDirectory, names: list[str] | tuple[str, ...]) -> dict[str, bytes]:

@@ -100,7 +100,7 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     if not isinstance(config.source, SimulatedSource):
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
     out = Path(out)
-    RunDirectory.check_free(out)
+    RunDirectory(out).refuse_unless_free()
     records = []
     for index, entry in enumerate(config.source.records):
         with naming(f"source.records[{index}] ({entry.name})"):

@@ -38,7 +38,7 @@ def run_pipeline(
     """
     progress = progress or Silence()
     out = Path(out)
-    RunDirectory.check_free(out, resume=resume, replace=replace)
+    RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     # Records are read before anything is written: a bad log leaves no directory behind.
     first = STAGES[0]

@@ -1,0 +1,110 @@
+"""A directory that one command fills, and another call continues (--resume) or starts afresh (--replace).
+
+It is known by its manifest, which is written last when it is begun and deleted last when it is replaced: a
+directory without one holds nothing worth keeping and is begun afresh, if all in it is ours. Nothing of
+anybody else is ever touched.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from workflow.engine import storage
+from workflow.engine.errors import InputError
+
+
+@dataclass(frozen=True)
+class Store:
+    """Files of a command in one directory: `what` they are, the name of their manifest, their folders."""
+
+    path: Path
+
+    what: ClassVar[str]
+    manifest_name: ClassVar[str]
+    folders: ClassVar[tuple[str, ...]] = ()
+    own_files: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def manifest_path(self) -> Path:
+        return self.path / self.manifest_name
+
+    def own_entries(self) -> Sequence[str]:
+        """Names that are ours here, besides manifest and lock."""
+        return (*self.folders, *self.own_files)
+
+    def held(self) -> set[str]:
+        """What is in the directory, leftovers of killed writers and the lock aside. Raises InputError where
+        nothing can be written there."""
+        try:
+            ancestor = self.path.absolute()
+            while not ancestor.exists():
+                ancestor = ancestor.parent
+            if not ancestor.is_dir():
+                raise InputError(f"cannot write {self.path}: {ancestor} is not a directory")
+            # Permission bits do not tell of read-only file systems, nor bind the administrator: try.
+            trial = ancestor / f".flexlink.{os.getpid()}{storage.TEMPORARY_SUFFIX}"
+            trial.mkdir()
+            trial.rmdir()
+            entries = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
+        except OSError as error:
+            raise InputError(f"cannot write {self.path}: {error.strerror or error}") from error
+        return {name for name in entries if not name.endswith(storage.TEMPORARY_SUFFIX) and name != "lock"}
+
+    def refuse_unless_free(self, *, resume: bool = False, replace: bool = False) -> bool:
+        """Refuse, before any work is done, a place that cannot be written; nothing is left there.
+
+        Returns whether there is something to continue. Raises InputError: not writable, not a directory, not
+        empty with neither `resume` nor `replace`, or holding something else (which is never replaced).
+        """
+        held = self.held()
+        there = self.manifest_name in held
+        strangers = held if there else held - set(self.own_entries())
+        if strangers and not there:
+            what = f"no {self.what} is there" if resume or replace else "not empty"
+            raise InputError(f"{self.path}: {what} (it holds {min(strangers)!r}); choose another --out")
+        if held and not (resume or replace):
+            raise InputError(
+                f"{self.path}: not empty, an earlier {self.what} is there; choose another --out, continue it "
+                "with --resume or start it afresh with --replace"
+            )
+        return there
+
+    def prepare(self, *, resume: bool = False, replace: bool = False) -> bool:
+        """Make the directory and its folders; with `replace` what is there is deleted first.
+
+        Returns whether an earlier one is there now, to be continued. Raises InputError: see
+        `refuse_unless_free`; also where another process is writing it.
+        """
+        there = self.refuse_unless_free(resume=resume, replace=replace)
+        if replace and self.path.is_dir():
+            with self.locked():  # never under the hands of a living writer
+                self.discard()
+        try:
+            for folder in ("", *self.folders):
+                (self.path / folder).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot write {self.path}: {error.strerror or error}") from error
+        return there and not replace
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the directory against a second writer."""
+        return storage.locked(self.path, self.what, *(self.path / folder for folder in self.folders))
+
+    def discard(self) -> None:
+        """Delete what is ours, and the directory itself if nothing else is in it."""
+        if not self.path.is_dir():
+            return
+        for name in (*self.own_entries(), self.manifest_name, "lock"):
+            entry = self.path / name
+            if entry.is_dir():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink(missing_ok=True)
+        if not any(self.path.iterdir()):
+            self.path.rmdir()
