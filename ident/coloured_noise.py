@@ -1,0 +1,183 @@
+"""Poles behind coloured noise: the same search on records that a noise model has whitened.
+
+Dry friction, drift and encoder steps leave a residual whose power lies at low frequency, often a hundred
+times that of the sensor noise. Least squares weigh it as if it were white: a slow pole pair that follows the
+friction of these records then gains more than a mode of the machine that moves the output by a tenth of a
+millimetre. The remedy is generalised least squares: input and output of every record go through the same
+filter A(q), which leaves the response between them as it is and makes the noise white.
+
+A(q) is that of a long ARX model (Ljung, System Identification, 2nd ed., section 10.4; the model order
+reduction of Wahlberg, IEEE TAC 34(3), 1989). It needs no poles, so a mode that a first fit has missed is not
+taken for noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from ident.basis.options import IdentOptions
+from ident.checks.residual_tests import whiteness_test
+from ident.checks.validation import fit_on_fresh_data
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.least_squares import linearisation
+from ident.fit.refinement import Bounds, polish
+from ident.fit.regression import prepare, thinned
+from ident.identification import Identification
+from ident.uncertainty.autoregression import fit_autoregression
+
+Identify = Callable[[Sequence[Record], IdentOptions, float, float], Identification]
+"""Records, options, and the part of the progress (from, to): a fit that takes the noise as white."""
+
+_ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
+# Rows of the shortest record per order of the noise model.
+_ROWS_PER_ORDER = 10
+_RESIDUAL_ORDER = 12
+# Innovations of less than this share of the residual's variance: so coloured that a fit which takes the noise
+# as white need not be asked.
+_STRONG = 0.5
+
+
+def identify_in_noise(
+    records: Sequence[Record],
+    options: IdentOptions,
+    identify: Identify,
+    unfiltered: Sequence[Record] | None = None,
+) -> Identification:
+    """The fit in white noise if the residuals are white, else one behind a noise model; whichever the
+    likelihood prefers where the colour is weak.
+
+    unfiltered: the same experiments before a band was taken out of them; the noise model is made from these.
+
+    Notes
+    -----
+    The fit behind the noise model comes first. From its poles a descent on the records as they are leaves
+    residuals that are white if and only if the noise is; then what `identify` finds in white noise is the
+    answer, digit for digit.
+    """
+    noise_filter = long_arx_filter(list(unfiltered or records), options)
+    if noise_filter.size == 1:
+        return identify(records, options, 0.0, 1.0)
+    # Without its first rows a record starts in motion.
+    inside = options.model_copy(update={"estimate_initial_state": True})
+    whitened = [prewhitened(record, noise_filter) for record in records]
+    behind = identify(whitened, inside, 0.0, 0.6)
+    if behind.model.order == 0 or _white_after_descent(records, options, behind):
+        return identify(records, options, 0.6, 1.0)
+    result = _on_records(records, behind, noise_filter)
+    colour = _innovations(result) / np.mean(np.concatenate(result.residuals) ** 2)
+    if colour > _STRONG:
+        plain = identify(records, options, 0.6, 1.0)
+        if _criterion(plain) <= _criterion(result):
+            return plain
+    return result
+
+
+def prewhitened(record: Record, noise_filter: RealArray) -> Record:
+    """Input and output through A(q), without the first rows, whose predecessors were not recorded."""
+    if noise_filter.size == 1:
+        return record
+    input_, output = (
+        lfilter(noise_filter, np.ones(1), signal, axis=0)[noise_filter.size - 1 :]
+        for signal in (record.input, record.output)
+    )
+    return replace(record, input=input_, output=output, reference=None, reference_names=())
+
+
+def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArray:
+    """A(q) of A y = B u + c + white by least squares, its order by BIC; [1.0] where the records are too
+    short for the shortest."""
+    part, _ = thinned(records, options.search_samples)
+    delay = options.input_delay_samples
+    most = min(record.n_samples for record in part) // _ROWS_PER_ORDER - delay
+    orders = [order for order in _ARX_ORDERS if order <= most]
+    best, least = np.ones(1), np.inf
+    if not orders:
+        return best
+    longest = orders[-1]
+    blocks, targets = [], []
+    for record in part:
+        u, y = record.input[:, 0], record.output[:, 0] - record.output[:, 0].mean()
+        rows = np.arange(longest + delay, y.size)
+        lags = np.arange(1, longest + 1)
+        blocks.append(np.hstack([-y[rows[:, None] - lags], u[rows[:, None] - delay - lags + 1]]))
+        targets.append(y[rows])
+    columns, target = np.vstack(blocks), np.concatenate(targets)
+    offsets = np.repeat(np.eye(len(part)), [block.shape[0] for block in blocks], axis=0)
+    for order in orders:
+        chosen = np.hstack([columns[:, :order], columns[:, longest : longest + order], offsets])
+        theta, *_ = np.linalg.lstsq(chosen, target, rcond=None)
+        error = target - chosen @ theta
+        criterion = _bic(float(error @ error) / target.size, target.size, chosen.shape[1])
+        if criterion < least:
+            best, least = np.concatenate([[1.0], theta[:order]]), criterion
+    return best
+
+
+def _white_after_descent(records: Sequence[Record], options: IdentOptions, behind: Identification) -> bool:
+    """Whether a descent in white noise from the poles found leaves white residuals."""
+    part, _ = thinned(records, options.search_samples)
+    data = prepare(part, replace(behind.structure, relative_degree=1))
+    fixed = options.fixed()
+    end = polish(
+        data,
+        behind.model.poles,
+        Bounds.from_options(options, data.longest, data.dt_s),
+        n_fixed_real=fixed.real.size,
+        n_fixed_pairs=fixed.pairs.size,
+    )
+    residual = linearisation(data, end.poles).residual
+    return whiteness_test([residual[data.segment(i)] for i in range(data.n_records)]).passed
+
+
+def _on_records(
+    records: Sequence[Record], behind: Identification, noise_filter: RealArray
+) -> Identification:
+    """The model found behind the filter with its residuals on the records as they are."""
+    fits = [fit_on_fresh_data(behind.model, record) for record in records]
+    residuals = tuple(fit.residual[behind.model.input_delay_samples :] for fit in fits)
+    rss = float(sum(residual @ residual for residual in residuals))
+    n_samples = sum(residual.size for residual in residuals)
+    unknowns = 2 * behind.model.order + len(records) * (1 + behind.model.order)
+    power = sum(np.abs(np.fft.rfft(part - part.mean(), 2 * part.size)) ** 2 for part in residuals[:1])
+    half = np.searchsorted(np.cumsum(power), 0.5 * np.sum(power)) / (power.size - 1)
+    result = replace(
+        behind,
+        residuals=residuals,
+        fit_percent=np.array([fit.fit_percent for fit in fits]),
+        rss=rss,
+        noise_std=float(np.sqrt(rss / max(n_samples - unknowns, 1))),
+        noise_filter=noise_filter,
+    )
+    share = _innovations(result) / (rss / n_samples)
+    said = (
+        f"the noise is coloured (half of the residual's power lies below {0.5 * half / behind.model.dt_s:.2g} "
+        f"Hz, {100 * share:.2g} % of it is unpredictable; dry friction and drift look like this): poles and "
+        f"coefficients were fitted behind a noise model of order {noise_filter.size - 1}, not by plain least "
+        "squares, which would spend poles on it"
+    )
+    return replace(result, verdicts=(*behind.verdicts, said))
+
+
+def _innovations(found: Identification) -> float:
+    """Variance of the residuals behind an autoregressive model of their own."""
+    order = min(_RESIDUAL_ORDER, (min(part.size for part in found.residuals) - 1) // 4)
+    whitening = fit_autoregression(found.residuals, order)
+    n = whitening.size - 1
+    errors = [lfilter(whitening, np.ones(1), part)[n:] for part in found.residuals]
+    return float(np.mean(np.concatenate(errors) ** 2))
+
+
+def _criterion(found: Identification) -> float:
+    """BIC of a fit whose noise is autoregressive; the noise model's order counts the same for all."""
+    n = sum(part.size for part in found.residuals)
+    nuisances = len(found.residuals) * (1 + found.model.order * found.structure.estimate_initial_state)
+    return _bic(_innovations(found), n, 2 * found.model.order + nuisances)
+
+
+def _bic(variance: float, n_samples: int, unknowns: int) -> float:
+    return float(n_samples * np.log(max(variance, np.finfo(np.float64).tiny)) + unknowns * np.log(n_samples))
