@@ -15,17 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.signal import lfilter
 
 from ident.basis.options import IdentOptions
+from ident.checks.input_checks import clipped
 from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.fit.least_squares import linearisation
-from ident.fit.refinement import Bounds, polish
+from ident.fit.refinement import Bounds, refine
 from ident.fit.regression import prepare, thinned
 from ident.identification import Identification
 from ident.uncertainty.autoregression import fit_autoregression
@@ -42,16 +43,9 @@ _RESIDUAL_ORDER = 12
 _STRONG = 0.5
 
 
-def identify_in_noise(
-    records: Sequence[Record],
-    options: IdentOptions,
-    identify: Identify,
-    unfiltered: Sequence[Record] | None = None,
-) -> Identification:
+def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:
     """The fit in white noise if the residuals are white, else one behind a noise model; whichever the
     likelihood prefers where the colour is weak.
-
-    unfiltered: the same experiments before a band was taken out of them; the noise model is made from these.
 
     Notes
     -----
@@ -59,7 +53,7 @@ def identify_in_noise(
     residuals that are white if and only if the noise is; then what `identify` finds in white noise is the
     answer, digit for digit.
     """
-    noise_filter = long_arx_filter(list(unfiltered or records), options)
+    noise_filter = long_arx_filter(records, options)
     if noise_filter.size == 1:
         return identify(records, options, 0.0, 1.0)
     # Without its first rows a record starts in motion.
@@ -106,13 +100,16 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         lags = np.arange(1, longest + 1)
         blocks.append(np.hstack([-y[rows[:, None] - lags], u[rows[:, None] - delay - lags + 1]]))
         targets.append(y[rows])
-    columns, target = np.vstack(blocks), np.concatenate(targets)
     offsets = np.repeat(np.eye(len(part)), [block.shape[0] for block in blocks], axis=0)
+    n = offsets.shape[0]
+    # All orders from one factorisation: their columns, and what they leave of y, are columns of the triangle.
+    triangle = np.linalg.qr(np.column_stack([np.vstack(blocks), offsets, np.concatenate(targets)]), mode="r")
     for order in orders:
-        chosen = np.hstack([columns[:, :order], columns[:, longest : longest + order], offsets])
-        theta, *_ = np.linalg.lstsq(chosen, target, rcond=None)
-        error = target - chosen @ theta
-        criterion = _bic(float(error @ error) / target.size, target.size, chosen.shape[1])
+        lags = np.arange(order)
+        kept = np.concatenate([lags, longest + lags, 2 * longest + np.arange(len(part))])
+        theta, *_ = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)
+        error = triangle[:, -1] - triangle[:, kept] @ theta
+        criterion = _bic(float(error @ error) / n, n, kept.size)
         if criterion < least:
             best, least = np.concatenate([[1.0], theta[:order]]), criterion
     return best
@@ -122,29 +119,22 @@ def _white_after_descent(records: Sequence[Record], options: IdentOptions, behin
     """Whether a descent in white noise from the poles found leaves white residuals."""
     part, _ = thinned(records, options.search_samples)
     data = prepare(part, replace(behind.structure, relative_degree=1))
-    fixed = options.fixed()
-    end = polish(
-        data,
-        behind.model.poles,
-        Bounds.from_options(options, data.longest, data.dt_s),
-        n_fixed_real=fixed.real.size,
-        n_fixed_pairs=fixed.pairs.size,
-    )
-    residual = linearisation(data, end.poles).residual
+    bounds = Bounds.from_options(options, data.longest, data.dt_s)
+    end = refine(data, behind.model.poles, bounds, options.fixed())
+    residual = data.residual(end.poles)
     return whiteness_test([residual[data.segment(i)] for i in range(data.n_records)]).passed
 
 
-def _on_records(
-    records: Sequence[Record], behind: Identification, noise_filter: RealArray
-) -> Identification:
+def _on_records(records: Sequence[Record], behind: Identification, noise_filter: RealArray) -> Identification:
     """The model found behind the filter with its residuals on the records as they are."""
     fits = [fit_on_fresh_data(behind.model, record) for record in records]
     residuals = tuple(fit.residual[behind.model.input_delay_samples :] for fit in fits)
     rss = float(sum(residual @ residual for residual in residuals))
     n_samples = sum(residual.size for residual in residuals)
     unknowns = 2 * behind.model.order + len(records) * (1 + behind.model.order)
-    power = sum(np.abs(np.fft.rfft(part - part.mean(), 2 * part.size)) ** 2 for part in residuals[:1])
-    half = np.searchsorted(np.cumsum(power), 0.5 * np.sum(power)) / (power.size - 1)
+    longest = max(residuals, key=len)
+    power = np.cumsum(np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2)
+    half_Hz = np.searchsorted(power, 0.5 * power[-1]) / (2 * longest.size * behind.model.dt_s)
     result = replace(
         behind,
         residuals=residuals,
@@ -152,15 +142,21 @@ def _on_records(
         rss=rss,
         noise_std=float(np.sqrt(rss / max(n_samples - unknowns, 1))),
         noise_filter=noise_filter,
+        advise=partial(_advice, records, behind),
     )
     share = _innovations(result) / (rss / n_samples)
     said = (
-        f"the noise is coloured (half of the residual's power lies below {0.5 * half / behind.model.dt_s:.2g} "
-        f"Hz, {100 * share:.2g} % of it is unpredictable; dry friction and drift look like this): poles and "
+        f"the noise is coloured (half of the residual's power lies below {half_Hz:.2g} Hz, "
+        f"{100 * share:.2g} % of it is unpredictable; dry friction and drift look like this): poles and "
         f"coefficients were fitted behind a noise model of order {noise_filter.size - 1}, not by plain least "
         "squares, which would spend poles on it"
     )
     return replace(result, verdicts=(*behind.verdicts, said))
+
+
+def _advice(records: Sequence[Record], behind: Identification) -> list[str]:
+    """The filter hides where a signal was cut off."""
+    return [*clipped(records), *behind.advise()]
 
 
 def _innovations(found: Identification) -> float:

@@ -44,6 +44,9 @@ class FittedRecords:
         The same verdicts on priors with their numbers.
     search : SearchTrace
         Its warnings are those known when the search ended; `warnings` has them all.
+    noise_filter : (n + 1,) array
+        A(q) behind which poles and coefficients were fitted, input and output of every record sent through
+        it; [1.0] where the noise was taken as white.
     advise : callable
         Gives further warnings when they are first asked for: looking for them takes a good part of the time
         of a fit of low order.
@@ -61,11 +64,13 @@ class FittedRecords:
     search: SearchTrace
     n_fixed: tuple[int, int] = (0, 0)
     prior_tests: tuple[PriorTest, ...] = ()
+    noise_filter: RealArray = field(default_factory=lambda: np.ones(1))
     advise: Callable[[], Sequence[str]] = field(default=tuple)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
         object.__setattr__(self, "fit_percent", readonly_real(self.fit_percent))
+        object.__setattr__(self, "noise_filter", readonly_real(self.noise_filter))
         if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
             raise ValueError("residuals, record_names and fit_percent must have one entry per record")
         if not (self.rss >= 0 and self.noise_std >= 0 and self.tangent_optimality >= 0):

@@ -16,6 +16,7 @@ from ident.basis.poles import Poles
 from ident.checks.input_checks import advice, refuse_unusable
 from ident.checks.integrators_prior import integrators_test
 from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
+from ident.checks.plausible_modes import implausible_pairs
 from ident.checks.prior_tests import (
     Fitted,
     PriorTest,
@@ -27,6 +28,7 @@ from ident.checks.prior_tests import (
     relative_degree_test,
     too_few_poles,
 )
+from ident.coloured_noise import identify_in_noise
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import LinearFit, Regression, fit
@@ -70,6 +72,20 @@ def identify(
     """
     options = options or IdentOptions()
     report = progress or _silent
+    if options.noise == "auto":
+
+        def in_white_noise(
+            part: Sequence[Record], asked: IdentOptions, start: float, end: float
+        ) -> Identification:
+            return _identified(part, asked, lambda f, message: report(start + (end - start) * f, message))
+
+        refuse_unusable(records, prepare(records, options.structure()), least_order(options))
+        return identify_in_noise(records, options, in_white_noise)
+    return _identified(records, options, report)
+
+
+def _identified(records: Sequence[Record], options: IdentOptions, report: Progress) -> Identification:
+    """The fit that takes the noise as white."""
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, part = searched(records, data, options, report)
@@ -366,5 +382,6 @@ def _advice(
     return [
         *advice(records, data, model, residuals, fixed),
         *pole_warnings(model.poles, fixed, bounds, data.dt_s),
+        *implausible_pairs(model.poles, fixed, data.dt_s, data.longest * data.dt_s),
         *refused,
     ]

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.basis.options import IdentOptions
+from ident.coloured_noise import prewhitened
 from ident.data.arrays import RealArray, readonly_real
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression, fit
@@ -139,6 +140,7 @@ def stabilisation(
     of pairs the poles are those of the model. Long records are thinned as for the search.
     """
     options = options or IdentOptions()
+    records = [prewhitened(record, found.noise_filter) for record in records]
     part, in_mid_record = thinned(records, min(options.search_samples, _MOST_SAMPLES))
     structure = found.structure
     if in_mid_record:

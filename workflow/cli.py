@@ -180,6 +180,34 @@ def identify(
             show_default=False,
         ),
     ] = None,
+    noise: Annotated[
+        str,
+        typer.Option(
+            help="'auto': where residuals are coloured (dry friction, drift) the poles are sought behind a "
+            "noise model; 'white': plain least squares."
+        ),
+    ] = "auto",
+    noise_order: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=100,
+            help="Largest order of the noise model behind the ellipses [default: 8, or 32 where needed]",
+            show_default=False,
+        ),
+    ] = None,
+    omega_min: Annotated[
+        float | None, typer.Option(help="No pole pair below [rad/s].", show_default=False)
+    ] = None,
+    omega_max: Annotated[
+        float | None, typer.Option(help="No pole pair above [rad/s].", show_default=False)
+    ] = None,
+    zeta_min: Annotated[
+        float | None, typer.Option(help="Least damping ratio of a pole pair.", show_default=False)
+    ] = None,
+    zeta_max: Annotated[
+        float | None, typer.Option(help="Largest damping ratio of a pole pair.", show_default=False)
+    ] = None,
     export: Annotated[
         Path | None,
         typer.Option(
@@ -201,7 +229,9 @@ def identify(
     from workflow.console import TerminalProgress, print_summary
     from workflow.tasks.log_identification import identify_logs
 
-    chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators}
+    chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "noise": noise}
+    chosen |= {"omega_min_rad_s": omega_min, "omega_max_rad_s": omega_max}
+    chosen |= {"zeta_min": zeta_min, "zeta_max": zeta_max}
     chosen |= {
         "feedthrough": feedthrough,
         "input_delay_samples": delay,
@@ -220,6 +250,7 @@ def identify(
             options=options,
             level=level,
             band_rad_s=band,
+            noise_order=noise_order,
             out=out,
             report=report_page,
             export=export,

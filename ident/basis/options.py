@@ -68,6 +68,12 @@ class IdentOptions(BaseModel):
         "auto", description="records need not start from rest; auto: kept if the data ask for it"
     )
 
+    noise: Literal["white", "auto"] = Field(
+        "white",
+        description="white: plain least squares; auto: where the residuals are not white (dry friction, "
+        "drift), poles and coefficients are sought behind a noise model",
+    )
+
     algorithm: Algorithm = Field(
         "DIRECT_L",
         description="NLopt's DIRECT variants (DIRECT_L is GN_DIRECT_L), or scipy's",

@@ -77,7 +77,7 @@ def advice(
     return [
         *_too_short(data, model, fixed),
         *_weak_input(records, data, model, residuals),
-        *_clipped(records),
+        *clipped(records),
         *_drifting(records, data, model, residuals, fixed),
         *_far_from_zero(records, data),
     ]
@@ -159,7 +159,7 @@ def _weak_input(
     ]
 
 
-def _clipped(records: Sequence[Record]) -> list[str]:
+def clipped(records: Sequence[Record]) -> list[str]:
     sentences = []
     for record in records:
         for kind, signal, names in (

@@ -15,7 +15,7 @@ from ident.checks.validation import FreshFit, ResidualTest, fit_on_fresh_data, w
 from ident.closed_loop import TwoStage, two_stage
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.data.signal_filter import band_limited
+from ident.data.signal_filter import band_limited, settling_time_s
 from ident.identify import Identification, identify
 from ident.stabilisation import Stabilisation, stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -99,6 +99,7 @@ def identify_logs(
     options: IdentOptions | None = None,
     level: float = 0.95,
     band_rad_s: tuple[float, float] | None = None,
+    noise_order: int | None = None,
     out: Path | None = None,
     report: Path | None = None,
     export: Path | None = None,
@@ -109,7 +110,9 @@ def identify_logs(
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
     or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
     logs made in closed loop, for the two-stage method. band_rad_s: fit inside this band only, friction and
-    drift below it and noise above it left out. Raises InputError: one line naming file, column or line.
+    drift below it and noise above it left out. noise_order: largest order of the noise model behind the
+    ellipses; none given: 8, or 32 where that leaves coloured residuals. Raises InputError: one line naming
+    file, column or line.
     """
     if not 0.5 < level < 1:
         raise InputError(f"--level must lie between 0.5 and 1, got {level}")
@@ -134,6 +137,7 @@ def identify_logs(
         options,
         level=level,
         band_rad_s=band_rad_s,
+        noise_order=noise_order,
         with_plot=report is not None,
         progress=progress,
     )
@@ -160,6 +164,7 @@ def identify_records(
     *,
     level: float = 0.95,
     band_rad_s: tuple[float, float] | None = None,
+    noise_order: int | None = None,
     with_plot: bool = True,
     progress: Progress | None = None,
 ) -> LogIdentification:
@@ -181,14 +186,22 @@ def identify_records(
                     or min(2 * band_rad_s[1], 0.9 * np.pi / measured[0].dt_s),
                 }
             )
-            used = [band_limited(record, *band_rad_s) for record in measured]
-            fresh_records = [band_limited(record, *band_rad_s) for record in fresh_records]
+
+            def inside(record: Record) -> Record:
+                filtered = band_limited(record, *band_rad_s)
+                settled_s = settling_time_s(record.dt_s, *band_rad_s)
+                # Of a short record half is kept, whatever the filter's start leaves in it.
+                start = min(round(settled_s / record.dt_s), record.n_samples // 2)
+                return filtered.slice(start, record.n_samples)
+
+            used = [inside(record) for record in measured]
+            fresh_records = [inside(record) for record in fresh_records]
         if any(record.reference is not None for record in measured):
             # The first stage runs its model from rest, so it has to be fitted as from rest: free responses
             # that it estimated would be missing in the input it makes.
             opened = two_stage(
                 used,
-                options.model_copy(update={"estimate_initial_state": False}),
+                options.model_copy(update={"estimate_initial_state": False, "noise": "white"}),
                 EmbeddingOptions(estimate_initial_state=False),
             )
             used = list(opened.records)
@@ -219,7 +232,7 @@ def identify_records(
         )
         progress.finish("identify", 0.0, taken_up=False)
         progress.start("uncertainty")
-        posterior, tests = _posterior(used, found)
+        posterior, tests = _posterior(used, found, noise_order)
         omega = display_grid(found.model, used)
         if band_rad_s is not None:
             omega = omega[(omega >= band_rad_s[0]) & (omega <= band_rad_s[1])]
@@ -250,7 +263,7 @@ def identify_records(
 
 
 def _posterior(
-    used: Sequence[Record], found: Identification
+    used: Sequence[Record], found: Identification, noise_order: int | None
 ) -> tuple[ResponsePosterior, tuple[ResidualTest, ...]]:
     """Tangent posterior and its residual tests, with as much of a noise model as the residuals ask for.
 
@@ -260,7 +273,7 @@ def _posterior(
         posterior = tangent(used, found.model)
         return posterior, residual_tests(posterior, used)
     best: tuple[float, ResponsePosterior, tuple[ResidualTest, ...]] | None = None
-    for order in _NOISE_ORDERS:
+    for order in _NOISE_ORDERS if noise_order is None else (noise_order,):
         posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=True, max_ar_order=order))
         tests = residual_tests(posterior, used)
         whiteness = next(test for test in tests if test.name == "whiteness")
