@@ -22,12 +22,12 @@ from scipy.signal import lfilter
 
 from ident.basis.options import IdentOptions
 from ident.checks.input_checks import clipped
+from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.fit.refinement import Bounds, refine
-from ident.fit.regression import prepare, thinned
+from ident.fit.regression import thinned
 from ident.identification import Identification
 from ident.uncertainty.autoregression import fit_autoregression
 
@@ -36,39 +36,34 @@ Identify = Callable[[Sequence[Record], IdentOptions, float, float], Identificati
 
 _ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
 # Rows of the shortest record per order of the noise model.
-_ROWS_PER_ORDER = 10
+_ROWS_PER_ORDER = 13
 _RESIDUAL_ORDER = 12
-# Innovations of less than this share of the residual's variance: so coloured that a fit which takes the noise
-# as white need not be asked.
+# Innovations of less than this share of the residual's variance: so coloured that poles fitted to it as if it
+# were white say little about the machine, however well they follow these records.
 _STRONG = 0.5
 
 
 def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:
-    """The fit in white noise if the residuals are white, else one behind a noise model; whichever the
-    likelihood prefers where the colour is weak.
+    """The fit in white noise if its residuals are white, else one behind a noise model; where the colour is
+    weak, whichever of them the likelihood prefers.
 
-    Notes
-    -----
-    The fit behind the noise model comes first. From its poles a descent on the records as they are leaves
-    residuals that are white if and only if the noise is; then what `identify` finds in white noise is the
-    answer, digit for digit.
+    Only noise of low frequency counts: half of the residual's power has to lie below the lowest mode found
+    behind the noise model. A residual above it is more likely a mode for which no pair was left.
     """
+    plain = identify(records, options, 0.0, 0.5)
     noise_filter = long_arx_filter(records, options)
-    if noise_filter.size == 1:
-        return identify(records, options, 0.0, 1.0)
+    if noise_filter.size == 1 or plain.rss == 0 or whiteness_test(plain.residuals).passed:
+        return plain
     # Without its first rows a record starts in motion.
     inside = options.model_copy(update={"estimate_initial_state": True})
-    whitened = [prewhitened(record, noise_filter) for record in records]
-    behind = identify(whitened, inside, 0.0, 0.6)
-    if behind.model.order == 0 or _white_after_descent(records, options, behind):
-        return identify(records, options, 0.6, 1.0)
+    behind = identify([prewhitened(record, noise_filter) for record in records], inside, 0.5, 1.0)
+    modes = behind.model.poles.pairs[behind.model.poles.zeta() <= LARGEST_DAMPING]
+    lowest_Hz = np.min(np.abs(np.log(modes)), initial=np.inf) / (2 * np.pi * behind.model.dt_s)
+    if not _half_power_Hz(plain) < lowest_Hz < np.inf:
+        return plain
     result = _on_records(records, behind, noise_filter)
-    colour = _innovations(result) / np.mean(np.concatenate(result.residuals) ** 2)
-    if colour > _STRONG:
-        plain = identify(records, options, 0.6, 1.0)
-        if _criterion(plain) <= _criterion(result):
-            return plain
-    return result
+    strong = _innovations(plain) < _STRONG * plain.rss / sum(part.size for part in plain.residuals)
+    return result if strong or _criterion(result) < _criterion(plain) else plain
 
 
 def prewhitened(record: Record, noise_filter: RealArray) -> Record:
@@ -115,16 +110,6 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
     return best
 
 
-def _white_after_descent(records: Sequence[Record], options: IdentOptions, behind: Identification) -> bool:
-    """Whether a descent in white noise from the poles found leaves white residuals."""
-    part, _ = thinned(records, options.search_samples)
-    data = prepare(part, replace(behind.structure, relative_degree=1))
-    bounds = Bounds.from_options(options, data.longest, data.dt_s)
-    end = refine(data, behind.model.poles, bounds, options.fixed())
-    residual = data.residual(end.poles)
-    return whiteness_test([residual[data.segment(i)] for i in range(data.n_records)]).passed
-
-
 def _on_records(records: Sequence[Record], behind: Identification, noise_filter: RealArray) -> Identification:
     """The model found behind the filter with its residuals on the records as they are."""
     fits = [fit_on_fresh_data(behind.model, record) for record in records]
@@ -132,9 +117,6 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
     rss = float(sum(residual @ residual for residual in residuals))
     n_samples = sum(residual.size for residual in residuals)
     unknowns = 2 * behind.model.order + len(records) * (1 + behind.model.order)
-    longest = max(residuals, key=len)
-    power = np.cumsum(np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2)
-    half_Hz = np.searchsorted(power, 0.5 * power[-1]) / (2 * longest.size * behind.model.dt_s)
     result = replace(
         behind,
         residuals=residuals,
@@ -146,7 +128,7 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
     )
     share = _innovations(result) / (rss / n_samples)
     said = (
-        f"the noise is coloured (half of the residual's power lies below {half_Hz:.2g} Hz, "
+        f"the noise is coloured (half of the residual's power lies below {_half_power_Hz(result):.2g} Hz, "
         f"{100 * share:.2g} % of it is unpredictable; dry friction and drift look like this): poles and "
         f"coefficients were fitted behind a noise model of order {noise_filter.size - 1}, not by plain least "
         "squares, which would spend poles on it"
@@ -157,6 +139,13 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
 def _advice(records: Sequence[Record], behind: Identification) -> list[str]:
     """The filter hides where a signal was cut off."""
     return [*clipped(records), *behind.advise()]
+
+
+def _half_power_Hz(found: Identification) -> float:
+    """Half of the power of the longest residual lies below this frequency."""
+    longest = max(found.residuals, key=len)
+    power = np.cumsum(np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2)
+    return float(np.searchsorted(power, 0.5 * power[-1]) / (2 * longest.size * found.model.dt_s))
 
 
 def _innovations(found: Identification) -> float:
