@@ -38,17 +38,13 @@ _ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
 # Rows of the shortest record per order of the noise model.
 _ROWS_PER_ORDER = 13
 _RESIDUAL_ORDER = 12
-# Innovations of less than this share of the residual's variance: so coloured that poles fitted to it as if it
-# were white say little about the machine, however well they follow these records.
-_STRONG = 0.5
 
 
 def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:
-    """The fit in white noise if its residuals are white, else one behind a noise model; where the colour is
-    weak, whichever of them the likelihood prefers.
+    """The fit in white noise if its residuals are white, else one behind a noise model.
 
-    Only noise of low frequency counts: half of the residual's power has to lie below the lowest mode found
-    behind the noise model. A residual above it is more likely a mode for which no pair was left.
+    Only noise of low frequency counts: half of what the residual has beyond a white floor must lie below the
+    lowest mode found behind the noise model. Above it, a mode for which no pair was left is more likely.
     """
     plain = identify(records, options, 0.0, 0.5)
     noise_filter = long_arx_filter(records, options)
@@ -61,9 +57,7 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
     lowest_Hz = np.min(np.abs(np.log(modes)), initial=np.inf) / (2 * np.pi * behind.model.dt_s)
     if not _half_power_Hz(plain) < lowest_Hz < np.inf:
         return plain
-    result = _on_records(records, behind, noise_filter)
-    strong = _innovations(plain) < _STRONG * plain.rss / sum(part.size for part in plain.residuals)
-    return result if strong or _criterion(result) < _criterion(plain) else plain
+    return _on_records(records, behind, noise_filter)
 
 
 def prewhitened(record: Record, noise_filter: RealArray) -> Record:
@@ -128,10 +122,10 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
     )
     share = _innovations(result) / (rss / n_samples)
     said = (
-        f"the noise is coloured (half of the residual's power lies below {_half_power_Hz(result):.2g} Hz, "
-        f"{100 * share:.2g} % of it is unpredictable; dry friction and drift look like this): poles and "
-        f"coefficients were fitted behind a noise model of order {noise_filter.size - 1}, not by plain least "
-        "squares, which would spend poles on it"
+        f"the noise is coloured: half of what the residual has beyond a white floor lies below "
+        f"{_half_power_Hz(result):.2g} Hz, and {100 * share:.2g} % of the residual is unpredictable (dry "
+        "friction and drift look like this); poles and coefficients were fitted behind a noise model of order "
+        f"{noise_filter.size - 1}, not by plain least squares, which would spend poles on it"
     )
     return replace(result, verdicts=(*behind.verdicts, said))
 
@@ -142,10 +136,11 @@ def _advice(records: Sequence[Record], behind: Identification) -> list[str]:
 
 
 def _half_power_Hz(found: Identification) -> float:
-    """Half of the power of the longest residual lies below this frequency."""
+    """Below this frequency lies half of what the longest residual has beyond a white floor."""
     longest = max(found.residuals, key=len)
-    power = np.cumsum(np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2)
-    return float(np.searchsorted(power, 0.5 * power[-1]) / (2 * longest.size * found.model.dt_s))
+    power = np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2
+    beyond = np.cumsum(np.maximum(power - np.median(power), 0.0))
+    return float(np.searchsorted(beyond, 0.5 * beyond[-1]) / (2 * longest.size * found.model.dt_s))
 
 
 def _innovations(found: Identification) -> float:
@@ -155,13 +150,6 @@ def _innovations(found: Identification) -> float:
     n = whitening.size - 1
     errors = [lfilter(whitening, np.ones(1), part)[n:] for part in found.residuals]
     return float(np.mean(np.concatenate(errors) ** 2))
-
-
-def _criterion(found: Identification) -> float:
-    """BIC of a fit whose noise is autoregressive; the noise model's order counts the same for all."""
-    n = sum(part.size for part in found.residuals)
-    nuisances = len(found.residuals) * (1 + found.model.order * found.structure.estimate_initial_state)
-    return _bic(_innovations(found), n, 2 * found.model.order + nuisances)
 
 
 def _bic(variance: float, n_samples: int, unknowns: int) -> float:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
 from ident.basis.miso_model import MisoModel
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
