@@ -92,7 +92,8 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
     offsets = np.repeat(np.eye(len(part)), [block.shape[0] for block in blocks], axis=0)
     n = offsets.shape[0]
     # All orders from one factorisation: their columns, and what they leave of y, are columns of the triangle.
-    triangle = np.linalg.qr(np.column_stack([np.vstack(blocks), offsets, np.concatenate(targets)]), mode="r")
+    everything = np.column_stack([np.vstack(blocks), offsets, np.concatenate(targets)])
+    triangle = np.asarray(np.linalg.qr(everything, mode="r"))
     for order in orders:
         lags = np.arange(order)
         kept = np.concatenate([lags, longest + lags, 2 * longest + np.arange(len(part))])
@@ -124,7 +125,8 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
     said = (
         f"the noise is coloured: half of what the residual has beyond a white floor lies below "
         f"{_half_power_Hz(result):.2g} Hz, and {100 * share:.2g} % of the residual is unpredictable (dry "
-        "friction and drift look like this); poles and coefficients were fitted behind a noise model of order "
+        "friction and drift look like this); poles and coefficients were fitted behind a noise model of "
+        "order "
         f"{noise_filter.size - 1}, not by plain least squares, which would spend poles on it"
     )
     return replace(result, verdicts=(*behind.verdicts, said))
