@@ -159,36 +159,53 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
     """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
     output.
 
-    One block after the other over the whole signal: the recursion of a block is a short chain that the
-    processor overlaps, and every row is written once, contiguously.
+    One block after the other over the whole signal, so that every row is written once, contiguously. A
+    recursion is a chain of dependent operations, each a few cycles long; it goes two samples at a time,
+    x(k+2) = A^2 x(k) + A B v(k) + B v(k+1), and x(k+1) beside it is no part of the chain.
     """
     signal = w[lo:hi]
+    even = signal.size - signal.size % 2
     for i in range(blocks.shape[0]):
         out1 = rows[row, lo:hi]
         if i < n_real:
             a, b = blocks[i, 0], blocks[i, 1]
+            aa, ab = a * a, a * b
             x = 0.0
-            for k in range(signal.size):
-                v = signal[k]
-                out1[k] = x
-                signal[k] = b * x - a * v
-                x = b * v + a * x
+            for k in range(0, even, 2):
+                v, v_next = signal[k], signal[k + 1]
+                x_next = b * v + a * x
+                out1[k], out1[k + 1] = x, x_next
+                signal[k], signal[k + 1] = b * x - a * v, b * x_next - a * v_next
+                x = (ab * v + b * v_next) + aa * x
+            if even < signal.size:
+                out1[even] = x
+                signal[even] = b * x - a * signal[even]
             row += 1
         else:
             gamma, beta, sg, sb = blocks[i, 0], blocks[i, 1], blocks[i, 2], blocks[i, 3]
             gb, gs = gamma * beta, gamma * sb
             c1, c2 = -beta * sg, sb * sg
+            # A = [[gb, -gs], [sb, beta]], B = [sg, 0]: A^2 and A B.
+            a11, a12 = gb * gb - gs * sb, -gs * (gb + beta)
+            a21, a22 = sb * (gb + beta), beta * beta - gs * sb
+            b1, b2 = gb * sg, sb * sg
             x1 = 0.0
             x2 = 0.0
             out2 = rows[row + 1, lo:hi]
-            for k in range(signal.size):
-                v = signal[k]
-                out1[k] = x1
-                out2[k] = x2
-                signal[k] = c1 * x1 + c2 * x2 + gamma * v
+            for k in range(0, even, 2):
+                v, v_next = signal[k], signal[k + 1]
                 x1_next = (sg * v - gs * x2) + gb * x1
-                x2 = sb * x1 + beta * x2
+                x2_next = sb * x1 + beta * x2
+                out1[k], out1[k + 1] = x1, x1_next
+                out2[k], out2[k + 1] = x2, x2_next
+                signal[k] = c1 * x1 + c2 * x2 + gamma * v
+                signal[k + 1] = c1 * x1_next + c2 * x2_next + gamma * v_next
+                x1_next = ((b1 * v + sg * v_next) + a12 * x2) + a11 * x1
+                x2 = (b2 * v + a22 * x2) + a21 * x1
                 x1 = x1_next
+            if even < signal.size:
+                out1[even], out2[even] = x1, x2
+                signal[even] = c1 * x1 + c2 * x2 + gamma * signal[even]
             row += 2
 
 

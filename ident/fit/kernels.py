@@ -38,29 +38,36 @@ def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
 
 
 @numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
-def _four_dots(a: Any, rows: Any, j: int, last: int, lo: int, hi: int) -> tuple[float, float, float, float]:
-    """Products of a with rows j .. j + 3, or `last` in place of what lies beyond it."""
-    x = a[lo:hi]
+def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) -> Any:
+    """Products of a with rows j .. j + 3, or `last` in place of what lies beyond it, then those of b: each
+    number read from memory is used more than once."""
+    x, z = a[lo:hi], b[lo:hi]
     y0, y1 = rows[j, lo:hi], rows[min(j + 1, last), lo:hi]
     y2, y3 = rows[min(j + 2, last), lo:hi], rows[min(j + 3, last), lo:hi]
-    s0 = s1 = s2 = s3 = 0.0
+    s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
     for k in range(x.size):
         s0 += x[k] * y0[k]
         s1 += x[k] * y1[k]
         s2 += x[k] * y2[k]
         s3 += x[k] * y3[k]
-    return s0, s1, s2, s3
+        t0 += z[k] * y0[k]
+        t1 += z[k] * y1[k]
+        t2 += z[k] * y2[k]
+        t3 += z[k] * y3[k]
+    return (s0, s1, s2, s3), (t0, t1, t2, t3)
 
 
 @numba.njit(cache=True)
 def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
-    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: j <= i only."""
-    for i in range(first, rows.shape[0]):
-        last = i if lower else others.shape[0] - 1
+    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i."""
+    for i in range(first, rows.shape[0], 2):
+        second = min(i + 1, rows.shape[0] - 1)
+        last = second if lower else others.shape[0] - 1
         for j in range(0, last + 1, 4):
-            four = _four_dots(rows[i], others, j, last, lo, hi)
+            ours, theirs = _eight_dots(rows[i], rows[second], others, j, last, lo, hi)
             for q in range(min(4, last + 1 - j)):
-                target[i, j + q] = four[q]
+                target[i, j + q] = ours[q]
+                target[second, j + q] = theirs[q]
 
 
 @numba.njit(cache=True)
