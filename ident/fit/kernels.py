@@ -59,7 +59,11 @@ def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) 
 
 @numba.njit(cache=True)
 def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
-    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i."""
+    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i.
+
+    Targets, here and below, are written as slices of both axes even where they are whole arrays: one type,
+    one compilation.
+    """
     for i in range(first, rows.shape[0], 2):
         second = min(i + 1, rows.shape[0] - 1)
         last = second if lower else others.shape[0] - 1
@@ -205,7 +209,7 @@ def candidate_rss(
     driven_rows(blocks, n_real, drive.copy(), starts, phi)
     gram, on_frozen = np.zeros((m, m)), np.empty((m, n_frozen + 1))
     _products(phi, phi, 0, n_total, True, 0, gram[first:, first:])
-    _products(phi, frozen, 0, n_total, False, 0, on_frozen[first:])
+    _products(phi, frozen, 0, n_total, False, 0, on_frozen[first:, :])
     on_local = np.empty((phi.shape[0], local_q.shape[0]))
     if free:
         response = _free_rows(blocks, n_real, starts)
@@ -213,22 +217,22 @@ def candidate_rss(
         free_on_local = np.empty((order, local_q.shape[0]))
     for r in range(n_records):
         lo, hi = starts[r], starts[r + 1]
-        _products(phi, local_q, lo, hi, False, 0, on_local)
-        _subtract_squares(gram[first:, first:], on_local, 0)
+        _products(phi, local_q, lo, hi, False, 0, on_local[:, :])
+        _subtract_squares(gram[first:, first:], on_local[:, :], 0)
         if free:
             at = r * order
             for i in range(order):
                 _copy(placed[i, lo:hi], response[i, : hi - lo])
-            _products(placed, local_q, lo, hi, False, 0, free_on_local)
+            _products(placed, local_q, lo, hi, False, 0, free_on_local[:, :])
             _products(placed, placed, lo, hi, True, 0, gram[at : at + order, at : at + order])
-            _subtract_squares(gram[at : at + order, at : at + order], free_on_local, 0)
-            _products(placed, frozen, lo, hi, False, 0, on_frozen[at : at + order])
+            _subtract_squares(gram[at : at + order, at : at + order], free_on_local[:, :], 0)
+            _products(placed, frozen, lo, hi, False, 0, on_frozen[at : at + order, :])
             _products(phi, placed, lo, hi, False, 0, gram[first:, at : at + order])
             for i in range(phi.shape[0]):
                 for j in range(order):
                     for q in range(local_q.shape[0]):
                         gram[first + i, at + j] -= on_local[i, q] * free_on_local[j, q]
-    _subtract_squares(gram, on_frozen[:, :n_frozen], 0)
+    _subtract_squares(gram[:, :], on_frozen[:, :n_frozen], 0)
     residual = frozen[n_frozen]
     return float(_dot(residual, residual, 0, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
 
@@ -287,11 +291,11 @@ def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
 def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_local: Any, gram: Any) -> None:
     """Products of rows first .. with all rows before them, local columns taken out of both."""
     n_local = local_q.shape[0]
-    _products(rows, rows, 0, rows.shape[1], True, first, gram)
+    _products(rows, rows, 0, rows.shape[1], True, first, gram[:, :])
     for r in range(starts.size - 1):
         here = on_local[:, r * n_local : (r + 1) * n_local]
         _products(rows, local_q, starts[r], starts[r + 1], False, first, here)
-    _subtract_squares(gram, on_local[: rows.shape[0]], first)
+    _subtract_squares(gram[:, :], on_local[: rows.shape[0], :], first)
 
 
 @numba.njit(cache=True)
