@@ -100,11 +100,12 @@ class Store:
         """Delete what is ours, and the directory itself if nothing else is in it."""
         if not self.path.is_dir():
             return
-        for name in (*self.own_entries(), self.manifest_name, "lock"):
+        for name in (*self.own_entries(), self.manifest_name):
             entry = self.path / name
             if entry.is_dir():
                 shutil.rmtree(entry)
             else:
                 entry.unlink(missing_ok=True)
-        if not any(self.path.iterdir()):
+        if {entry.name for entry in self.path.iterdir()} <= {"lock"}:
+            (self.path / "lock").unlink(missing_ok=True)
             self.path.rmdir()
