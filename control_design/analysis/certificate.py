@@ -31,7 +31,10 @@ class PlantVerdict:
     closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted
     value over the ellipses (<= 1 met, 0 = not asked), frequency of the largest. bandwidth_rad_s: up to here
     every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
-    uncertainty is known everywhere. all_frequencies: what was proved between the grid points.
+    uncertainty is known everywhere; assumed_linear: between its points the response was assumed on a straight
+    line between members. stated: an uncertainty was given at all. own_performance: the damping requirement
+    looks at a channel of its own, any pair of members allowed. all_frequencies: what was proved between the
+    grid points.
     """
 
     plant: str
@@ -49,6 +52,9 @@ class PlantVerdict:
     bandwidth_rad_s: float
     frequencies: int
     own_grid_rad_s: tuple[float, float] | None = None
+    assumed_linear: bool = False
+    stated: bool = True
+    own_performance: bool = False
     all_frequencies: AllFrequencies = _NOT_LOOKED_AT
 
 
@@ -58,18 +64,16 @@ class Certificate:
 
     certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches
     -1, and every item of the specification is met: for all frequencies on plants where
-    `PlantVerdict.all_frequencies` is possible, else on the grids named in `checked`. gamma: largest weighted
-    worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or None where
-    some plant allows no proof. joint: calibration of the ellipses to whole responses, where asked for; the
-    ellipses checked are then those of the calibrated level where it is above the given one.
+    `PlantVerdict.all_frequencies` is possible, else on the dense grid or the plant's own. gamma: largest
+    weighted worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or
+    None where some plant allows no proof. joint: calibration of the ellipses to whole responses, where asked
+    for; the ellipses checked are then those of the calibrated level where it is above the given one.
     """
 
     certified: bool
     gamma: float
     plants: tuple[PlantVerdict, ...]
     items: tuple[SpecificationItem, ...]
-    checked: tuple[str, ...]
-    not_checked: tuple[str, ...]
     gamma_bound: float | None = None
     joint: JointCoverage | None = None
 
@@ -150,8 +154,6 @@ def certify(
         gamma=max(v.worst_weighted for v in verdicts),
         plants=tuple(verdicts),
         items=tuple(items),
-        checked=_checked_words(verdicts, specification, between_own_points, joint),
-        not_checked=_not_checked_words(plants, verdicts, between_own_points, joint),
         gamma_bound=max(proof.gamma for proof in proofs) if all(p.possible for p in proofs) else None,
         joint=joint,
     )
@@ -233,6 +235,9 @@ def _check_plant(
         own_grid_rad_s=None
         if plant.own_grid is None
         else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
+        assumed_linear=plant.own_grid is not None and between_own_points == "linear",
+        stated=plant.uncertainty is not None,
+        own_performance=plant.performance is not None,
         all_frequencies=proof,
     )
     found = Findings(
@@ -268,88 +273,3 @@ def _stable_share_item(
         "",
         bool(joint.stable_share >= required),
     )
-
-
-def _checked_words(
-    verdicts: Sequence[PlantVerdict],
-    specification: Specification,
-    between_own_points: str,
-    joint: JointCoverage | None,
-) -> tuple[str, ...]:
-    words = [
-        "nominal closed-loop poles of the full state space (plant, controller, computational delay)",
-        "Nyquist count of the uncertainty centre against the count a stable loop needs",
-        "distance of every ellipse from -1 and every weighted worst case, exact on the ellipse, on "
-        "a dense grid of "
-        + ", ".join(f"{v.frequencies} frequencies ({v.plant})" for v in verdicts)
-        + ", refined around the maxima",
-        "gain, phase, delay and modulus margins, nominal and worst case over the ellipses on that grid",
-    ]
-    for verdict in verdicts:
-        proof = verdict.all_frequencies
-        if proof.proved:
-            assumed = (
-                ", assuming that between its own frequencies the response lies on a straight line between "
-                "members of neighbouring ellipses"
-                if verdict.own_grid_rad_s is not None and between_own_points == "linear"
-                else ""
-            )
-            words.append(
-                f"{verdict.plant}: for all frequencies from 0 to Nyquist (bounds on {proof.intervals} "
-                f"intervals): no ellipse comes nearer to -1 than {proof.distance:.4g}, the weighted worst "
-                f"case is at most {proof.gamma:.4g}, and the winding is that of a stable loop; so every "
-                f"plant in the ellipses with the nominal's unstable poles is stable{assumed}"
-            )
-    if joint is not None:
-        words.append(joint.sentence())
-    if specification.mode_peak_ratio is not None:
-        words.append("damping of the flexible mode as the peak of |Gp S| in its band")
-    if specification.mode_damping is not None:
-        words.append("damping ratios of the nominal closed loop's modes in their band")
-    return tuple(words)
-
-
-def _not_checked_words(
-    plants: Sequence[UncertainPlant],
-    verdicts: Sequence[PlantVerdict],
-    between_own_points: str,
-    joint: JointCoverage | None,
-) -> tuple[str, ...]:
-    words: list[str] = []
-    for verdict in verdicts:
-        proof = verdict.all_frequencies
-        if proof.proved:
-            words.append(
-                f"{verdict.plant}: rounding errors of double precision, and gain, phase and delay margins "
-                "between grid points"
-            )
-        else:
-            words.append(f"{verdict.plant}: between grid points: not proved ({proof.reason})")
-    if joint is None:
-        words.append(
-            "joint level: the ellipses hold at their level at each frequency, not at all frequencies together"
-        )
-    words += [
-        "nonlinear effects (friction, saturation, quantisation, backlash) and anything outside the ellipses",
-        "that the true plant has as many unstable poles and integrators as the nominal",
-    ]
-    for plant, verdict in zip(plants, verdicts, strict=True):
-        if verdict.own_grid_rad_s is not None:
-            low, high = verdict.own_grid_rad_s
-            between = (
-                "between its points a straight line between members is assumed"
-                if between_own_points == "linear"
-                else "between its points nothing is known"
-            )
-            words.append(
-                f"{plant.name}: the uncertainty is known on its own grid only; {between}, and below "
-                f"{low:.4g} and above {high:.4g} rad/s the nominal alone was used, without uncertainty"
-            )
-        elif plant.uncertainty is None:
-            words.append(f"{plant.name}: no uncertainty was given; only the nominal plant was checked")
-        if plant.performance is not None:
-            words.append(
-                f"{plant.name}: correlation between measured and performance channel is not used "
-                "(any pair of members allowed)"
-            )
-    return tuple(words)

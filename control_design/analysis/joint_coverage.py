@@ -66,15 +66,6 @@ class JointCoverage:
     simultaneous_level: float
     stable_share: float
 
-    def sentence(self) -> str:
-        """One line for a report."""
-        return (
-            f"joint coverage {self.coverage:.4g}, calibrated on {self.draws} sampled responses: ellipses at "
-            f"{100 * self.level:.4g} % per frequency, weighted worst case {self.gamma:.4g} (at "
-            f"{100 * self.given_level:.4g} % the worst case {self.gamma_given:.4g} holds for "
-            f"{100 * self.coverage_given:.4g} % of them); {100 * self.stable_share:.4g} % of the draws stable"
-        )
-
 
 def joint_coverage(
     controller: Controller,
