@@ -38,6 +38,7 @@ _ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
 # Rows of the shortest record per order of the noise model.
 _ROWS_PER_ORDER = 13
 _RESIDUAL_ORDER = 12
+_LINES = 25
 
 
 def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:
@@ -141,7 +142,9 @@ def _half_power_Hz(found: Identification) -> float:
     """Below this frequency lies half of what the longest residual has beyond a white floor."""
     longest = max(found.residuals, key=len)
     power = np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2
-    beyond = np.cumsum(np.maximum(power - np.median(power), 0.0))
+    # Lines of white noise scatter by as much as their mean: means over neighbours show what stands out.
+    power = np.convolve(power, np.full(_LINES, 1 / _LINES), "same")
+    beyond = np.cumsum(np.maximum(power - 2 * np.median(power), 0.0))
     return float(np.searchsorted(beyond, 0.5 * beyond[-1]) / (2 * longest.size * found.model.dt_s))
 
 
