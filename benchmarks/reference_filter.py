@@ -16,7 +16,11 @@ import numpy as np
 
 from benchmarks.harness import Print, main
 from control_design import certify, synthesise
-from control_design.convex.reference_filter import Prefilter, PrefilterOptions, design_prefilter
+from control_design.convex.reference_filter import (
+    ReferenceFilter,
+    ReferenceFilterOptions,
+    design_reference_filter,
+)
 from control_design.plants.ellipses import Ellipses
 from control_design.plants.weights import RationalWeight
 from validation.example_plants import flexible_link, flexible_link_specification
@@ -25,7 +29,11 @@ MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 
 
 def error_of_members(
-    ellipses: Ellipses, loop: np.ndarray, prefilter: Prefilter | None, omega: np.ndarray, dt_s: float
+    ellipses: Ellipses,
+    loop: np.ndarray,
+    reference_filter: ReferenceFilter | None,
+    omega: np.ndarray,
+    dt_s: float,
 ) -> float:
     """Largest error over boundary members, from python-control responses."""
     angle = 2 * np.pi * np.arange(720) / 720
@@ -34,8 +42,8 @@ def error_of_members(
     s = 2j / dt_s * np.tan(omega * dt_s / 2)
     target = 1 / (0.25 * s**2 + s + 1)
     follow = np.ones(omega.size, complex)
-    if prefilter is not None:
-        follow = np.asarray(control.frequency_response(prefilter.to_control(), omega).complex).ravel()
+    if reference_filter is not None:
+        follow = np.asarray(control.frequency_response(reference_filter.to_control(), omega).complex).ravel()
     return float(np.max(np.abs(follow * tracking - target)))
 
 
@@ -55,8 +63,8 @@ def run(out: Print, *, seed: int = 1) -> None:
     cases = [(1, True), (1, False), (2, True), (3, True)]
     for order, unit_gain in cases:
         begin = time.process_time()
-        f = design_prefilter(
-            result.controller, plant, MODEL, PrefilterOptions(order=order, unit_gain=unit_gain)
+        f = design_reference_filter(
+            result.controller, plant, MODEL, ReferenceFilterOptions(order=order, unit_gain=unit_gain)
         )
         spent = time.process_time() - begin
         members = [error_of_members(ellipses, loop, each, omega, plant.dt_s) for each in (None, f)]

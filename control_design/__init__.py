@@ -14,7 +14,11 @@ from control_design.analysis.joint_coverage import JointCoverage
 from control_design.analysis.margins import Margins
 from control_design.controllers.c_code import c_header, c_source
 from control_design.controllers.controller import Controller, ControllerStepper
-from control_design.convex.reference_filter import Prefilter, PrefilterOptions, design_prefilter
+from control_design.convex.reference_filter import (
+    ReferenceFilter,
+    ReferenceFilterOptions,
+    design_reference_filter,
+)
 from control_design.convex.youla import YoulaBracket, YoulaOptions, youla_bracket
 from control_design.plants.ellipses import Ellipses
 from control_design.plants.guards import Guard
@@ -50,9 +54,9 @@ __all__ = [
     "Mode",
     "Outcome",
     "PlantVerdict",
-    "Prefilter",
-    "PrefilterOptions",
     "RationalWeight",
+    "ReferenceFilter",
+    "ReferenceFilterOptions",
     "SampledMachine",
     "Specification",
     "SpecificationError",
@@ -68,7 +72,7 @@ __all__ = [
     "c_header",
     "c_source",
     "certify",
-    "design_prefilter",
+    "design_reference_filter",
     "simulate",
     "step_metrics",
     "synthesise",

@@ -65,12 +65,12 @@ class Law:
         plain = {
             key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in values.items()
         }
-        return {"format": f"flexlink-{self.kind}-1", "law": self.equations, **plain}
+        return {"format": f"flexlink-{self.kind.replace(' ', '_')}-1", "law": self.equations, **plain}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Inverse of `to_dict`; ValueError if it is not of this format, naming a key it lacks."""
-        known = f"flexlink-{cls.kind}-1"
+        known = f"flexlink-{cls.kind.replace(' ', '_')}-1"
         if data.get("format") != known:
             raise ValueError(f"not a {cls.kind} file: format is {data.get('format')!r}, expected {known!r}")
         missing = [field.name for field in fields(cls) if field.name not in data]

@@ -1,5 +1,5 @@
 """Smallest worst ratio of a convex over a concave function, many rows at once: the convex core of bound and
-prefilter.
+reference filter.
 
 Every row looks at one complex number y_k = sum_i basis_ki x_i, taken as a vector of the plane, and asks
     |A y + a| <= gamma (e + E y - |C y + c|).

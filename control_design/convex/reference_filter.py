@@ -38,8 +38,8 @@ from control_design.plants.weights import RationalWeight
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
 
 
-class PrefilterOptions(BaseModel):
-    """Order of the prefilter and how finely it is designed."""
+class ReferenceFilterOptions(BaseModel):
+    """Order of the reference filter and how finely it is designed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,7 +61,7 @@ class PrefilterOptions(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Prefilter(Law):
+class ReferenceFilter(Law):
     """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable.
 
     A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. error_before, error_after: largest weighted
@@ -69,7 +69,7 @@ class Prefilter(Law):
     the dense grid; worst_rad_s: where the second occurs.
     """
 
-    kind = "prefilter"
+    kind = "reference filter"
     equations = "x+ = A x + B r; filtered reference = C x + D r"
 
     error_before: float
@@ -79,13 +79,13 @@ class Prefilter(Law):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.order and not np.max(np.abs(self.poles)) < 1:
-            raise ValueError("the prefilter is not stable")
+            raise ValueError("the reference filter is not stable")
         for name in ("error_before", "error_after", "worst_rad_s"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"prefilter {name} must not be negative; got {getattr(self, name)}")
+                raise ValueError(f"reference filter {name} must not be negative; got {getattr(self, name)}")
 
     def filtered(self, reference: Real) -> Real:
-        """The reference (T,) behind the prefilter, from rest: what `closed_loop.simulate` takes as
+        """The reference (T,) behind the reference filter, from rest: what `closed_loop.simulate` takes as
         reference."""
         reference = np.asarray(reference, dtype=np.float64)
         if reference.ndim != 1:
@@ -138,15 +138,15 @@ def worst_matching_error(
     return np.asarray(np.where(blocked, np.inf, high))
 
 
-def design_prefilter(
+def design_reference_filter(
     controller: Controller,
     plants: UncertainPlant | Sequence[UncertainPlant],
     model: RationalWeight,
-    options: PrefilterOptions | None = None,
+    options: ReferenceFilterOptions | None = None,
     *,
     weight: RationalWeight | None = None,
-) -> Prefilter:
-    """Prefilter with the smallest worst-case |W (F T - T_ref)| over all plants and their ellipses.
+) -> ReferenceFilter:
+    """Reference filter with the smallest worst-case |W (F T - T_ref)| over all plants and their ellipses.
 
     model: T_ref(s), weight: W(s) or None for 1, both on the circle at the Tustin frequency. Poles of F as in
     the options; searched ones start spread around the model's and follow a simplex search on their
@@ -155,13 +155,13 @@ def design_prefilter(
     Raises
     ------
     ValueError
-        If an ellipse reaches -1 (no prefilter helps), sampling times differ, or a pole is not in (0,
+        If an ellipse reaches -1 (no reference filter helps), sampling times differ, or a pole is not in (0,
         Nyquist).
     """
-    options = options or PrefilterOptions()
+    options = options or ReferenceFilterOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)
     if not listed:
-        raise ValueError("no plant given: the prefilter needs at least one uncertain plant")
+        raise ValueError("no plant given: the reference filter needs at least one uncertain plant")
     for plant in listed:
         if not np.isclose(plant.dt_s, controller.dt_s, rtol=1e-9, atol=0):
             raise ValueError(
@@ -171,7 +171,7 @@ def design_prefilter(
 
 
 class _Matching:
-    """Grids and loops of one prefilter design."""
+    """Grids and loops of one reference filter design."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class _Matching:
         plants: tuple[UncertainPlant, ...],
         model: RationalWeight,
         weight: RationalWeight | None,
-        options: PrefilterOptions,
+        options: ReferenceFilterOptions,
     ) -> None:
         self.controller, self.plants, self.options = controller, plants, options
         self.model, self.weight, self.dt_s = model, weight, controller.dt_s
@@ -205,15 +205,17 @@ class _Matching:
             self.dense.append(plant.at(plant_grid(plant, dense)))
         for plant, ellipses in zip(plants, self.dense, strict=True):
             if not np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1:
-                raise ValueError(f"plant {plant.name!r}: the nominal loop is unstable; no prefilter helps")
+                raise ValueError(
+                    f"plant {plant.name!r}: the nominal loop is unstable; no reference filter helps"
+                )
             gap = distance_to_minus_one(self.controller.response(ellipses.omega_rad_s), ellipses)
             if not np.all(gap > 0):
                 raise ValueError(
                     f"plant {plant.name!r}: at {ellipses.omega_rad_s[np.argmin(gap)]:.4g} rad/s a member "
-                    "of the ellipse puts the loop on -1; a prefilter needs a robustly stable loop"
+                    "of the ellipse puts the loop on -1; a reference filter needs a robustly stable loop"
                 )
 
-    def solve(self) -> Prefilter:
+    def solve(self) -> ReferenceFilter:
         poles = self._given_poles()
         if poles is None:
             poles = self._searched_poles()
@@ -234,7 +236,7 @@ class _Matching:
         assert best is not None
         worst, where, full = best
         a, b = basis_state_space(poles)
-        return Prefilter(a, b, full[None, 1:], np.array([[full[0]]]), self.dt_s, before, worst, where)
+        return ReferenceFilter(a, b, full[None, 1:], np.array([[full[0]]]), self.dt_s, before, worst, where)
 
     def _given_poles(self) -> Complex | None:
         rates = self.options.poles_rad_s

@@ -1,4 +1,4 @@
-"""Published comparison numbers that one design reaches in seconds: order 6, damping of the mode, prefilter.
+"""Published comparison numbers that one design reaches in seconds: order 6, mode damping, reference filter.
 
 The others have their tests beside their subject: order 5 in test_synthesis, joint coverage in
 test_joint_coverage and test_joint_synthesis, certificate in test_between_grid_points and test_random_designs,
@@ -13,11 +13,11 @@ import pytest
 from benchmarks.mode_damping import PUBLISHED, damping, nominal_cost
 from benchmarks.reference_filter import MODEL
 from control_design import (
-    PrefilterOptions,
+    ReferenceFilterOptions,
     SynthesisOptions,
     UncertainPlant,
     certify,
-    design_prefilter,
+    design_reference_filter,
     synthesise,
 )
 from validation.example_plants import flexible_link, flexible_link_specification
@@ -52,9 +52,11 @@ def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controll
     assert nominal_cost(result.controller, plant, specification) <= min(cost for _, cost in PUBLISHED)
 
 
-def test_first_order_prefilter_of_scenario_b_divides_the_worst_matching_error_by_four():
+def test_first_order_reference_filter_of_scenario_b_divides_the_worst_matching_error_by_four():
     plant, specification = flexible_link("B"), flexible_link_specification(5)
     result = synthesise([plant], specification, rng=np.random.default_rng(1))
-    prefilter = design_prefilter(result.controller, plant, MODEL, PrefilterOptions(order=1))
-    assert prefilter.error_before >= 4.0 * prefilter.error_after
-    assert prefilter.error_after <= 0.23
+    reference_filter = design_reference_filter(
+        result.controller, plant, MODEL, ReferenceFilterOptions(order=1)
+    )
+    assert reference_filter.error_before >= 4.0 * reference_filter.error_after
+    assert reference_filter.error_after <= 0.23

@@ -1,4 +1,4 @@
-"""Any order's reach, whole responses and the prefilter: found, told, written beside the controller."""
+"""Any order's reach, whole responses and the reference filter: found, told, written beside the controller."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import JointCoverage
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import UncertainPlant
 from control_design.requirement import LoopFunction
 from control_design.specification import RationalWeight, Specification
@@ -237,7 +237,7 @@ def test_model_of_a_corner_is_a_power_of_a_lag():
     assert settings.reference_model.at(s) == pytest.approx(1 / (s / 3 + 1) ** 3)
 
 
-def test_weight_of_a_prefilter_is_for_steps_unless_said():
+def test_weight_of_a_reference_filter_is_for_steps_unless_said():
     steps = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0}).error_weight
     assert steps is not None
     assert np.abs(steps.at(1j * np.array([0.0, 3e4]))) == pytest.approx([100.0, 1.0])
@@ -270,7 +270,7 @@ def filtered() -> ReferenceFilterResult:
     return find_filter(controller(), [plant()], settings)
 
 
-def test_prefilter_follows_the_model_better_than_none(filtered):
+def test_reference_filter_follows_the_model_better_than_none(filtered):
     found = filtered.filter
     assert found is not None
     assert found.error_after < 0.9 * found.error_before
@@ -283,7 +283,7 @@ def test_prefilter_follows_the_model_better_than_none(filtered):
     assert "times smaller" in said("reference_filter", filtered)
 
 
-def test_prefilter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
+def test_reference_filter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0})
     result = find_filter(controller(500.0), [plant()], settings)
     assert result.filter is None
@@ -300,7 +300,7 @@ def test_filter_files(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
     assert filter_file(Path("k.json")) == Path("k_reference_filter.json")
-    again = Prefilter.from_json(filter_bytes(found, ".JSON").decode())
+    again = ReferenceFilter.from_json(filter_bytes(found, ".JSON").decode())
     assert np.array_equal(again.A, found.A)
     mat = scipy.io.loadmat(BytesIO(filter_bytes(found, ".mat")))
     assert np.array_equal(mat["B"], found.B)
@@ -308,7 +308,7 @@ def test_filter_files(filtered, tmp_path):
 
 
 @pytest.mark.skipif(_COMPILER is None, reason="no C compiler (cc, gcc or clang) on this machine")
-def test_prefilter_in_c_agrees_to_1e_12(filtered, tmp_path):
+def test_reference_filter_in_c_agrees_to_1e_12(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
     (tmp_path / "f.c").write_bytes(filter_bytes(found, ".c"))

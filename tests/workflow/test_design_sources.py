@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from ident.basis.model import GobfModel
 from ident.basis.model_files import ModelFile
 from ident.basis.poles import Poles
@@ -125,7 +125,7 @@ def test_state_space_with_stated_uncertainty(flexlink, wish, tmp_path):
         assert np.max(np.abs(1 / (1 + factor * law(z) * arm()(z)))) <= verdict["worst_peak_sensitivity"]
 
 
-def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexlink, wish, tmp_path):
+def test_design_says_how_far_it_is_from_any_order_and_brings_its_reference_filter(flexlink, wish, tmp_path):
     write_json(tmp_path / "arm.json", document(arm()))
     more = (
         "[uncertainty]\nmultiplicative = 0.1\n[reference_filter]\ncorner_rad_s = 2.0\ndense_points = 1000\n"
@@ -141,7 +141,7 @@ def test_design_says_how_far_it_is_from_any_order_and_brings_its_prefilter(flexl
     assert filtered["error_after"] < filtered["error_before"]
     beside = tmp_path / "law_reference_filter.json"
     assert found["files"] == [str(out), str(beside)]
-    assert np.array_equal(Prefilter.from_json(beside.read_text()).A, filtered["A"])
+    assert np.array_equal(ReferenceFilter.from_json(beside.read_text()).A, filtered["A"])
     table = {row["label"]: row["value"] for row in json.loads(answer.out)["table"]}
     assert "that a controller of any order is known to reach" in table["achievable performance"]
     assert "times smaller" in table["model matching"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
@@ -334,7 +334,7 @@ def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, und
     assert "The loop under other conditions" not in page.text
 
 
-def test_page_tells_of_any_order_whole_responses_and_prefilter(tmp_path, undrawn):
+def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, undrawn):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
     text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
@@ -345,8 +345,8 @@ def test_page_tells_of_any_order_whole_responses_and_prefilter(tmp_path, undrawn
     assert "against a controller of any order" in text
     assert "99 % stay within the worst case of the 95 % ellipses (98.17 % to 99.46 %" in text
     assert "Joint level: sampled, not certified" in text
-    assert "Prefilter" not in text
-    filtered = Prefilter(
+    assert "Reference filter" not in text
+    filtered = ReferenceFilter(
         A=np.array([[0.9]]),
         B=np.array([[0.1]]),
         C=np.array([[1.0]]),

@@ -108,7 +108,7 @@ def test_every_design_is_compared_with_any_order_and_sampled_whole(run):
     assert joint.stable_share > 0.999
 
 
-def test_prefilter_takes_the_reference_step_to_the_loop(run, tmp_path):
+def test_reference_filter_takes_the_reference_step_to_the_loop(run, tmp_path):
     shutil.copytree(run.run.path, tmp_path / "run")
     copy = RunResults(RunDirectory(tmp_path / "run"))
     corner = 0.3 * config_of(run.run).specification.bandwidth_rad_s
@@ -130,7 +130,7 @@ def test_prefilter_takes_the_reference_step_to_the_loop(run, tmp_path):
     def away(loop, signal):
         return np.max(np.abs(loop.predicted_runs.output[0, first] - signal[first]))
 
-    # A model three times slower than the loop: with the prefilter the loop is nearer to it.
+    # A model three times slower than the loop: with the reference filter the loop is nearer to it.
     assert away(filtered, model) < 0.7 * away(plain, model)
     assert filtered.sensitivity.measured[0].peak == plain.sensitivity.measured[0].peak
 

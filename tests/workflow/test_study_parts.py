@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 
 from control_design.analysis.margins import Margins
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
 from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.report_examples import achievable, sampled_responses
@@ -206,7 +206,7 @@ def test_margins_in_the_units_of_the_table():
 
 
 def test_numbers_beyond_the_margins():
-    filtered = Prefilter(
+    filtered = ReferenceFilter(
         np.array([[0.9]]), np.array([[0.1]]), np.array([[1.0]]), np.array([[0.0]]), 0.01, 0.95, 0.2, 3.0
     )
     peaks = SimpleNamespace(

@@ -8,7 +8,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from control_design.convex.reference_filter import PrefilterOptions
+from control_design.convex.reference_filter import ReferenceFilterOptions
 from control_design.convex.youla import YoulaOptions
 from control_design.specification import RationalWeight
 
@@ -49,7 +49,7 @@ class AchievableOptions(YoulaOptions):
     compute: bool = Field(True, description="false: the design is not compared with other orders")
 
 
-class ReferenceFilterSettings(PrefilterOptions):
+class ReferenceFilterSettings(ReferenceFilterOptions):
     """[reference_filter]: second degree of freedom, u = K (F r - y), designed after K to follow a model."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -39,7 +39,7 @@ class LoopTraces:
 class LoopScene:
     """What was asked of the loop, and the axes' words: (name, unit) per signal.
 
-    model: answer (T,) of the model that a prefilter makes the loop follow.
+    model: answer (T,) of the model that a reference filter makes the loop follow.
     """
 
     time_s: Real

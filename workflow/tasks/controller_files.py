@@ -13,7 +13,7 @@ import scipy.io
 
 from control_design.controllers.c_code import c_header, c_source
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from workflow.engine import codec, storage
 
 RUN_FILES = ("controller.json", "controller.c", "controller.h")
@@ -32,13 +32,13 @@ def _mat(controller: Controller) -> bytes:
     return stream.getvalue()
 
 
-def _filter_mat(found: Prefilter) -> bytes:
+def _filter_mat(found: ReferenceFilter) -> bytes:
     stream: Any = BytesIO()  # scipy takes any binary file; its annotations know of paths only
     scipy.io.savemat(stream, codec.plain(found))
     return bytes(stream.getvalue())
 
 
-def _as_law(found: Prefilter) -> Controller:
+def _as_law(found: ReferenceFilter) -> Controller:
     """The controller's generator serves: a state space without limits, from reference to filtered one."""
     return Controller(
         A=found.A,
@@ -58,7 +58,7 @@ _CONTROLLER: Mapping[str, Callable[[Controller], bytes]] = {
     ".c": lambda controller: c_source(controller).encode("ascii"),
     ".h": lambda controller: c_header(controller).encode("ascii"),
 }
-_FILTER: Mapping[str, Callable[[Prefilter], bytes]] = {
+_FILTER: Mapping[str, Callable[[ReferenceFilter], bytes]] = {
     ".json": lambda found: found.to_json().encode(),
     ".mat": _filter_mat,
     ".c": lambda found: (_NOTE + c_source(_as_law(found), "reference_filter")).encode("ascii"),
@@ -72,7 +72,7 @@ def filter_file(controller_file: Path) -> Path:
     return controller_file.with_name(f"{controller_file.stem}_reference_filter{controller_file.suffix}")
 
 
-def filter_bytes(found: Prefilter, suffix: str) -> bytes:
+def filter_bytes(found: ReferenceFilter, suffix: str) -> bytes:
     """The file's content, by the ending."""
     return _FILTER[suffix.lower()](found)
 
@@ -85,7 +85,7 @@ def targets(out: Path) -> list[Path]:
 
 
 def write_controller(
-    out: Path, controller: Controller, reference_filter: Prefilter | None, *, certified: bool
+    out: Path, controller: Controller, reference_filter: ReferenceFilter | None, *, certified: bool
 ) -> list[Path]:
     """Write the `targets` of `out` where their content is not there already; the files there are now."""
     law = controller if certified else replace(controller, name=f"{controller.name} (NOT CERTIFIED)")

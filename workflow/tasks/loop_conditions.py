@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
 from plant import Rig, parse_effect
 from plant import simulate as simulate_arm
@@ -97,8 +97,8 @@ class _Pushed:
 class ConditionBench:
     """Everything the conditions share.
 
-    reference: (T,) step after a lead-in; prefilter: what every reference goes through, if any; options:
-    effects and steps of the closed-loop check; rng: noise of run number k comes from the k-th spawned
+    reference: (T,) step after a lead-in; reference_filter: what every reference goes through, if any;
+    options: effects and steps of the closed-loop check; rng: noise of run k comes from the k-th spawned
     generator.
     """
 
@@ -110,7 +110,7 @@ class ConditionBench:
     reference: Real
     measured: int
     rng: np.random.Generator
-    prefilter: Prefilter | None = None
+    reference_filter: ReferenceFilter | None = None
 
     @property
     def effects(self) -> dict[str, dict[str, Any]]:
@@ -171,7 +171,7 @@ class ConditionBench:
 
     def _given(self, reference: Real) -> Real:
         """What the loop is given for a reference."""
-        return reference if self.prefilter is None else self.prefilter.filtered(reference)
+        return reference if self.reference_filter is None else self.reference_filter.filtered(reference)
 
     @property
     def step(self) -> float:

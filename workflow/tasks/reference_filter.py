@@ -9,7 +9,7 @@ import numpy.typing as npt
 import scipy.signal
 
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import PrefilterOptions, design_prefilter
+from control_design.convex.reference_filter import ReferenceFilterOptions, design_reference_filter
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight
 from workflow.config.design_options import ReferenceFilterSettings
@@ -29,9 +29,9 @@ def find_filter(
         return ReferenceFilterResult()
     check_filter(settings, controller.dt_s)
     own = {"corner_rad_s", "model_order", "model", "weight"}
-    options = PrefilterOptions(**settings.model_dump(exclude=own))
+    options = ReferenceFilterOptions(**settings.model_dump(exclude=own))
     try:
-        found = design_prefilter(
+        found = design_reference_filter(
             controller, plants, settings.reference_model, options, weight=settings.error_weight
         )
     except ValueError as unfit:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import StepMetrics
 from control_design.analysis.joint_coverage import JointCoverage
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
 from control_design.plants.plant_set import Channel as PlantChannel
 from control_design.plants.plant_set import UncertainPlant
@@ -368,7 +368,7 @@ class CertifyResult:
 class ReferenceFilterResult:
     """filter: None where none was asked for, or where none is possible (reason)."""
 
-    filter: Prefilter | None = None
+    filter: ReferenceFilter | None = None
     reason: str | None = None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import UncertainPlant
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import SimulatedSource
@@ -25,7 +25,7 @@ Real = npt.NDArray[np.float64]
 def check_on_arm(
     stage: StageInput,
     controller: Controller,
-    prefilter: Prefilter | None,
+    reference_filter: ReferenceFilter | None,
     plant: UncertainPlant,
     posterior: ResponsePosterior,
     reference: Real,
@@ -45,7 +45,7 @@ def check_on_arm(
         stage.progress.update("closed_loop", 0.9, "conditions")
         conditions = ConditionBench(
             controller=controller,
-            prefilter=prefilter,
+            reference_filter=reference_filter,
             posterior=posterior,
             source=source,
             options=options,

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate, step_metrics
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import Prefilter
+from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedSource
 from workflow.engine.errors import naming
@@ -45,7 +45,7 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
 @dataclass(frozen=True, eq=False)
 class Trial:
     """What is asked of the loop: reference step after the lead-in, input disturbance from half-way on; (T,)
-    each. prefiltered: the reference behind the prefilter, which the loop is then given; None without one."""
+    each. reference_filtered: the reference behind the filter, which the loop is then given; None without."""
 
     time_s: Real
     reference: Real
@@ -53,7 +53,7 @@ class Trial:
     step: float
     half: int
     tracking: bool
-    prefiltered: Real | None = None
+    reference_filtered: Real | None = None
 
 
 def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
@@ -68,8 +68,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
         radius = float(np.max(np.abs(closed_loop_poles(controller, plant))))
         if not radius < 1:
             return ClosedLoopResult(skipped="the nominal closed loop is unstable")
-        prefilter = results.reference_filter.filter
-        trial = make_trial(stage, controller.dt_s, radius, prefilter)
+        reference_filter = results.reference_filter.filter
+        trial = make_trial(stage, controller.dt_s, radius, reference_filter)
         channels, performance = results.uncertainty.channels, config.performance_index
         posterior = channels[config.control_index].posterior
         tip = None if performance is None else channels[performance].posterior
@@ -81,10 +81,10 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             else run_on_posterior(stage, controller, posterior, tip, trial)
         )
         sensitivity, conditions = check_on_arm(
-            stage, controller, prefilter, plant, posterior, trial.reference[: trial.half]
+            stage, controller, reference_filter, plant, posterior, trial.reference[: trial.half]
         )
     model = None
-    if prefilter is not None and config.reference_filter is not None:
+    if reference_filter is not None and config.reference_filter is not None:
         model = model_answer(config.reference_filter.reference_model, trial.reference, controller.dt_s)
     return ClosedLoopResult(
         check=LoopCheck(
@@ -95,7 +95,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             quantisation=config.closed_loop.quantisation,
             measurement_step=config.closed_loop.measurement_step,
             input_limit=controller.input_limit,
-            filtered=prefilter is not None,
+            filtered=reference_filter is not None,
             predicted=describe(predicted, trial)[0],
             achieved=describe(achieved, trial),
             time_s=trial.time_s,
@@ -111,7 +111,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
 
 
 def make_trial(
-    stage: StageInput, dt_s: float, pole_radius: float, prefilter: Prefilter | None = None
+    stage: StageInput, dt_s: float, pole_radius: float, reference_filter: ReferenceFilter | None = None
 ) -> Trial:
     """Half the record for the step, half for the disturbance, each long enough for the slowest closed-loop
     pole."""
@@ -138,7 +138,7 @@ def make_trial(
         half=half,
         tracking=config.specification.bandwidth_rad_s is not None
         or config.specification.sensitivity_weight is not None,
-        prefiltered=None if prefilter is None else prefilter.filtered(reference),
+        reference_filtered=None if reference_filter is None else reference_filter.filtered(reference),
     )
 
 
@@ -235,7 +235,7 @@ def _loop(
     return simulate(
         controller,
         machine,
-        trial.reference if trial.prefiltered is None else trial.prefiltered,
+        trial.reference if trial.reference_filtered is None else trial.reference_filtered,
         measured_index=measured,
         input_disturbance=disturbance,
         measurement_step=0.0 if steps is None else steps.measurement_step,

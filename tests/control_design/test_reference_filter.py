@@ -1,4 +1,4 @@
-"""Prefilter: independent evaluation of errors, known answers, round trips."""
+"""Reference filter: independent evaluation of errors, known answers, round trips."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from control_design.analysis.closed_loop import LinearMachine, simulate
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import (
-    Prefilter,
-    PrefilterOptions,
-    design_prefilter,
+    ReferenceFilter,
+    ReferenceFilterOptions,
+    design_reference_filter,
     worst_matching_error,
 )
 from control_design.plants.ellipses import Ellipses
@@ -20,7 +20,7 @@ from control_design.plants.weights import RationalWeight
 
 from .plants import RelativeDisc, hub_arm
 
-_FAST = PrefilterOptions(grid_points=80, mode_points=30, dense_points=1500)
+_FAST = ReferenceFilterOptions(grid_points=80, mode_points=30, dense_points=1500)
 _MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 
 
@@ -58,8 +58,8 @@ def test_constant_filter_of_an_exact_plant_agrees_with_a_scan():
     empty = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
     controller = Controller(*empty, np.array([[9.0]]), dt, computational_delay_samples=0)
     model = RationalWeight(numerator=(1.0,), denominator=(1 / 40, 1.0))
-    got = design_prefilter(
-        controller, plant, model, PrefilterOptions(order=0, unit_gain=False, dense_points=2000)
+    got = design_reference_filter(
+        controller, plant, model, ReferenceFilterOptions(order=0, unit_gain=False, dense_points=2000)
     )
     z = np.exp(1j * np.geomspace(1e-4, np.pi / dt, 4000) * dt)
     tracking = 0.45 * z / (1.45 * z - 0.95)
@@ -71,10 +71,10 @@ def test_constant_filter_of_an_exact_plant_agrees_with_a_scan():
 
 def test_designed_filter_improves_over_all_members_and_keeps_unit_gain():
     controller, plant = _hub_loop()
-    prefilter = design_prefilter(controller, plant, _MODEL, _FAST)
-    assert prefilter.order == 1
-    assert prefilter.error_after < 0.7 * prefilter.error_before
-    f = prefilter.to_control()
+    reference_filter = design_reference_filter(controller, plant, _MODEL, _FAST)
+    assert reference_filter.order == 1
+    assert reference_filter.error_after < 0.7 * reference_filter.error_before
+    f = reference_filter.to_control()
     assert np.real(f(1.0)) == pytest.approx(1.0, abs=1e-9)
     # Independent evaluation: members of the discs, python-control for the loop.
     omega = np.geomspace(1e-2, 600, 300)
@@ -86,17 +86,19 @@ def test_designed_filter_improves_over_all_members_and_keeps_unit_gain():
     target = 1 / (0.25 * s**2 + s + 1)
     response = np.asarray(control.frequency_response(f, omega).complex).ravel()
     error = np.max(np.abs(response * member * k / (1 + member * k) - target))
-    assert error <= prefilter.error_after * (1 + 1e-6)
-    assert error > 0.9 * prefilter.error_after
+    assert error <= reference_filter.error_after * (1 + 1e-6)
+    assert error > 0.9 * reference_filter.error_after
 
 
 def test_more_poles_never_hurt_and_two_plants_cost():
     controller, plant = _hub_loop()
-    one = design_prefilter(controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (3.0,)}))
-    two = design_prefilter(controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (3.0, 8.0)}))
+    one = design_reference_filter(controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (3.0,)}))
+    two = design_reference_filter(
+        controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (3.0, 8.0)})
+    )
     assert two.error_after <= one.error_after * (1 + 1e-3)
     wide = _hub_loop(0.08)[1]
-    both = design_prefilter(
+    both = design_reference_filter(
         controller, [plant, wide], _MODEL, _FAST.model_copy(update={"poles_rad_s": (3.0,)})
     )
     assert both.error_after >= one.error_after * (1 - 1e-3)
@@ -104,25 +106,30 @@ def test_more_poles_never_hurt_and_two_plants_cost():
 
 def test_round_trips_and_filtering():
     controller, plant = _hub_loop()
-    prefilter = design_prefilter(
+    reference_filter = design_reference_filter(
         controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (2.0, 9.0)})
     )
-    again = Prefilter.from_json(prefilter.to_json())
+    again = ReferenceFilter.from_json(reference_filter.to_json())
     for name in ("A", "B", "C", "D"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(prefilter, name))
-    assert (again.error_before, again.error_after) == (prefilter.error_before, prefilter.error_after)
+        np.testing.assert_array_equal(getattr(again, name), getattr(reference_filter, name))
+    assert (again.error_before, again.error_after) == (
+        reference_filter.error_before,
+        reference_filter.error_after,
+    )
     reference = np.random.default_rng(1).standard_normal(200)
-    expected = control.forced_response(prefilter.to_control(), inputs=reference).outputs
-    np.testing.assert_allclose(prefilter.filtered(reference), expected, atol=1e-12)
+    expected = control.forced_response(reference_filter.to_control(), inputs=reference).outputs
+    np.testing.assert_allclose(reference_filter.filtered(reference), expected, atol=1e-12)
 
 
-def test_simulated_step_is_the_response_of_prefilter_and_loop():
+def test_simulated_step_is_the_response_of_reference_filter_and_loop():
     controller, plant = _hub_loop()
-    prefilter = design_prefilter(controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (2.0,)}))
+    reference_filter = design_reference_filter(
+        controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (2.0,)})
+    )
     step = np.ones(600)
-    run = simulate(controller, LinearMachine(plant.nominal), prefilter.filtered(step))
+    run = simulate(controller, LinearMachine(plant.nominal), reference_filter.filtered(step))
     loop = control.series(controller.to_control(include_delay=True), plant.nominal)
-    whole = control.series(prefilter.to_control(), control.feedback(loop, 1))
+    whole = control.series(reference_filter.to_control(), control.feedback(loop, 1))
     expected = control.forced_response(whole, inputs=step).outputs
     np.testing.assert_allclose(run.output[:, 0], expected, atol=1e-9)
 
@@ -130,12 +137,14 @@ def test_simulated_step_is_the_response_of_prefilter_and_loop():
 def test_bad_input_is_one_clear_line():
     controller, plant = _hub_loop()
     with pytest.raises(ValueError, match="Nyquist"):
-        design_prefilter(controller, plant, _MODEL, PrefilterOptions(poles_rad_s=(1e4,)))
+        design_reference_filter(controller, plant, _MODEL, ReferenceFilterOptions(poles_rad_s=(1e4,)))
     with pytest.raises(ValueError, match="at least one"):
-        design_prefilter(controller, [], _MODEL)
+        design_reference_filter(controller, [], _MODEL)
     with pytest.raises(ValueError, match="loop on -1"):
-        design_prefilter(controller, _hub_loop(0.6)[1], _MODEL, _FAST)
+        design_reference_filter(controller, _hub_loop(0.6)[1], _MODEL, _FAST)
     with pytest.raises(ValueError, match="not stable"):
-        Prefilter(np.eye(1), np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 0.1, 1.0, 1.0, 0.0)
+        ReferenceFilter(np.eye(1), np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 0.1, 1.0, 1.0, 0.0)
     with pytest.raises(ValueError, match="lacks the key 'dt_s'"):
-        Prefilter.from_dict({"format": "flexlink-prefilter-1", "A": [], "B": [], "C": [], "D": [[1.0]]})
+        ReferenceFilter.from_dict(
+            {"format": "flexlink-reference_filter-1", "A": [], "B": [], "C": [], "D": [[1.0]]}
+        )
