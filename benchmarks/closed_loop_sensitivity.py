@@ -32,10 +32,9 @@ from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sen
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.synthesis.synthesis import synthesise
-from workflow.config.run_config import RunConfig, SimulatedSource
+from workflow.config.run_config import RunConfig, SimulatedSource, built_in_config
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.entry import built_in_config
 from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
 from workflow.tasks.stages import STAGES, StageInput

@@ -20,8 +20,7 @@ from benchmarks.harness import Print, main
 from ident import IdentOptions
 from ident.checks.plausible_modes import PairKind, kind_of_pair
 from plant.modal import linear_arm
-from workflow.config.run_config import SimulatedSource
-from workflow.tasks.entry import built_in_config
+from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.log_identification import identify_records
 from workflow.tasks.simulated_rig import rig_of, simulate_record
 

@@ -89,8 +89,8 @@ def run(
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config)
+    from workflow.commands.run import run_from_files
     from workflow.console import TerminalProgress, print_summary
-    from workflow.tasks.entry import run_from_files
 
     with TerminalProgress() as progress:
         summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
@@ -112,7 +112,7 @@ def simulate(
 ) -> None:
     """Simulate the experiments of a configuration and write them as CSV."""
     need(config)
-    from workflow.tasks.entry import simulate_to_csv
+    from workflow.commands.simulate import simulate_to_csv
 
     files = simulate_to_csv(config, out)
     if as_json:
@@ -225,9 +225,9 @@ def identify(
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
+    from workflow.commands.identify import identify_logs
     from workflow.config.settings import check
     from workflow.console import TerminalProgress, print_summary
-    from workflow.tasks.log_identification import identify_logs
 
     chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "noise": noise}
     chosen |= {"omega_min_rad_s": omega_min, "omega_max_rad_s": omega_max}
@@ -301,8 +301,8 @@ def design(
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
     need(*source, specification)
+    from workflow.commands.design import design_controller
     from workflow.console import print_summary
-    from workflow.tasks.entry import design_controller
 
     summary = design_controller(source, specification, out=out, seed=seed)
     if as_json:
@@ -318,9 +318,9 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write report.html of a run directory anew and print its table."""
+    from workflow.commands.run import rebuild_report
     from workflow.console import print_summary
     from workflow.engine.run_directory import RunDirectory
-    from workflow.tasks.pipeline import rebuild_report
 
     summary = rebuild_report(RunDirectory.open(directory))
     if as_json:

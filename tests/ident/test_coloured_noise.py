@@ -11,7 +11,7 @@ from ident.basis.poles import Poles
 from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair
 from ident.coloured_noise import long_arx_filter, prewhitened
 from tests.ident.benchmark_plants import as_record, p1, p2
-from workflow.tasks.entry import built_in_config
+from workflow.config.run_config import built_in_config
 from workflow.tasks.simulated_rig import simulate_record
 
 STATED = {"integrators": 1, "input_delay_samples": 1, "noise": "auto"}

@@ -13,7 +13,7 @@ from workflow.tasks.summary import RunSummary
 @pytest.fixture(scope="session")
 def fast_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
     """Directory and summary of the fast arm's run."""
-    from workflow.tasks.entry import run_from_files
+    from workflow.commands.run import run_from_files
 
     out = tmp_path_factory.mktemp("fast") / "run"
     return out, run_from_files(FAST_ARM, out)

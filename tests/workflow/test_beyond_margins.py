@@ -37,7 +37,6 @@ from workflow.config.design_options import (
     ReferenceFilterSettings,
 )
 from workflow.engine.errors import InputError
-from workflow.report.environment import environment, said
 from workflow.tasks.achievable_performance import (
     bracket_numbers,
     find_bracket,
@@ -60,6 +59,7 @@ from workflow.tasks.results import (
     SampledResponses,
 )
 from workflow.tasks.summary import verdict_of
+from workflow.text.templates import environment, said
 
 _COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 

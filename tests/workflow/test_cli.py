@@ -340,12 +340,12 @@ def test_version_and_module_entry():
 
 
 def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
-    import workflow.tasks.entry
+    import workflow.commands.run
 
     def broken(*arguments, **options):
         raise ZeroDivisionError("division\nby zero")
 
-    monkeypatch.setattr(workflow.tasks.entry, "run_from_files", broken)
+    monkeypatch.setattr(workflow.commands.run, "run_from_files", broken)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 1
     assert (
@@ -355,12 +355,12 @@ def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
 
 
 def test_lack_of_memory_is_no_internal_error(flexlink, monkeypatch, tmp_path):
-    import workflow.tasks.entry
+    import workflow.commands.run
 
     def too_much(*arguments, **options):
         return np.zeros(2**45)  # more than any address space
 
-    monkeypatch.setattr(workflow.tasks.entry, "run_from_files", too_much)
+    monkeypatch.setattr(workflow.commands.run, "run_from_files", too_much)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 1
     assert answer.err.startswith("flexlink: out of memory (Unable to allocate")
@@ -368,16 +368,17 @@ def test_lack_of_memory_is_no_internal_error(flexlink, monkeypatch, tmp_path):
 
 
 def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
-    import workflow.tasks.entry
+    import workflow.commands.run
+    import workflow.commands.simulate
 
     def stop(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(workflow.tasks.entry, "run_from_files", stop)
+    monkeypatch.setattr(workflow.commands.run, "run_from_files", stop)
     answer = flexlink("run", "--out", tmp_path / "run")
     assert answer.code == 130
     assert answer.err == "flexlink: interrupted\n"  # nothing is there yet to be continued
-    monkeypatch.setattr(workflow.tasks.entry, "simulate_to_csv", stop)
+    monkeypatch.setattr(workflow.commands.simulate, "simulate_to_csv", stop)
     answer = flexlink("simulate", "--out", tmp_path / "run")
     assert (answer.code, answer.err) == (130, "flexlink: interrupted\n")
 

@@ -12,9 +12,7 @@ from matplotlib.figure import Figure
 
 from workflow.figures.registry import drawings
 from workflow.report import rendering
-from workflow.report.environment import environment as shared
-from workflow.report.environment import render_text
-from workflow.report.formats import (
+from workflow.text.formats import (
     count,
     decibels,
     extent,
@@ -30,6 +28,8 @@ from workflow.report.formats import (
     signed,
     yes_no,
 )
+from workflow.text.templates import environment as shared
+from workflow.text.templates import render_text
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,12 @@ from ident.basis.model_files import ModelFile
 from tests.ident.benchmark_plants import P2_HZ, p2
 from tests.workflow.test_report import ATTACK, Page
 from workflow.cli import main
+from workflow.commands.identify import identify_logs
 from workflow.engine.errors import InputError
 from workflow.figures.style import Picture
 from workflow.report import rendering
-from workflow.report.formats import interval
-from workflow.tasks.log_identification import identify_logs, read_model
+from workflow.tasks.model_files import read_model
+from workflow.text.formats import interval
 
 DT_S = 0.005
 COLUMNS = ("--input", "u_V", "--output", "tip_m", "--time", "t_s")

@@ -13,7 +13,7 @@ import pytest
 from plant import linear_arm
 from plant.presets import paper_link
 from tests.golden.margins import ROOT
-from workflow.tasks.log_identification import read_model
+from workflow.tasks.model_files import read_model
 
 
 @pytest.mark.slow

@@ -16,9 +16,9 @@ from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import Picture
 from workflow.report import rendering
-from workflow.report.environment import environment
 from workflow.report.run_report import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
+from workflow.text.templates import environment
 
 ATTACK = "<script>alert(1)</script>"
 

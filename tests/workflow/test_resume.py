@@ -13,17 +13,19 @@ import pytest
 
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, start_flexlink
+from workflow.commands.run import run_from_files
 from workflow.config.run_config import load_config
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
+from workflow.report import run_report
+from workflow.report.stage import REPORT
 from workflow.tasks.controller_files import write_controller
-from workflow.tasks.entry import run_from_files
 from workflow.tasks.results import ClosedLoopResult, RunResults
 from workflow.tasks.stages import STAGES
 
-NAMES = [stage.name for stage in STAGES]
+NAMES = [*(stage.name for stage in STAGES), REPORT.name]
 
 
 def stage_bytes(run: Path) -> dict[str, bytes]:
@@ -101,13 +103,12 @@ def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears,
 @pytest.fixture
 def plain_page(monkeypatch):
     """Resuming is about numbers: an empty page saves the seconds that drawing takes."""
-    import workflow.report
 
-    def write(run, config, progress=None):
-        storage.write_text(run.report_path, "<html></html>\n")
-        return run.report_path
+    def write(results, config, progress=None):
+        storage.write_text(results.run.report_path, "<html></html>\n")
+        return results.run.report_path
 
-    monkeypatch.setattr(workflow.report, "write_report", write)
+    monkeypatch.setattr(run_report, "write_report", write)
 
 
 def test_resume_from_every_stage_boundary(fast_run, tmp_path, plain_page):

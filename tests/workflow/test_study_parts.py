@@ -25,7 +25,7 @@ from control_design.plants.plant_set import Mode
 from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.report_examples import achievable, sampled_responses
 from tests.workflow.study_examples import assert_same_study, write_study
-from workflow.config.run_config import RunConfig, load_config
+from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.executor import LocalProcesses
 from workflow.figures.study import Mark, Panel, draw_pareto
@@ -39,7 +39,6 @@ from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
 from workflow.study.task import Job, Task
 from workflow.study.toml_text import toml_text
-from workflow.tasks.entry import built_in_config
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,

@@ -12,8 +12,8 @@ import numpy as np
 from markupsafe import Markup
 
 from validation.blind.truth import LISTED
-from workflow.report.environment import environment
 from workflow.tasks.summary import Row, RunSummary, Section
+from workflow.text.templates import environment
 
 _SLICES = ("all", "exact", "uncertain")
 _CPU = "CPU per case [s]"

@@ -12,8 +12,8 @@ from validation.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
 from validation.paper.quotes import OPEN_CHOICES, REPORTED, SOURCE
 from validation.paper.table import Row
 from workflow.figures.style import Picture
-from workflow.report.environment import environment
 from workflow.report.rendering import embedded
+from workflow.text.templates import environment
 
 
 def headlines_of(results: PaperResults, findings: Findings) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from importlib import resources
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -380,3 +381,9 @@ def load_simulation(path: Path) -> RunConfig | SimulationConfig:
     if document.keys() <= SimulationConfig.model_fields.keys():
         return check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
     return load_config(path)[0]
+
+
+def built_in_config() -> tuple[RunConfig, str]:
+    """The default arm: configuration and its text."""
+    with resources.as_file(resources.files("workflow") / "data" / "default_arm.toml") as path:
+        return load_config(path)

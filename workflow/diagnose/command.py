@@ -28,8 +28,8 @@ from workflow.engine.errors import (
 )
 from workflow.engine.executor import LocalProcesses
 from workflow.engine.progress import Progress, Silence
-from workflow.report.formats import listing
 from workflow.tasks.summary import Row, RunSummary, Section
+from workflow.text.formats import listing
 
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
 

@@ -13,7 +13,7 @@ from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
 from plant.effects import LOOK_ALIKES, in_words
 from plant.simulate import simulate
-from workflow.report.formats import listing
+from workflow.text.formats import listing
 
 # Below this probability not even a runner-up competes.
 _THINKABLE = 1e-4

@@ -8,9 +8,9 @@ from typing import Any
 
 from plant.effects import in_words
 from workflow.diagnose.words import FILTERS
-from workflow.report.environment import environment
-from workflow.report.formats import MISSING, listing, number
 from workflow.report.rendering import render_page
+from workflow.text.formats import MISSING, listing, number
+from workflow.text.templates import environment
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck
 from workflow.diagnose.following import Following
 from workflow.diagnose.words import FILTERS
-from workflow.report.environment import environment
 from workflow.report.rendering import render_page
+from workflow.text.templates import environment
 
 
 @dataclass(frozen=True, eq=False)

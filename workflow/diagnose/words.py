@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 
 from plant.effects import in_words
-from workflow.report.formats import MISSING, fixed, interval, number, si
+from workflow.text.formats import MISSING, fixed, interval, number, si
 
 # Longest ending first: "stiffness_Nm_rad" is no "rad".
 _UNITS: Mapping[str, str] = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 _ROOMS = ("plant", "ident", "control_design", "workflow")
 # They draw what is stored; numbers do not pass through them.
-_ONLY_DRAWING = ("workflow/figures", "workflow/report")
+_ONLY_DRAWING = ("workflow/figures", "workflow/report", "workflow/text")
 
 
 @cache

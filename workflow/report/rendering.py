@@ -1,6 +1,6 @@
 """Templates into self-contained pages: every sentence and all layout stand in `workflow/templates`.
 
-A template sees the typed values it is given, the filters of `workflow.report.formats`, and, through the macro
+A template sees the typed values it is given, the filters of `workflow.text.formats`, and, through the macro
 `figure`, every drawing of `workflow.figures` by its name.
 """
 
@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from workflow.figures.registry import drawings
 from workflow.figures.style import Picture, inline_svg, render
-from workflow.report.environment import environment
+from workflow.text.templates import environment
 
 
 @dataclass(frozen=True)

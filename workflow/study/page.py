@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from workflow.figures.study import Mark, Panel
-from workflow.report.environment import render_text, rows_of
 from workflow.report.rendering import RenderedPage, render_page
 from workflow.study.columns import COLUMNS, Column
 from workflow.study.points import short
 from workflow.study.rows import PointRow, State
 from workflow.study.settings import ParetoPlot, StudyConfig
 from workflow.tasks.summary import RunSummary, sections_of
+from workflow.text.templates import render_text, rows_of
 
 _BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "rise_time_s")
 

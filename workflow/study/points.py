@@ -11,14 +11,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from workflow.config.run_config import RunConfig, load_config
+from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
 from workflow.study.keys import last_name, with_values
 from workflow.study.settings import Axis, StudyConfig
-from workflow.tasks.entry import built_in_config
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.stages import STAGES, Stage
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from workflow.engine.run_directory import RunDirectory
-from workflow.report.environment import said
 from workflow.study.columns import COLUMNS, Number, numbers_of
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import verdict_of
+from workflow.text.templates import said
 
 State = Literal["certified", "does not come to rest", "not certified", "impossible", "failed"]
 

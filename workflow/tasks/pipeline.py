@@ -25,13 +25,14 @@ def run_pipeline(
     config_text: str = "",
     resume: bool = False,
     replace: bool = False,
+    page: Stage | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
     `config_text` is kept as config.toml (the file as the user wrote it); `resume` takes up a run that is
-    there, `replace` starts it afresh. A result that is not certified is no error: the report is written all
-    the same and `RunSummary.certified` says so.
+    there, `replace` starts it afresh; `page` is the stage that comes last and writes the page. A result that
+    is not certified is no error: the page is written all the same and `RunSummary.certified` says so.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -59,10 +60,11 @@ def run_pipeline(
     )
     with run.locked():
         run.record_status("running")
-        progress.plan([(stage.name, stage.expected_s) for stage in STAGES])
+        stages = STAGES if page is None else (*STAGES, page)
+        progress.plan([(stage.name, stage.expected_s) for stage in stages])
         try:
             results = RunResults(run)
-            for stage in STAGES:
+            for stage in stages:
                 before = (ready, ready_s) if stage is first else None
                 _perform(stage, config, results, progress, inputs, before)
             _keep_controller(results)
@@ -77,12 +79,12 @@ def run_pipeline(
     return summary
 
 
-def rebuild_report(run: RunDirectory) -> RunSummary:
-    """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing."""
+def rebuild_page(run: RunDirectory, page: Stage) -> RunSummary:
+    """Perform the last stage anew on a finished run. Raises InputError when a stage is missing."""
     config = config_of(run)
     results = RunResults(run)
     with run.locked():
-        _perform(STAGES[-1], config, results, Silence(), {}, None, always=True)
+        _perform(page, config, results, Silence(), {}, None, always=True)
     return summarise(results, config)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
-from workflow.report.environment import rows_of, said
 from workflow.tasks.achievable_performance import bracket_numbers
 from workflow.tasks.joint_coverage import joint_numbers
 from workflow.tasks.results import (
@@ -20,6 +19,7 @@ from workflow.tasks.results import (
     RunResults,
     UncertainChannel,
 )
+from workflow.text.templates import rows_of, said
 
 
 @dataclass(frozen=True)

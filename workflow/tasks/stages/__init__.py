@@ -1,4 +1,7 @@
-"""The stages of a run, in order. What each leaves behind is a type of `workflow.tasks.results`."""
+"""The stages of a run before its page, in order.
+
+What each leaves behind is a type of `workflow.tasks.results`.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ from workflow.tasks.stages import (
     identify,
     records,
     reference_filter,
-    report,
     uncertainty,
 )
 from workflow.tasks.stages.base import Stage, StageInput
@@ -55,22 +57,5 @@ STAGES: tuple[Stage, ...] = (
         closed_loop.settings,
         closed_loop.run_closed_loop,
         expected_s=5.0,
-    ),
-    Stage(
-        "report",
-        (
-            "records",
-            "identify",
-            "uncertainty",
-            "design",
-            "achievable_performance",
-            "certify",
-            "reference_filter",
-            "closed_loop",
-        ),
-        report.settings,
-        report.write_page,
-        expected_s=7.0,
-        also_writes=report.page,
     ),
 )

@@ -1,39 +1,30 @@
-"""One library call per command: files and options in, a table of numbers out."""
+"""`flexlink design`: one controller for one or several plants, from files."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from control_design.analysis.certificate import Certificate
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
-from ident.data.record import Record
 from workflow.config.design_options import (
     AchievableOptions,
     CertificateOptions,
     ReferenceFilterSettings,
 )
-from workflow.config.run_config import RunConfig, SimulatedSource, load_config, load_simulation
+from workflow.config.run_config import RunConfig
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming, need
-from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
-from workflow.engine.run_directory import RunDirectory, default_directory
-from workflow.report.environment import rows_of, said
 from workflow.tasks.achievable_performance import bracket_numbers, find_bracket
 from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
 from workflow.tasks.design_source import DesignFile, load_sources, read_design_file
 from workflow.tasks.joint_coverage import certify_asked, joint_numbers
-from workflow.tasks.pipeline import config_of, run_pipeline
 from workflow.tasks.reference_filter import check_filter, find_filter
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -42,99 +33,11 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
-from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 from workflow.tasks.stages.design import find_design
 from workflow.tasks.summary import RunSummary, sections_of
+from workflow.text.templates import rows_of, said
 
 BetweenPoints = Literal["nothing", "linear"]
-
-
-def built_in_config() -> tuple[RunConfig, str]:
-    """The default arm: configuration and its text."""
-    with resources.as_file(resources.files("workflow") / "data" / "default_arm.toml") as path:
-        return load_config(path)
-
-
-def run_from_files(
-    config_path: Path | None,
-    out: Path | None,
-    *,
-    resume: bool = False,
-    replace: bool = False,
-    progress: Progress | None = None,
-) -> RunSummary:
-    """Load a configuration and run it; see `run_pipeline`.
-
-    Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
-    without `out` a new directory below runs/ is made. Raises InputError.
-    """
-    if resume and replace:
-        raise InputError("--resume and --replace contradict each other")
-    if (resume or replace) and out is None:
-        raise InputError(
-            f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
-        )
-    if config_path is not None:
-        config, text = load_config(config_path)
-    elif resume and out is not None and (out / "manifest.json").is_file():
-        config, text = config_of(RunDirectory.open(out)), ""
-    else:
-        config, text = built_in_config()
-    return run_pipeline(
-        config,
-        out if out is not None else default_directory(config.run.name),
-        config_text=text,
-        resume=resume,
-        replace=replace,
-        progress=progress,
-    )
-
-
-def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
-    """Simulate the experiments of a configuration; one CSV per record, named after it.
-
-    Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises
-    InputError.
-    """
-    config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
-    if not isinstance(config.source, SimulatedSource):
-        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
-    out = Path(out)
-    RunDirectory(out).refuse_unless_free()
-    records = []
-    for index, entry in enumerate(config.source.records):
-        with naming(f"source.records[{index}] ({entry.name})"):
-            records.append(simulate_record(config.source, entry, config.run.seed).record)
-    existed = out.is_dir()
-    files: list[Path] = []
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for number, record in enumerate(records, start=1):
-            path = out / f"{number:02d}_{file_name(record.name)}.csv"
-            storage.write_text(path, csv_text(record))
-            files.append(path)
-    except (OSError, InputError) as error:
-        for path in files:  # all of the experiments or none
-            path.unlink()
-        if not existed and out.is_dir():
-            out.rmdir()
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"cannot write {out}: {error.strerror or error}") from error
-    return files
-
-
-def file_name(name: str) -> str:
-    """A record's name in a file name: all but letters, digits, '_', '.' and '-' becomes '_'."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)
-
-
-def csv_text(record: Record) -> str:
-    """The record as CSV with one header line; nine digits, far below any sensor's noise."""
-    lines = [",".join(("time_s", INPUT_NAME, *OUTPUT_NAMES))]
-    table = np.column_stack([record.time_s, record.input, record.output])
-    lines += [",".join(f"{value:.9g}" for value in row) for row in table]
-    return "\n".join(lines) + "\n"
 
 
 _NO_CONTROLLER = (

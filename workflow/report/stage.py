@@ -1,4 +1,4 @@
-"""Report: one self-contained page."""
+"""The last stage of a run: one self-contained page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import ReportResult
-from workflow.tasks.stages.base import StageInput
+from workflow.tasks.stages import STAGES, Stage, StageInput
 
 
 def settings(config: RunConfig) -> Mapping[str, Any]:
@@ -38,3 +38,13 @@ def write_page(stage: StageInput) -> ReportResult:
 def page(run: RunDirectory) -> tuple[Path, ...]:
     """The file outside stages/ that belongs to this stage."""
     return (run.report_path,)
+
+
+REPORT = Stage(
+    "report",
+    tuple(stage.name for stage in STAGES),
+    settings,
+    write_page,
+    expected_s=7.0,
+    also_writes=page,
+)

@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from workflow.report.formats import FILTERS, TESTS
+from workflow.text.formats import FILTERS, TESTS
 
 
 @cache

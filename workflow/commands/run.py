@@ -1,0 +1,54 @@
+"""`flexlink run` and `flexlink report`: a configuration into a run directory with its page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from workflow.config.run_config import built_in_config, load_config
+from workflow.engine.errors import InputError
+from workflow.engine.progress import Progress
+from workflow.engine.run_directory import RunDirectory, default_directory
+from workflow.report.stage import REPORT
+from workflow.tasks.pipeline import config_of, rebuild_page, run_pipeline
+from workflow.tasks.summary import RunSummary
+
+
+def run_from_files(
+    config_path: Path | None,
+    out: Path | None,
+    *,
+    resume: bool = False,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> RunSummary:
+    """Load a configuration and run it; see `run_pipeline`.
+
+    Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
+    without `out` a new directory below runs/ is made. Raises InputError.
+    """
+    if resume and replace:
+        raise InputError("--resume and --replace contradict each other")
+    if (resume or replace) and out is None:
+        raise InputError(
+            f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
+        )
+    if config_path is not None:
+        config, text = load_config(config_path)
+    elif resume and out is not None and (out / "manifest.json").is_file():
+        config, text = config_of(RunDirectory.open(out)), ""
+    else:
+        config, text = built_in_config()
+    return run_pipeline(
+        config,
+        out if out is not None else default_directory(config.run.name),
+        config_text=text,
+        page=REPORT,
+        resume=resume,
+        replace=replace,
+        progress=progress,
+    )
+
+
+def rebuild_report(run: RunDirectory) -> RunSummary:
+    """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing."""
+    return rebuild_page(run, REPORT)

@@ -1,0 +1,33 @@
+"""Models in files for other programs, written and read as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ident.basis.model_files import ModelFile
+from workflow.engine import storage
+from workflow.engine.errors import InputError, naming
+
+MODEL_SUFFIXES = (".json", ".mat")
+
+
+def write_model(path: Path, file: ModelFile) -> None:
+    """JSON or MAT by the ending (`MODEL_SUFFIXES`), atomically."""
+    content = file.to_mat() if path.suffix.lower() == ".mat" else file.to_json().encode("utf-8")
+    storage.write_bytes(path, content)
+
+
+def read_model(path: Path) -> ModelFile:
+    """The model in a file of `write_model`. Raises InputError: one line that names the file."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    with naming(str(path)):
+        if path.suffix.lower() == ".mat":
+            return ModelFile.from_mat(content, str(path))
+        try:
+            text = content.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: not a UTF-8 text file (byte {error.start})") from error
+        return ModelFile.from_json(text, str(path))

@@ -1,0 +1,1 @@
+"""Numbers and templates into words: formats, sentences and tables, for pages and terminals alike."""
