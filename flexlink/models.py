@@ -17,6 +17,7 @@ from ident.basis import posterior
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
+from ident.data.units import TimeColumn
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
@@ -93,6 +94,7 @@ class Record(Shown, ident.Record):
         input_units: Sequence[str] = (),
         output_units: Sequence[str] = (),
         source: str = "",
+        time_column: TimeColumn | None = None,
     ) -> None:
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
@@ -113,6 +115,7 @@ class Record(Shown, ident.Record):
             input_units=tuple(input_units),
             output_units=tuple(output_units),
             source=source,
+            time_column=time_column,
         )
 
 

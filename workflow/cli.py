@@ -131,7 +131,15 @@ def identify(
     input_name: Annotated[str, typer.Option("--input", help="Name of the input column.")],
     output_name: Annotated[str, typer.Option("--output", help="Name of the output column.")],
     time: Annotated[
-        str | None, typer.Option(help="Name of the time column [s]; this or --dt-s.", show_default=False)
+        str | None, typer.Option(help="Name of the time column; this or --dt-s.", show_default=False)
+    ] = None,
+    time_unit: Annotated[
+        str | None,
+        typer.Option(
+            help="Unit of the time column: s, ms, us, ns, min, h [default: as in its name ('t_ms', "
+            "'Zeit [ms]'), else s]",
+            show_default=False,
+        ),
     ] = None,
     dt_s: Annotated[
         float | None, typer.Option(help="Sampling period [s], if there is no --time.", show_default=False)
@@ -245,6 +253,7 @@ def identify(
             output_name,
             time=time,
             dt_s=dt_s,
+            time_unit=time_unit,
             reference=reference,
             validation=validation or [],
             options=options,

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from ident.data.arrays import RealArray, readonly_real
+from ident.data.units import TimeColumn, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 _LARGEST = 1e100
@@ -35,6 +36,8 @@ class Record:
         Units are free text for display, either empty or one per column.
     source : str
         Where the data came from (the file), named in later error messages.
+    time_column : TimeColumn or None
+        What the file's time stamps were taken for; None where dt_s was given without any.
 
     Raises
     ------
@@ -54,6 +57,7 @@ class Record:
     input_units: tuple[str, ...] = ()
     output_units: tuple[str, ...] = ()
     source: str = ""
+    time_column: TimeColumn | None = None
 
     def __post_init__(self) -> None:
         for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
@@ -161,14 +165,18 @@ class Record:
         *,
         time: str | None = None,
         dt_s: float | None = None,
+        time_unit: str | None = None,
         references: Sequence[str] = (),
         name: str | None = None,
         **reading: Any,
     ) -> Self:
         """Read columns of a CSV, npz or MATLAB file; readers and checks: `ident.data.record_files`.
 
-        The sampling time comes from the column `time`, from dt_s, or from both if they agree. `reading` are
-        options of the reader (CSV: separator). Raises ValueError in one line naming file and place.
+        The sampling time comes from the column `time`, from dt_s, or from both if they agree. The unit of
+        the time stamps is time_unit, else the one in the column's name ('t_ms', 'Zeit [ms]'), else seconds;
+        signals keep the unit in their names. What was taken stands in `time_column`, `input_units` and
+        `output_units`. `reading` are options of the reader (CSV: separator). Raises ValueError in one line
+        naming file and place.
         """
         from ident.data.record_files import read_table
 
@@ -183,13 +191,16 @@ class Record:
             raise ValueError(
                 f"{table.path}: column {time!r} is asked for as time and as a signal; expected two"
             )
+        if time is None and time_unit is not None:
+            raise ValueError(f"{table.path}: time_unit = '{time_unit}' without a time column; name it (time)")
         both = [item for item in inputs if item in outputs]
         if both:
             raise ValueError(
                 f"{table.path}: column {both[0]!r} is asked for as input and output; expected two"
             )
         columns = table.columns(wanted if time is None else [time, *wanted])
-        step = table.sampling_time(None if time is None else columns[time], time, dt_s)
+        stamps, base = (None, None) if time is None else table.seconds(time, columns[time], time_unit)
+        step = table.sampling_time(stamps, time, dt_s)
 
         def stack(names: Sequence[str]) -> RealArray:
             return np.column_stack([columns[item] for item in names]) if names else np.zeros((0, 0))
@@ -203,5 +214,14 @@ class Record:
             output_names=tuple(outputs),
             reference=stack(references) if references else None,
             reference_names=tuple(references),
+            input_units=_units(inputs),
+            output_units=_units(outputs),
             source=str(table.path),
+            time_column=base,
         )
+
+
+def _units(names: Sequence[str]) -> tuple[str, ...]:
+    """The units that stand in the names; empty if there is none at all."""
+    found = tuple(written_unit(name) for name in names)
+    return found if any(found) else ()

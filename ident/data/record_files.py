@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import pandas as pd
 
 from ident.data.arrays import RealArray
 from ident.data.mat_files import mat_variables
+from ident.data.units import TimeColumn
 
 # Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
 # of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
@@ -95,6 +96,15 @@ class Table:
         raise ValueError(
             f"{self.path}, {self.place(row)}: column '{name}' is {found}; expected a finite number"
         )
+
+    def seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
+        """Time stamps in seconds, from the unit stated or written in the header, and what was taken for
+        which. Raises ValueError for an unknown unit."""
+        try:
+            column = TimeColumn.of(name, unit)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from None
+        return column.seconds(stamps), replace(column, doubtful=column.doubtful_for(stamps))
 
     def sampling_time(self, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
         """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both

@@ -236,9 +236,56 @@ def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
     assert "Fitted inside the band from 8 to 300 rad/s" in text
 
 
+def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexlink, undrawn, tmp_path):
+    """Same bits: the stamps are divided by 1000, which rounds once."""
+    record = p2(5, 600).record
+    u, y = record.input[:, 0], record.output[:, 0]
+    stamps = np.arange(u.size) * DT_S
+    found, told = {}, {}
+    for name, header, factor, more in (
+        ("seconds", "t_s", 1, ()),
+        ("milliseconds", "Zeit [ms]", 1000, ()),
+        ("stated", "t", 1000, ("--time-unit", "ms")),
+    ):
+        log = tmp_path / f"{name}.csv"
+        lines = [f"{header},u_V,tip_m"]
+        lines += [f"{t:.6g},{a:.12g},{b:.12g}" for t, a, b in zip(factor * stamps, u, y, strict=True)]
+        log.write_text("\n".join(lines))
+        answer = flexlink(
+            *("identify", log, "--input", "u_V", "--output", "tip_m", "--time", header, *more),
+            *("--real", 2, "--pairs", 3, "--json", "--report", tmp_path / f"{name}.html"),
+        )
+        assert answer.code == 0, answer.err
+        document = json.loads(answer.out)
+        found[name] = {key: document["numbers"][key] for key in ("modes", "real_poles_z", "warnings")}
+        told[name] = {row["label"]: row["value"] for row in document["table"]}
+        assert told[name][name] in Page((tmp_path / f"{name}.html").read_text(encoding="utf-8")).text
+    assert found["milliseconds"] == found["seconds"] == found["stated"]
+    told_ms = told["milliseconds"]
+    assert told_ms["milliseconds"] == "time column 'Zeit [ms]': milliseconds, sampled every 5 ms, 3 s"
+    assert (told_ms["input"], told_ms["output"]) == ("'u_V' in V", "'tip_m' in m")
+    assert told["stated"]["stated"] == "time column 't': milliseconds as stated, sampled every 5 ms, 3 s"
+
+
+def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
+    record = p2(5, 600).record
+    rows = enumerate(zip(record.input[:, 0], record.output[:, 0], strict=True))
+    lines = ["t,u,y", *(f"{5 * k},{a:.12g},{b:.12g}" for k, (a, b) in rows)]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    command = ("identify", tmp_path / "log.csv", "--input", "u", "--output", "y", "--time", "t")
+    command = (*command, "--real", 2, "--pairs", 3, "--json")
+    document = json.loads(flexlink(*command).out)
+    assert "--time-unit ms" in document["numbers"]["warnings"][0]
+    (said,) = [row["value"] for row in document["table"] if row["label"] == "log"]
+    assert said == "time column 't': seconds (no unit stated), sampled every 5 s, 3000 s"
+    document = json.loads(flexlink(*command, "--time-unit", "s").out)
+    assert not any("--time-unit" in sentence for sentence in document["numbers"]["warnings"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("--time-unit", "foo"), "unknown unit of time 'foo'; expected s, ms, us"),
         (("--export", "{out}/model.txt"), "the ending must be .json or .mat"),
         (("--export", "{out}/gone/model.mat"), "is not a directory"),
         (("--report", "{out}"), "it is a directory"),

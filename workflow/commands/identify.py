@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
@@ -27,6 +28,7 @@ def identify_logs(
     *,
     time: str | None = None,
     dt_s: float | None = None,
+    time_unit: str | None = None,
     reference: str | None = None,
     validation: Sequence[Path] = (),
     options: IdentOptions | None = None,
@@ -42,10 +44,10 @@ def identify_logs(
 
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
     or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
-    logs made in closed loop, for the two-stage method. band_rad_s: fit inside this band only, friction and
-    drift below it and noise above it left out. noise_order: largest order of the noise model behind the
-    ellipses; none given: 8, or 32 where that leaves coloured residuals. Raises InputError: one line naming
-    file, column or line.
+    logs made in closed loop, for the two-stage method. time_unit: of the time column, where its name does
+    not say it. band_rad_s: fit inside this band only, friction and drift below it and noise above it left
+    out. noise_order: largest order of the noise model behind the ellipses; none given: 8, or 32 where that
+    leaves coloured residuals. Raises InputError: one line naming file, column or line.
     """
     if not 0.5 < level < 1:
         raise InputError(f"--level must lie between 0.5 and 1, got {level}")
@@ -57,7 +59,15 @@ def identify_logs(
     references = [] if reference is None else [reference]
 
     def read(path: Path) -> Record:
-        return read_log(path, [input_name], [output_name], time=time, dt_s=dt_s, references=references)
+        return read_log(
+            path,
+            [input_name],
+            [output_name],
+            time=time,
+            dt_s=dt_s,
+            time_unit=time_unit,
+            references=references,
+        )
 
     measured = [read(Path(path)) for path in logs]
     fresh_logs = [read(Path(path)) for path in validation]
@@ -100,6 +110,7 @@ def _summary(
         numbers={
             **model_numbers(about),
             "warnings": list(result.careful),
+            "logs": [_log_numbers(record) for record in (*result.measured, *result.fresh_records)],
             "uncertainty": uncertainty_numbers(spread),
             "file": None if out is None else str(out),
             "model_file": None if export is None else str(export),
@@ -107,6 +118,16 @@ def _summary(
         verdict=count(len(result.careful), "warning"),
         report_path=None if report is None else str(report),
     )
+
+
+def _log_numbers(record: Record) -> dict[str, Any]:
+    return {
+        "name": record.name,
+        "dt_s": record.dt_s,
+        "time_column": codec.plain(record.time_column),
+        "input_unit": "".join(record.input_units),
+        "output_unit": "".join(record.output_units),
+    }
 
 
 def _refuse_files_in_the_way(logs: Sequence[Path], written: Mapping[str, Path | None]) -> None:

@@ -72,6 +72,9 @@ class SimulatedSource(Section):
     records: tuple[SimulatedRecord, ...] = Field(min_length=1)
 
 
+TimeUnit = Literal["s", "ms", "us", "ns", "min", "h"]
+
+
 class FileRecord(Section):
     """One log file; keys left out are taken from [source]."""
 
@@ -82,7 +85,8 @@ class FileRecord(Section):
     role: Role = "estimation"
     condition: str | None = None
     remark: str = ""
-    time: str | None = Field(None, description="name of the time column [s]")
+    time: str | None = Field(None, description="name of the time column")
+    time_unit: TimeUnit | None = None
     dt_s: float | None = Field(None, gt=0, description="sampling period, where there is no time column")
     references: tuple[str, ...] | None = None
     start_sample: int = Field(0, ge=0, description="first row used, counted from 0")
@@ -94,7 +98,10 @@ class FileRecord(Section):
 
 class FileSource(Section):
     kind: Literal["files"]
-    time: str | None = Field(None, description="name of the time column [s]; give this or dt_s")
+    time: str | None = Field(None, description="name of the time column; give this or dt_s")
+    time_unit: TimeUnit | None = Field(
+        None, description="unit of the time column; default: as in its name ('t_ms', 'Zeit [ms]'), else s"
+    )
     dt_s: float | None = Field(None, gt=0, description="sampling period [s]; give this or time")
     references: tuple[str, ...] = Field((), description="reference columns of logs made in closed loop")
     units: Mapping[str, str] = Field(

@@ -28,6 +28,7 @@ from workflow.tasks.stages.uncertainty import (
     residual_tests,
     uncertain_channel,
 )
+from workflow.text.templates import said
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
@@ -179,7 +180,11 @@ def identify_records(
         options=options,
         about=about,
         spread=spread,
-        careful=(*_careful(found, spread), *_first_stage_error(opened, omega)),
+        careful=(
+            *_doubts([*measured, *fresh_records]),
+            *_careful(found, spread),
+            *_first_stage_error(opened, omega),
+        ),
     )
 
 
@@ -205,6 +210,12 @@ def _posterior(
             break
     assert best is not None
     return best[1], best[2]
+
+
+def _doubts(records: Sequence[Record]) -> list[str]:
+    """Time columns that look like another unit, each said once."""
+    doubted = {record.time_column: record.dt_s for record in records if record.time_column is not None}
+    return [said("time_doubt", column, dt_s) for column, dt_s in doubted.items() if column.doubtful]
 
 
 def _careful(found: Identification, spread: UncertainChannel) -> list[str]:

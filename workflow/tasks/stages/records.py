@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ident.data.record import Record
+from ident.data.units import written_unit
 from workflow.config.run_config import (
     Channel,
     FileRecord,
@@ -86,27 +87,25 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
         outputs,
         time=entry.time if own else source.time,
         dt_s=entry.dt_s if own else source.dt_s,
+        time_unit=entry.time_unit or (None if own else source.time_unit),
         references=list(references),
         name=record_name(entry),
     )
     if entry.start_sample or entry.stop_sample is not None:
         with naming(f"{entry.path}"):
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
-    unit = source.units
-    return Record(
-        name=record.name,
-        input=-record.input if entry.mirrored else record.input,
-        output=-record.output if entry.mirrored else record.output,
-        dt_s=record.dt_s,
-        input_names=record.input_names,
-        output_names=record.output_names,
-        reference=None
-        if record.reference is None
-        else (-record.reference if entry.mirrored else record.reference),
-        reference_names=record.reference_names,
-        input_units=tuple(unit.get(name, "") for name in record.input_names),
-        output_units=tuple(unit.get(name, "") for name in record.output_names),
-        source=record.source,
+    sign = -1.0 if entry.mirrored else 1.0
+
+    def units(names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(source.units.get(name) or written_unit(name) for name in names)
+
+    return replace(
+        record,
+        input=sign * record.input,
+        output=sign * record.output,
+        reference=None if record.reference is None else sign * record.reference,
+        input_units=units(record.input_names),
+        output_units=units(record.output_names),
     )
 
 
@@ -117,12 +116,22 @@ def read_log(
     *,
     time: str | None,
     dt_s: float | None,
+    time_unit: str | None = None,
     references: Sequence[str] = (),
     name: str | None = None,
 ) -> Record:
     """A log by its ending, in any format of `ident.data.record_files`. Raises InputError, one line."""
     try:
-        return Record.from_file(path, inputs, outputs, time=time, dt_s=dt_s, references=references, name=name)
+        return Record.from_file(
+            path,
+            inputs,
+            outputs,
+            time=time,
+            dt_s=dt_s,
+            time_unit=time_unit,
+            references=references,
+            name=name,
+        )
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except ValueError as error:

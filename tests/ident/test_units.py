@@ -1,0 +1,110 @@
+"""Units in headers: what is recognised, what is refused, and that seconds come back with their very bits."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ident.data.record import Record
+from ident.data.units import TimeColumn, written_unit
+
+PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 60), "h": Fraction(1, 3600)}
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        *[("Zeit [ms]", "ms"), ("time (us)", "us"), ("t_ms", "ms"), ("time_s", "s"), ("Time (Sec)", "s")],
+        *[
+            ("Zeit in Sekunden", "s"),
+            ("t [\N{MICRO SIGN}s]", "us"),
+            ("t/ms", "ms"),
+            ("ms", "ms"),
+            ("t [min]", "min"),
+        ],
+        *[("time msec", "ms"), ("timestamp_ns", "ns"), ("t", ""), ("time_stamp", ""), ("t[0]", "")],
+    ],
+)
+def test_units_of_time_are_read_from_the_header(header, unit):
+    column = TimeColumn.of(header)
+    assert (column.in_header, column.unit) == (unit, unit or "s")
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        *[("Angle [deg]", "deg"), ("voltage_mV", "mV"), ("u in mV", "mV"), ("hub_angle_rad", "rad")],
+        *[
+            ("acc_m_s2", "m/s2"),
+            ("v_m/s", "m/s"),
+            ("v in m/s", "m/s"),
+            ("F/N", "N"),
+            ("tip (furlong)", "furlong"),
+        ],
+        *[("u", ""), ("u_reaction_torque", ""), ("y[1]", ""), ("motor_command", ""), ("set_point", "")],
+    ],
+)
+def test_units_of_signals_are_carried_along(header, unit):
+    assert written_unit(header) == unit
+
+
+@pytest.mark.parametrize(
+    ("header", "stated"), [("Zeit [foo]", None), ("t (fortnight)", None), ("t_ms", "foo")]
+)
+def test_an_unknown_unit_is_one_line_with_those_that_are_known(tmp_path, header, stated):
+    path = tmp_path / "log.csv"
+    path.write_text(f"{header},u,y\n0,1,2\n1,3,4\n")
+    with pytest.raises(
+        ValueError, match=r"log\.csv: .*unknown unit.*expected s, ms, us, ns, min, h"
+    ) as error:
+        Record.from_file(path, ["u"], ["y"], time=header, time_unit=stated)
+    assert "\n" not in str(error.value)
+
+
+@given(st.sampled_from(sorted(PER_SECOND)), st.lists(st.integers(0, 10**6), min_size=1, max_size=9))
+def test_seconds_are_the_doubles_nearest_to_the_decimals_in_the_file(unit, ticks):
+    """Whole numbers of any unit up to 1e6 are exact doubles, and one exact operation is rounded once."""
+    seconds = TimeColumn.of(f"t [{unit}]").seconds(np.array(ticks, dtype=np.float64))
+    assert seconds.tolist() == [float(Fraction(k) / PER_SECOND[unit]) for k in ticks]
+
+
+@given(st.sampled_from(["s", "ms", "us", "ns"]), st.integers(1, 10**6), st.integers(3, 50))
+def test_a_written_log_reads_back_with_its_sampling_time(tmp_path_factory, unit, step_us, n):
+    path = tmp_path_factory.mktemp("log") / "log.npz"
+    stamps = np.array([float(Fraction(k * step_us, 10**6) * PER_SECOND[unit]) for k in range(n)])
+    np.savez(path, **{f"t_{unit}": stamps, "u_V": np.ones(n), "y": np.ones(n)})
+    record = Record.from_file(path, ["u_V"], ["y"], time=f"t_{unit}")
+    assert record.dt_s == step_us / 10**6
+    assert (record.input_units, record.output_units) == (("V",), ())
+
+
+@pytest.mark.parametrize(
+    ("name", "stated", "stamps", "doubtful"),
+    [
+        ("t", None, 5.0 * np.arange(10), True),
+        ("time_s", None, np.arange(1.0, 10.0), True),
+        ("t", None, 0.5 + 2.5 * np.arange(1200), True),
+        ("t", None, 0.25 + 0.5 * np.arange(900), False),
+        ("t", None, 0.002 * np.arange(4000), False),
+        ("t", "s", 5.0 * np.arange(10), False),
+        ("t_ms", None, 5.0 * np.arange(10), False),
+    ],
+)
+def test_integers_called_seconds_are_doubted(name, stated, stamps, doubtful):
+    assert TimeColumn.of(name, stated).doubtful_for(stamps) is doubtful
+
+
+def test_what_is_stated_counts_more_than_the_header():
+    column = TimeColumn.of("t_ms", "s")
+    assert (column.unit, column.in_header, column.stated) == ("s", "ms", True)
+
+
+def test_a_unit_without_a_time_column_is_refused(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("u,y\n1,2\n3,4\n")
+    with pytest.raises(ValueError, match="without a time column"):
+        Record.from_file(path, ["u"], ["y"], dt_s=0.1, time_unit="ms")
