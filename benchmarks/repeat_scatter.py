@@ -29,6 +29,7 @@ from ident.frequency_fit import FrfIdentification, identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.conditions import combine_posteriors, combine_responses, record_posteriors
 from ident.uncertainty.embedding import EmbeddingOptions
+from workflow.text.templates import words
 
 HZ = 2 * np.pi
 
@@ -84,7 +85,7 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
         f"{w / HZ:.2f} Hz (damping {z:.3f})"
         for w, z in zip(model.poles.omega_rad_s(model.dt_s), model.poles.zeta(), strict=True)
     )
-    say(f"\nSLFR {channel} ({output} from v_drive_counts): modes {modes}; {stage.verdict}")
+    say(f"\nSLFR {channel} ({output} from v_drive_counts): modes {modes}; {words(stage.finding)}")
     say(
         "band Hz        predicted  first stage  measured   predicted/measured  (95 % if honest)  dof   "
         "amplitudes apart   left-out sweep inside"
@@ -109,11 +110,11 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
         + ", ".join(f"{a} counts {f:.2f}" for (a, _), f in zip(SLFR_SWEEPS, second, strict=True))
         + f"   (CPU {time.process_time() - begin:.0f} s)"
     )
-    for words, bands in (
+    for said, bands in (
         ("Too small", [b for b, row in zip(SLFR_BANDS_HZ, rows, strict=True) if row.ratio > row.ratio_high]),
         ("Too large", [b for b, row in zip(SLFR_BANDS_HZ, rows, strict=True) if row.ratio < row.ratio_low]),
     ):
-        say(f"{words}: {', '.join(f'{low:g}-{high:g} Hz' for low, high in bands) or 'nowhere'}.")
+        say(f"{said}: {', '.join(f'{low:g}-{high:g} Hz' for low, high in bands) or 'nowhere'}.")
     say("\n" + reading("repeat_scatter_slfr"))
 
 
@@ -343,7 +344,7 @@ def describe(date: str, found: FrfIdentification, gain: float, say: Print) -> No
         f"{date}: integrator, {poles.real.size - 1} real ({real} 1/s), {poles.pairs.size} pairs: {pairs}; "
         f"run gain std {100 * gain:.1f} %"
     )
-    say(f"    {found.verdicts[0]}")
+    say(f"    {words(found.verdicts[0])}")
 
 
 def run(say: Print, *, only: str = "") -> None:

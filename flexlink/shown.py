@@ -44,8 +44,11 @@ def _lines(result: object) -> list[str]:
 def _macros() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    from workflow.text.templates import words
+
     # Text; the HTML is escaped line by line.
     loader = PackageLoader("flexlink")
     environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["words"] = words
     environment.globals |= {"zip": zip, "abs": abs}
     return environment.get_template("results.j2").module

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -12,8 +12,12 @@ from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+from ident.finding import Finding, FindingKind, finding
 from ident.identify import Identification, identify
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
+
+# A first stage that explains less of the input than this has gone wrong.
+_EXPLAINED_PERCENT = 50.0
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,10 @@ class FeedbackCheck:
     largest_error: float
     tolerance: float
     exact: bool
-    verdict: str
+
+    @property
+    def finding(self) -> Finding:
+        return finding(FindingKind.FEEDBACK, **asdict(self))
 
 
 def check_feedback(
@@ -62,14 +69,7 @@ def check_feedback(
     a = reference_gain if reference_gain is not None else estimated.pop(0)
     g = feedback_gain if feedback_gain is not None else estimated.pop(0)
     error = float(np.abs(u - a * r + g * y - solution[0]).max())
-    exact = error <= tolerance
-    law = f"u = {a:.6g} r - {g:.6g} y {solution[0]:+.3g}"
-    verdict = (
-        f"The log obeys {law} at every sample (largest error {error:.2g})."
-        if exact
-        else f"The log does not obey {law}: largest error {error:.3g}, more than {tolerance:.3g}."
-    )
-    return FeedbackCheck(float(a), float(g), float(solution[0]), error, float(tolerance), exact, verdict)
+    return FeedbackCheck(float(a), float(g), float(solution[0]), error, float(tolerance), error <= tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,22 @@ class TwoStage:
     sensitivities: tuple[ResponsePosterior, ...]
     fit_percent: tuple[float, ...]
     first_stage: Identification
-    verdict: str
+
+    @property
+    def finding(self) -> Finding:
+        return finding(
+            FindingKind.TWO_STAGE, least_percent=min(self.fit_percent), most_percent=max(self.fit_percent)
+        )
+
+    def warnings(self, omega_rad_s: RealArray) -> tuple[Finding, ...]:
+        """What the ellipses of a second stage do not hold, in the median over omega (F,)."""
+        explained = min(self.fit_percent)
+        lost = finding(FindingKind.UNEXPLAINED_INPUT, explained_percent=explained)
+        error = float(np.median(self.relative_error(omega_rad_s)))
+        return (
+            *([lost] if explained < _EXPLAINED_PERCENT else []),
+            finding(FindingKind.FIRST_STAGE_ERROR, relative_std=error),
+        )
 
     def relative_error(self, omega_rad_s: RealArray) -> RealArray:
         """(F,) standard deviation of S_hat over |S_hat|, RMS over the records.
@@ -134,11 +149,7 @@ def two_stage(
         spread = float(np.linalg.norm(u - u.mean()))
         fits.append(100 * (1 - float(np.linalg.norm(u - u_hat)) / spread))
         opened.append(replace(record, input=u_hat[:, None], reference=None, reference_names=()))
-    verdict = (
-        f"The reference explains {min(fits):.1f} to {max(fits):.1f} % of the input: the rest is noise and "
-        "distortion that the loop fed back, and no longer drives the estimate."
-    )
-    return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits), first, verdict)
+    return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits), first)
 
 
 def indirect(

@@ -27,6 +27,7 @@ from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.record import Record
+from ident.finding import Finding, FindingKind, finding
 from ident.fit.regression import thinned
 from ident.identification import Identification
 from ident.uncertainty.autoregression import fit_autoregression
@@ -123,17 +124,16 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
         advise=partial(_advice, records, behind),
     )
     share = _innovations(result) / (rss / n_samples)
-    said = (
-        f"the noise is coloured: half of what the residual has beyond a white floor lies below "
-        f"{_half_power_Hz(result):.2g} Hz, and {100 * share:.2g} % of the residual is unpredictable (dry "
-        "friction and drift look like this); poles and coefficients were fitted behind a noise model of "
-        "order "
-        f"{noise_filter.size - 1}, not by plain least squares, which would spend poles on it"
+    said = finding(
+        FindingKind.COLOURED_NOISE,
+        half_power_Hz=_half_power_Hz(result),
+        unpredictable_share=share,
+        order=noise_filter.size - 1,
     )
     return replace(result, verdicts=(*behind.verdicts, said))
 
 
-def _advice(records: Sequence[Record], behind: Identification) -> list[str]:
+def _advice(records: Sequence[Record], behind: Identification) -> list[Finding]:
     """The filter hides where a signal was cut off."""
     return [*clipped(records), *behind.advise()]
 

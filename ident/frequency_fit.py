@@ -14,6 +14,7 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, readonly_real
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.finding import Finding, FindingKind, distinct, finding
 from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
 from ident.fit.refinement import pole_system
 from ident.identify import in_order
@@ -56,7 +57,7 @@ class FrfIdentification:
         order; multiplied by sqrt(dispersion) where that is above 1. In the order of the model's poles; known
         poles (first of each type) have 0.
     order_table : tuple of OrderStep
-    verdicts : tuple of str
+    verdicts : tuple of Finding
     search : SearchTrace
     """
 
@@ -71,7 +72,7 @@ class FrfIdentification:
     omega_std_rad_s: RealArray
     zeta_std: RealArray
     order_table: tuple[OrderStep, ...]
-    verdicts: tuple[str, ...]
+    verdicts: tuple[Finding, ...]
     search: SearchTrace
 
     def __post_init__(self) -> None:
@@ -91,8 +92,8 @@ class FrfIdentification:
         return self.rss / self.degrees_of_freedom
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What to look at before trusting the model, one sentence each."""
+    def warnings(self) -> tuple[Finding, ...]:
+        """What to look at before trusting the model."""
         return self.search.warnings
 
 
@@ -190,42 +191,37 @@ def identify_frf(
         omega_std_rad_s=omega,
         zeta_std=zeta,
         order_table=selection.table(best),
-        verdicts=(_residual_verdict(fit.rss, freedom),),
+        verdicts=(_chi_square(fit.rss, freedom),),
         search=SearchTrace(
             tuple(search.stages),
             tuple(search.minima),
-            tuple(
-                dict.fromkeys(
-                    [
-                        *pole_warnings(poles, fixed, search.bounds, response.dt_s),
-                        *_outside_the_band(poles, fixed, response),
-                    ]
-                )
+            distinct(
+                [
+                    *pole_warnings(poles, fixed, search.bounds, response.dt_s),
+                    *_outside_the_band(poles, fixed, response),
+                ]
             ),
             search.evaluations,
         ),
     )
 
 
-def _residual_verdict(rss: float, freedom: int) -> str:
+def _chi_square(rss: float, freedom: int) -> Finding:
     low, high = chi2.ppf(1 - _LEVEL, freedom), chi2.ppf(_LEVEL, freedom)
-    numbers = f"chi-square {rss:.4g} with {freedom} degrees of freedom, {low:.4g} to {high:.4g} expected"
-    if rss > high:
-        return (
-            f"The residual is larger than the covariances explain ({numbers}): the order is too low, the "
-            "plant is not linear, or the covariances are too small; the posterior is widened accordingly."
-        )
-    if rss < low:
-        return f"The residual is smaller than the covariances say ({numbers}): they are on the safe side."
-    return f"The covariances explain the residual ({numbers})."
+    return finding(
+        FindingKind.CHI_SQUARE,
+        chi_square=rss,
+        degrees_of_freedom=freedom,
+        expected_low=low,
+        expected_high=high,
+    )
 
 
-def _outside_the_band(poles: Poles, fixed: Poles, response: FrequencyUncertainty) -> list[str]:
-    """One sentence for each pair that no measured frequency surrounds."""
+def _outside_the_band(poles: Poles, fixed: Poles, response: FrequencyUncertainty) -> list[Finding]:
+    """One finding for each pair that no measured frequency surrounds."""
     low, high = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
     return [
-        f"the pole pair at {omega:.4g} rad/s lies outside the measured band ({low:.4g} to {high:.4g} rad/s): "
-        "it stands for whatever is there; measure further, or take the model as extrapolation there"
+        finding(FindingKind.OUTSIDE_BAND, omega_rad_s=omega, low_rad_s=low, high_rad_s=high)
         for omega in poles.omega_rad_s(response.dt_s)[fixed.pairs.size :]
         if not low <= omega <= high
     ]

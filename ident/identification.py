@@ -13,6 +13,7 @@ from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import PriorTest
 from ident.data.arrays import RealArray, readonly_real
+from ident.finding import Finding, distinct
 from ident.search.order_selection import OrderStep
 from ident.search.search_trace import SearchTrace
 
@@ -40,8 +41,8 @@ class FittedRecords:
         Every structure that was tried, by order.
     n_fixed : (int, int)
         Numbers of real poles and pairs that were given (integrators counted); they come first of each type.
-    verdicts : tuple of str
-        One sentence for each question that was left to the data, and for each prior that they judged.
+    verdicts : tuple of Finding
+        One for each question that was left to the data, and for each prior that they judged.
     prior_tests : tuple of PriorTest
         The same verdicts on priors with their numbers.
     search : SearchTrace
@@ -62,12 +63,12 @@ class FittedRecords:
     noise_std: float
     tangent_optimality: float
     order_table: tuple[OrderStep, ...]
-    verdicts: tuple[str, ...]
+    verdicts: tuple[Finding, ...]
     search: SearchTrace
     n_fixed: tuple[int, int] = (0, 0)
     prior_tests: tuple[PriorTest, ...] = ()
     noise_filter: RealArray = field(default_factory=lambda: np.ones(1))
-    advise: Callable[[], Sequence[str]] = field(default=tuple)
+    advise: Callable[[], Sequence[Finding]] = field(default=tuple)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
@@ -82,9 +83,9 @@ class FittedRecords:
             )
 
     @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """What to look at before trusting the model, one sentence each."""
-        return tuple(dict.fromkeys((*self.search.warnings, *self.advise())))
+    def warnings(self) -> tuple[Finding, ...]:
+        """What to look at before trusting the model."""
+        return distinct((*self.search.warnings, *self.advise()))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

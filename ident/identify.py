@@ -24,13 +24,13 @@ from ident.checks.prior_tests import (
     delay_test,
     direct_term_test,
     fixed_poles_test,
-    not_imposed,
     relative_degree_test,
     too_few_poles,
 )
 from ident.coloured_noise import identify_in_noise
 from ident.data.arrays import RealArray
 from ident.data.record import Record
+from ident.finding import Finding
 from ident.fit.least_squares import LinearFit, Regression, fit
 from ident.fit.refinement import Bounds, Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
@@ -183,7 +183,9 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, re
     return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
 
 
-def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Regression, Refined, tuple[str, ...]]:
+def fitted_on_all(
+    records: Sequence[Record], outcome: Outcome
+) -> tuple[Regression, Refined, tuple[Finding, ...]]:
     """Refine on all samples and decide what was left to the data: initial state first, then the offset."""
     structure, search, best = outcome.data.structure, outcome.search, outcome.best
     options = search.options
@@ -202,7 +204,7 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Regressi
         if chosen != "auto":
             continue
         if key == "estimate_initial_state" and outcome.from_rest and best is outcome.best:
-            verdicts.append(outcome.from_rest.verdict())
+            verdicts.append(outcome.from_rest.finding)
             continue
         here = (data, best)
         other_structure = replace(data.structure, **{key: not getattr(data.structure, key)})
@@ -220,7 +222,7 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Regressi
         known = with_it[1] is outcome.best and with_it[0].structure == outcome.data.structure
         worth = outcome.selection.worth(outcome.best) if known else None
         test = nuisance_test(name, without, with_it, worth)
-        verdicts.append(test.verdict())
+        verdicts.append(test.finding)
         data, best = with_it if test.needed else without
     return data, best, tuple(verdicts)
 
@@ -262,7 +264,7 @@ def _priors_judged(
             break
         test, constrained = relative_degree_test(judged, trial)
         if asked == "auto" and test.refused:
-            tests.append(not_imposed(test))
+            tests.append(replace(test, imposed=False))
             break
         tests.append(test)
         relative_degree = trial
@@ -304,7 +306,7 @@ def _result(
     data: Regression,
     best: Refined,
     outcome: Outcome,
-    verdicts: tuple[str, ...],
+    verdicts: tuple[Finding, ...],
     tests: tuple[PriorTest, ...],
 ) -> Identification:
     options, fixed = outcome.search.options, outcome.search.fixed
@@ -327,13 +329,13 @@ def _result(
     else:
         optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, fixed)
     refused = tuple(
-        test.verdict for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
+        test.finding for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
     )
     described = description(records, data, poles, linear, outcome, optimality)
     residuals = described["residuals"]
     return Identification(
         model=model,
-        verdicts=(*verdicts, *(test.verdict for test in tests)),
+        verdicts=(*verdicts, *(test.finding for test in tests)),
         prior_tests=tests,
         advise=partial(_advice, tuple(records), data, model, residuals, fixed, bounds, refused),
         **described,
@@ -376,8 +378,8 @@ def _advice(
     residuals: tuple[RealArray, ...],
     fixed: Poles,
     bounds: Bounds,
-    refused: tuple[str, ...],
-) -> list[str]:
+    refused: tuple[Finding, ...],
+) -> list[Finding]:
     """All that `Identification.warnings` has to say."""
     return [
         *advice(records, data, model, residuals, fixed),

@@ -15,8 +15,10 @@ import numpy as np
 from ident.basis.miso_model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.checks.input_checks import few_samples
 from ident.data.arrays import RealArray
 from ident.data.record import Record
+from ident.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression, fit
 from ident.fit.refinement import Bounds, free_optimality
 from ident.fit.regression import prepare_inputs
@@ -132,23 +134,11 @@ def _least_independence(data: Regression) -> float:
 
 def _advice(
     data: Regression, model: MisoModel, residual: RealArray, fixed: Poles, bounds: Bounds
-) -> list[str]:
-    sentences = pole_warnings(model.poles, fixed, bounds, data.dt_s)
-    needed = data.n_parameters(model.order)
-    if data.n_samples < 10 * needed:
-        sentences.append(
-            f"only {data.n_samples} samples for {needed} unknowns: record longer, or fit fewer poles; below "
-            "ten samples per unknown the choice of the poles is itself uncertain"
-        )
+) -> list[Finding]:
+    found = pole_warnings(model.poles, fixed, bounds, data.dt_s) + few_samples(data, model.order)
     if _least_independence(data) < _ALIKE_INPUT:
-        sentences.append(
-            f"the inputs {list(model.input_names)} are nearly one signal: their channels are told apart "
-            "badly; excite them independently, or one at a time in records of their own"
-        )
+        found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
     worth = data.colour(residual).effective_samples
     if worth < _COLOURED * data.n_samples:
-        sentences.append(
-            f"the residual is not white ({data.n_samples} samples are worth {worth:.0f}): poles are missing, "
-            "or noise and disturbances are coloured; uncertainties that assume white noise are too small"
-        )
-    return sentences
+        found.append(finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=worth))
+    return found

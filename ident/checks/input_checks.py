@@ -1,7 +1,7 @@
 """What the records themselves say about a fit: unusable ones are refused, doubtful ones get advice.
 
-Every sentence names what was seen and what to do about it, and appears only where that would help: the
-benchmark plants and the examples are quiet (`tests/ident/test_input_checks.py`).
+A finding appears only where advice would help: the benchmark plants and the examples are quiet
+(`tests/ident/test_input_checks.py`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
 from ident.data.record import Record
+from ident.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import pole_system
 from ident.fit.residual_colour import effective_samples
@@ -69,8 +70,8 @@ def advice(
     model: GobfModel,
     residuals: Sequence[RealArray],
     fixed: Poles,
-) -> list[str]:
-    """One sentence per doubt about the records behind a fitted model; residuals (T,) one per record.
+) -> list[Finding]:
+    """One finding per doubt about the records behind a fitted model; residuals (T,) one per record.
 
     `fixed` are the poles that were given (they come first among the model's).
     """
@@ -83,18 +84,19 @@ def advice(
     ]
 
 
-def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
-    sentences = []
-    needed = data.n_parameters(model.order)
-    if data.n_samples < 10 * needed:
-        sentences.append(
-            f"only {data.n_samples} samples for {needed} unknowns: record longer, or fit fewer poles; "
-            "below ten samples per unknown the choice of the poles is itself uncertain"
-        )
-    return sentences + _unknown_rates(data, model, fixed)
+def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[Finding]:
+    return few_samples(data, model.order) + _unknown_rates(data, model, fixed)
 
 
-def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str]:
+def few_samples(data: Regression, order: int) -> list[Finding]:
+    """Below ten samples per unknown the choice of the poles is itself uncertain."""
+    needed = data.n_parameters(order)
+    if data.n_samples >= 10 * needed:
+        return []
+    return [finding(FindingKind.FEW_SAMPLES, n_samples=data.n_samples, unknowns=needed)]
+
+
+def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[Finding]:
     """Poles whose decay the records do not tell, by the Gauss-Newton covariance.
 
     Where the residual is coloured, what counts for a pole is the noise around its own frequency.
@@ -114,25 +116,19 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[str
     still = 1.01e-3 / data.longest  # slower ones have come to the bound, which pole_warnings speaks of
     seconds = data.longest * dt_s
     residual = data.residual(poles)
-    sentences = []
+    found = []
     for rate, spread in zip(1 - poles.real[n_real:], deviation[:n_free], strict=True):
         slow = still < rate < 1 / (_SLOW * data.longest)
         if slow and not _is_known(residual, data, rate / dt_s, spread / rate):
-            sentences.append(
-                f"a real pole decays with a time constant of {dt_s / rate:.0f} s, give or take a factor "
-                f"of two at best, in {seconds:.3g} s of record: record longer, or give it as known "
-                "(integrators, fixed_poles)"
+            found.append(
+                finding(FindingKind.UNKNOWN_TIME_CONSTANT, time_constant_s=dt_s / rate, longest_s=seconds)
             )
     omegas = poles.omega_rad_s(dt_s)[n_pairs:]
     rates = -np.log(np.abs(poles.pairs[n_pairs:]))
     for omega, rate, spread in zip(omegas, rates, deviation[n_free::2], strict=True):
         if rate > still and not _is_known(residual, data, omega, spread / rate):
-            sentences.append(
-                f"the damping of the pole pair at {omega:.4g} rad/s is known to a factor of two at best: "
-                f"record longer than {seconds:.3g} s, drive it harder, or fit one pair less if it is no mode "
-                "of the machine"
-            )
-    return sentences
+            found.append(finding(FindingKind.UNKNOWN_DAMPING, omega_rad_s=omega, longest_s=seconds))
+    return found
 
 
 def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviation: float) -> bool:
@@ -149,18 +145,15 @@ def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviati
 
 def _weak_input(
     records: Sequence[Record], data: Regression, model: GobfModel, residuals: Sequence[RealArray]
-) -> list[str]:
+) -> list[Finding]:
     limit = excitation_limit_rad_s(records, model, residuals)
     if limit >= 0.6 * np.pi / data.dt_s:
         return []
-    return [
-        f"the input is not exciting above {limit:.3g} rad/s: the model there is extrapolation; "
-        "use an input with power up to the frequency you need"
-    ]
+    return [finding(FindingKind.WEAK_INPUT, limit_rad_s=limit)]
 
 
-def clipped(records: Sequence[Record]) -> list[str]:
-    sentences = []
+def clipped(records: Sequence[Record]) -> list[Finding]:
+    found = []
     for record in records:
         for kind, signal, names in (
             ("input", record.input, record.input_names),
@@ -168,11 +161,10 @@ def clipped(records: Sequence[Record]) -> list[str]:
         ):
             share = clipped_share(signal[:, 0])
             if share > 0:
-                sentences.append(
-                    f"{record.label}: {share:.1%} of {kind} '{names[0]}' stand at its very limit, as if "
-                    "saturated or clipped: lower the amplitude, or cut those samples out"
+                found.append(
+                    finding(FindingKind.CLIPPED, record=record.label, signal=kind, name=names[0], share=share)
                 )
-    return sentences
+    return found
 
 
 def _drifting(
@@ -181,7 +173,7 @@ def _drifting(
     model: GobfModel,
     residuals: Sequence[RealArray],
     fixed: Poles,
-) -> list[str]:
+) -> list[Finding]:
     # A machine that integrates also integrates friction and offsets of its drive: its output walks away
     # without any fault of the record.
     if model.integrators:
@@ -189,12 +181,15 @@ def _drifting(
     slow = np.flatnonzero(1 - model.poles.real < 1 / (_SLOW * data.longest))
     if slow.size:
         return [
-            f"a real pole with a time constant of {data.dt_s / (1 - model.poles.real[i]):.3g} s describes a "
-            f"drift of '{model.output_name}', a straight line does it as well: take the trend off the output"
+            finding(
+                FindingKind.SLOW_POLE_IS_DRIFT,
+                time_constant_s=data.dt_s / (1 - model.poles.real[i]),
+                output=model.output_name,
+            )
             for i in slow[slow >= fixed.real.size]
             if _is_a_line(data, model.poles, int(i))
         ]
-    sentences = []
+    found = []
     for record, residual in zip(records, residuals, strict=True):
         if residual.size < 50:
             continue
@@ -207,12 +202,16 @@ def _drifting(
         share = 1 - float(rest @ rest) / power
         worth = effective_samples(rest, np.array([0, residual.size]))
         if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chdtri(1, _DRIFT_LEVEL):
-            sentences.append(
-                f"{record.label}: output '{record.output_names[0]}' drifts by {2 * slope:+.3g} in all, "
-                f"without a cause in the input ({share:.0%} of what the model leaves): take the trend "
-                "off, or fit within a band above it"
+            found.append(
+                finding(
+                    FindingKind.DRIFT,
+                    record=record.label,
+                    output=record.output_names[0],
+                    drift=2 * slope,
+                    share=share,
+                )
             )
-    return sentences
+    return found
 
 
 def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
@@ -229,17 +228,21 @@ def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
     return there <= _AS_WELL * data.linearise(*poles.writable()).rss
 
 
-def _far_from_zero(records: Sequence[Record], data: Regression) -> list[str]:
-    sentences = []
+def _far_from_zero(records: Sequence[Record], data: Regression) -> list[Finding]:
+    found = []
     for record in records:
         u = record.input[:, 0]
         if abs(u.mean()) > _LARGE_OFFSET * u.std() and not data.structure.estimate_initial_state:
-            sentences.append(
-                f"{record.label}: input '{record.input_names[0]}' stands at {u.mean():.4g} and moves by "
-                f"{u.std():.2g} only, but the fit starts from rest at zero: subtract the operating point "
-                "from input and output"
+            found.append(
+                finding(
+                    FindingKind.FAR_FROM_ZERO,
+                    record=record.label,
+                    input=record.input_names[0],
+                    mean=u.mean(),
+                    std=u.std(),
+                )
             )
-    return sentences
+    return found
 
 
 def excitation_limit_rad_s(

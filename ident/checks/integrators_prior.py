@@ -11,6 +11,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import ROUGH, Fitted, PriorTest, judged, limit, silent, statistic
 from ident.data.record import Record
+from ident.finding import FindingKind
 from ident.fit.least_squares import Regression
 from ident.fit.regression import prepare
 from ident.search.order_selection import OrderSelection
@@ -39,26 +40,21 @@ def integrators_test(
     """
     k = given.data.structure.integrators
     free = _without_integrators(records, searched, given)
-    advice = "a wrong one spoils all that is slow and can lose a mode: set "
-    for fewer in range(k - 1, -1, -1):
-        if fewer == 0 or _fewer_integrators_value(records, free, fewer) <= limit(fewer):
-            advice += f"integrators = {fewer}" + (", which the data accept" if fewer else "")
-            break
-    # A motor shaft integrates by its mechanics, and dry friction still makes it look like a slow pole.
-    advice += "; or keep it if the mechanics say so, dry friction looks the same, and fit in a band above it"
+    accepted = next(
+        fewer
+        for fewer in range(k - 1, -1, -1)
+        if fewer == 0 or _fewer_integrators_value(records, free, fewer) <= limit(fewer)
+    )
     value = statistic(given.end.rss, free)
     name = f"integrators = {k}"
-    test = judged(name, value, k, "a slow pole in place of each", advice)
+    test = judged(FindingKind.INTEGRATORS, name, value, k, accepted=accepted)
     if not test.refused:
         spare = _spare_integrators(records, given)
         if spare is not None:
             fewer, needless, price = spare
-            verdict = (
-                f"{name} not supported by the data: with {fewer}, and as many zeros less, the fit is as good "
-                f"(test statistic {needless:.1f} against {price:.1f}, the price of a pole), so zeros of the "
-                f"model cancel the rest; kept as asked, but set integrators = {fewer}"
+            test = PriorTest(
+                FindingKind.SPARE_INTEGRATORS, name, True, True, needless, price, k - fewer, {"enough": fewer}
             )
-            test = PriorTest(name, True, True, needless, price, k - fewer, verdict)
     return test, free
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from ident.basis.poles import Poles
+from ident.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import Bounds, Refined, free_optimality
 
@@ -42,10 +43,16 @@ class NuisanceTest:
     def needed(self) -> bool:
         return self.statistic > self.limit
 
-    def verdict(self) -> str:
-        return (
-            f"{self.name} {'estimated' if self.needed else 'left out'}: {self.columns} unknowns, "
-            f"test statistic {self.statistic:.1f} against {self.limit:.1f} at {NUISANCE_LEVEL:.0%}"
+    @property
+    def finding(self) -> Finding:
+        return finding(
+            FindingKind.NUISANCE,
+            name=self.name,
+            needed=self.needed,
+            columns=self.columns,
+            statistic=self.statistic,
+            limit=self.limit,
+            level=NUISANCE_LEVEL,
         )
 
 

@@ -6,14 +6,14 @@ the edge of the stable ones, where the chi-square quantile is on the safe side: 
 often than in 1 % of all records.
 
 A refused prior is kept all the same: who gives it may know the machine better than one record does, and a
-model whose structure was changed in silence is the worse surprise. The verdict says so and what to do. What
+model whose structure was changed in silence is the worse surprise. The finding says so. What
 was left to the data (`relative_degree = "auto"`) is imposed only as far as the data agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -22,6 +22,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
 from ident.data.record import Record
+from ident.finding import Finding, FindingKind, Value, finding
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import Refined
 from ident.fit.regression import prepare
@@ -39,18 +40,32 @@ class PriorTest:
     """Verdict of the data on one prior.
 
     statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
-    above it the prior is refused; a cancelled integrator is refused the other way round, as its verdict says
-    (`ident.checks.integrators_prior`). imposed says whether the model keeps to the prior; verdict is one
-    sentence, with advice where it is refused.
+    above it the prior is refused; a cancelled integrator is refused the other way round
+    (`ident.checks.integrators_prior`). imposed says whether the model keeps to the prior; details are what
+    the advice needs beside these.
     """
 
+    kind: FindingKind
     prior: str
     refused: bool
     imposed: bool
     statistic: float
     limit: float
     degrees_of_freedom: int
-    verdict: str
+    details: Mapping[str, Value] = field(default_factory=dict)
+
+    @property
+    def finding(self) -> Finding:
+        return finding(
+            self.kind,
+            prior=self.prior,
+            refused=self.refused,
+            imposed=self.imposed,
+            statistic=self.statistic,
+            limit=self.limit,
+            level=TEST_LEVEL,
+            **self.details,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,22 +99,12 @@ def limit(degrees_of_freedom: int) -> float:
     return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
 
 
-def judged(prior: str, value: float, degrees_of_freedom: int, without: str, advice: str) -> PriorTest:
-    """`without`: what the data were offered instead; `advice`: what to do if they take it."""
+def judged(
+    kind: FindingKind, prior: str, value: float, degrees_of_freedom: int, **details: Value
+) -> PriorTest:
+    """`details`: further numbers of the sentence of this kind."""
     bound = limit(degrees_of_freedom)
-    numbers = _numbers(value, bound)
-    if value > bound:
-        verdict = (
-            f"{prior} refused by the data: {without} fits better than chance allows ({numbers}); kept as "
-            f"asked, but {advice}"
-        )
-    else:
-        verdict = f"{prior} accepted: {without} fits no better than chance would ({numbers})"
-    return PriorTest(prior, value > bound, True, value, bound, degrees_of_freedom, verdict)
-
-
-def _numbers(value: float, bound: float) -> str:
-    return f"test statistic {value:.1f} against {bound:.1f} at {TEST_LEVEL:.0%}"
+    return PriorTest(kind, prior, value > bound, True, value, bound, degrees_of_freedom, details)
 
 
 def fixed_poles_test(
@@ -122,11 +127,11 @@ def fixed_poles_test(
     real = ", ".join(f"{a:.6g}" for a in np.sort(freed.end.poles.real[k:]))
     pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.end.poles.pairs)
     return judged(
+        FindingKind.FIXED_POLES,
         "fixed_poles",
         statistic(given.end.rss, freed),
         fixed.real.size - k + 2 * fixed.pairs.size,
-        f"leaving them free (poles at {', '.join(part for part in (real, pairs) if part)})",
-        "leave them to the search, or check sampling time and units",
+        free_poles=", ".join(part for part in (real, pairs) if part),
     )
 
 
@@ -165,14 +170,7 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
             value = 0.0
         if value > best:
             best, chosen = value, other
-    plural = "s" if chosen != 1 else ""
-    return judged(
-        f"input_delay_samples = {delay}",
-        best,
-        1,
-        f"a delay of {chosen} sample{plural}",
-        f"set input_delay_samples = {chosen}, and look for the sample of delay in the time stamps",
-    )
+    return judged(FindingKind.DELAY, f"input_delay_samples = {delay}", best, 1, other_delay=chosen)
 
 
 def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
@@ -186,13 +184,7 @@ def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
     data = replace(data, polynomials=given.data.polynomials)
     search = PoleSearch(data, given.search.options.model_copy(update={"feedthrough": True}))
     free = Fitted(data, search.descend(given.end.poles, "direct term"), search)
-    return judged(
-        "relative_degree = 1",
-        statistic(given.end.rss, free),
-        1,
-        "a model with a direct term",
-        "set feedthrough = true and leave out relative_degree, or check whether the input runs late",
-    )
+    return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(given.end.rss, free), 1)
 
 
 def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Refined]:
@@ -207,30 +199,20 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
     if again.rss < free.end.rss:
         free = replace(free, end=again)
     test = judged(
+        FindingKind.RELATIVE_DEGREE,
         f"relative_degree = {relative_degree}",
         statistic(constrained.rss, free),
         relative_degree - 1,
-        "a numerator without that limit",
-        f"set relative_degree = {relative_degree - 1} or leave it out (a sample of delay, a filter in the "
-        "sensor or an input that is not held constant between samples blurs it)",
+        one_less=relative_degree - 1,
     )
     return test, constrained
-
-
-def not_imposed(test: PriorTest) -> PriorTest:
-    """The same refusal for a prior that nobody stated: it was only tried."""
-    verdict = test.verdict.split("; kept as asked")[0] + "; not imposed"
-    return replace(test, imposed=False, verdict=verdict)
 
 
 def too_few_poles(relative_degree: int, order: int) -> PriorTest:
     """A relative degree above the number of poles that the data showed."""
     prior = f"relative_degree = {relative_degree}"
-    verdict = (
-        f"{prior} not imposed: the model has only {order} poles, integrators counted; state n_real and "
-        "n_pairs, or record more"
-    )
-    return PriorTest(prior, True, False, 0.0, limit(relative_degree - 1), relative_degree - 1, verdict)
+    free = relative_degree - 1
+    return PriorTest(FindingKind.TOO_FEW_POLES, prior, True, False, 0.0, limit(free), free, {"order": order})
 
 
 def best_under_relative_degree(free: Fitted, relative_degree: int) -> Refined:

@@ -1,4 +1,4 @@
-"""Is anything left in the residuals? Whiteness and independence from the input, with bands and a sentence."""
+"""Is anything left in the residuals? Whiteness and independence from the input, with bands."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
 from ident.data.arrays import RealArray, readonly_real
+from ident.finding import Finding, FindingKind, finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,8 +19,8 @@ class ResidualTest:
 
     lags (K,) in samples, correlation (K,) in -1..1, band (K,): |correlation| stays below it with probability
     `level` at each lag alone if the hypothesis holds. probability is that of correlations as large as these,
-    all lags together, under the hypothesis; passed says that it is at least 1 - level; verdict is one
-    sentence.
+    all lags together, under the hypothesis; passed says that it is at least 1 - level. precedes_input: the
+    residual is found again in a later input, so the record was taken in closed loop.
     """
 
     name: str
@@ -29,13 +30,32 @@ class ResidualTest:
     level: float
     probability: float
     passed: bool
-    verdict: str
+    precedes_input: bool = False
 
     def __post_init__(self) -> None:
         for name in ("lags", "correlation", "band"):
             object.__setattr__(self, name, readonly_real(getattr(self, name)))
         if not (self.lags.shape == self.correlation.shape == self.band.shape and self.lags.ndim == 1):
             raise ValueError("lags, correlation and band must be (K,) arrays")
+
+    @property
+    def largest(self) -> tuple[int, float]:
+        """Lag (not negative) and value of the largest correlation."""
+        at = int(np.argmax(np.where(self.lags >= 0, np.abs(self.correlation), 0)))
+        return int(self.lags[at]), float(self.correlation[at])
+
+    @property
+    def finding(self) -> Finding:
+        lag, correlation = self.largest
+        return finding(
+            FindingKind[self.name.upper()],
+            passed=self.passed,
+            probability=self.probability,
+            max_lag=int(self.lags[-1]),
+            lag=lag,
+            correlation=correlation,
+            precedes_input=self.precedes_input,
+        )
 
 
 def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99) -> ResidualTest:
@@ -53,20 +73,7 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     probability = float(chi2.sf(statistic, max_lag))
     passed = probability >= 1 - level
     band = np.full(max_lag, norm.ppf(0.5 + level / 2) / np.sqrt(n))
-    largest = int(np.argmax(np.abs(correlation)))
-    if passed:
-        verdict = (
-            f"The residuals look white over {max_lag} lags ({_p(probability)}): no noise model is missed."
-        )
-    else:
-        verdict = (
-            f"The residuals are not white ({_p(probability)}, largest correlation "
-            f"{correlation[largest]:+.2f} at lag {lags[largest]}): the bounds may be too narrow; model the "
-            "noise (coloured_noise) or, where that is done already, more of it (max_ar_order)."
-        )
-    return ResidualTest(
-        "whiteness", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
-    )
+    return ResidualTest("whiteness", lags.astype(np.float64), correlation, band, level, probability, passed)
 
 
 def independence_test(
@@ -99,69 +106,26 @@ def independence_test(
     passed = probability >= 1 - level
     band = np.full(correlation.size, norm.ppf(0.5 + level / 2) * deviation)
     lags = np.arange(-max_lag, max_lag + 1)
-    worst = int(np.argmax(causal))
-    if passed:
-        verdict = (
-            f"The residuals do not depend on the input ({_p(probability)}): no linear dynamics is missed."
-        )
-    else:
-        verdict = (
-            f"The residuals depend on the input {worst} samples before (correlation "
-            f"{correlation[max_lag + worst]:+.2f}, {_p(probability)}): the model lacks dynamics or delay "
-            "there; allow more poles, a direct term or another delay."
-        )
     before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
-    if before > deviation * norm.ppf(1 - (1 - level) / (2 * max(max_lag, 1))):
-        verdict += " They also precede the input: the record was taken in closed loop."
+    precedes = bool(before > deviation * norm.ppf(1 - (1 - level) / (2 * max(max_lag, 1))))
     return ResidualTest(
-        "independence", lags.astype(np.float64), correlation, band, level, probability, passed, verdict
+        "independence", lags.astype(np.float64), correlation, band, level, probability, passed, precedes
     )
 
 
 def residual_advice(
     whiteness: ResidualTest, independence: ResidualTest, *, noise_order: int = 0
-) -> list[str]:
-    """What to do about tests that fail, one sentence each; nothing where both pass.
+) -> list[Finding]:
+    """What is wrong where a test fails; nothing where both pass.
 
     noise_order: order of the noise model behind which whiteness was tested, 0 without one.
     """
-    sentences = []
+    found = []
     if not independence.passed:
-        after = int(
-            independence.lags[
-                np.argmax(np.where(independence.lags >= 0, np.abs(independence.correlation), 0))
-            ]
-        )
-        sentences.append(
-            f"the residuals depend on the input, most {after} samples after it: allow a pole pair or a real "
-            "pole more, a direct term, or another delay; if that does not help, the machine is not linear at "
-            "this amplitude (dry friction, saturation), and the bounds hold for this kind of input only"
-        )
-    if not whiteness.passed and noise_order:
-        sentences.append(
-            f"the residuals are coloured even behind a noise model of order {noise_order}: the bounds may be "
-            "too narrow; "
-            + (
-                "raise max_ar_order, or take them as lower limits"
-                if independence.passed
-                else "cure the dependence on the input first"
-            )
-        )
-    elif not whiteness.passed:
-        sentences.append(
-            "the residuals are coloured, and the bounds take them as white: "
-            + (
-                "model the noise (coloured_noise = true)"
-                if independence.passed
-                else "cure the dependence on the input first, then model the noise (coloured_noise = true)"
-            )
-        )
-    return sentences
-
-
-def _p(probability: float) -> str:
-    """'p = 0.02'; far out in the tail doubles end, and 'p = 0' would claim a certainty nobody has."""
-    return "p < 1e-300" if probability < 1e-300 else f"p = {probability:.2g}"
+        found.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
+    if not whiteness.passed:
+        found.append(finding(FindingKind.NOT_WHITE, noise_order=noise_order, independent=independence.passed))
+    return found
 
 
 def _long_enough(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:

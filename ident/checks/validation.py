@@ -18,6 +18,7 @@ from ident.data.arrays import RealArray, readonly_real
 from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+from ident.finding import Finding, FindingKind, finding
 
 __all__ = [
     "FreshFit",
@@ -102,8 +103,8 @@ class Invalidation:
     distance (F,): length of the difference in units of the ellipse of both covariances together at `level` (1
     = on its boundary); probability (F,) of a difference as large if the prediction holds; n_outside
     frequencies lie outside, worst_omega_rad_s is the least probable; joint_probability is that of the least
-    probable one among F independent frequencies; invalidated when it is below 1 - level; verdict is one
-    sentence.
+    probable one among F independent frequencies; invalidated when it is below 1 - level; no more than
+    n_expected_outside lie outside by chance, at that level.
     """
 
     omega_rad_s: RealArray
@@ -114,11 +115,24 @@ class Invalidation:
     worst_omega_rad_s: float
     joint_probability: float
     invalidated: bool
-    verdict: str
+    n_expected_outside: int
 
     def __post_init__(self) -> None:
         for name in ("omega_rad_s", "distance", "probability"):
             object.__setattr__(self, name, readonly_real(getattr(self, name)))
+
+    @property
+    def finding(self) -> Finding:
+        return finding(
+            FindingKind.INVALIDATION,
+            invalidated=self.invalidated,
+            level=self.level,
+            n=self.distance.size,
+            outside=self.n_outside,
+            expected=self.n_expected_outside,
+            worst_rad_s=self.worst_omega_rad_s,
+            worst_distance=float(self.distance.max()),
+        )
 
 
 def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) -> Invalidation:
@@ -143,16 +157,6 @@ def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) 
     joint = float(-np.expm1(n * np.log1p(-min(float(probability[worst]), 1 - 1e-16))))
     invalidated = joint < 1 - both.level
     expected = int(binom.ppf(both.level, n, 1 - both.level))
-    where = f"{both.omega_rad_s[worst]:.4g} rad/s"
-    count = f"{outside} of {n} frequencies lie outside their {100 * both.level:.3g} % ellipses"
-    if invalidated:
-        verdict = (
-            f"The new data contradict the model, most at {where} ({distance[worst]:.2g} radii); {count}."
-        )
-    elif outside > expected:
-        verdict = f"No single frequency contradicts the model, but {count}, more than {expected} by chance."
-    else:
-        verdict = f"The new data do not contradict the model: {count}, the farthest at {where}."
     return Invalidation(
         both.omega_rad_s,
         distance,
@@ -162,7 +166,7 @@ def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) 
         float(both.omega_rad_s[worst]),
         joint,
         bool(invalidated),
-        verdict,
+        expected,
     )
 
 

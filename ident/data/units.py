@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.data.arrays import RealArray
+from ident.finding import Finding, FindingKind, finding
 
 # Units per second, or seconds per unit. Both are integers, so that 2 [ms] becomes the very double that 0.002
 # is: division by an exact number is rounded once.
@@ -63,6 +64,10 @@ class TimeColumn:
     in_header: str
     stated: bool = False
     doubtful: bool = False
+
+    def doubt(self, dt_s: float) -> Finding:
+        """What there is to say of a doubtful column with steps of dt_s."""
+        return finding(FindingKind.TIME_UNIT, name=self.name, in_header=self.in_header, dt_s=dt_s)
 
     @classmethod
     def of(cls, name: str, stated: str | None = None) -> TimeColumn:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray, readonly_real
+from ident.finding import Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +48,12 @@ class SearchTrace:
     stages : tuple of SearchStage
     minima : tuple of PolishedMinimum
         In the order they were found.
-    warnings : tuple of str
-        Each one sentence with advice.
+    warnings : tuple of Finding
     evaluations : int
         Cost evaluations in all, rescans and descents included.
     """
 
     stages: tuple[SearchStage, ...]
     minima: tuple[PolishedMinimum, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Finding, ...]
     evaluations: int

@@ -39,17 +39,14 @@ def test_feedback_check_estimates_the_law_and_notices_when_it_does_not_hold():
     found = check_feedback(records, tolerance=1e-9)
     assert found.exact
     assert (found.reference_gain, found.feedback_gain) == pytest.approx((1.0, GAIN), rel=1e-9)
-    assert "at every sample" in found.verdict
     assert check_feedback(records, tolerance=1e-9, reference_gain=1.0, feedback_gain=GAIN).exact
     wrong = check_feedback(records, tolerance=1e-9, feedback_gain=GAIN + 0.1)
     assert not wrong.exact
-    assert "does not obey" in wrong.verdict
 
 
 def test_two_stage_is_free_of_the_direct_method_s_bias():
     records = [log(np.random.default_rng([1, seed])) for seed in range(4)]
     stage = two_stage(records, OPTIONS, BOUNDS, shared=True)
-    assert "explains" in stage.verdict
     assert all(record.reference is None for record in stage.records)
     # The noise-free input itself is known here: S r with S = A / (A + g B).
     closed = np.polyadd(A, GAIN * np.asarray(B))

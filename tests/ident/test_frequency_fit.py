@@ -8,12 +8,14 @@ import pytest
 from control_design.plants.plant_set import UncertainPlant
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.finding import FindingKind
 from ident.fit.frf_regression import fit_response, prepare_response
 from ident.fit.pole_unknowns import free_parameters, set_poles
 from ident.fit.refinement import pole_system
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
+from tests.ident.findings import only
 from tests.ident.storage import stored_and_read
 
 OMEGA = np.geomspace(0.5, 300, 120)
@@ -71,7 +73,8 @@ def test_poles_and_order_from_noisy_data(plant, turn):
         # Sixteen numbers in all: 4 standard deviations are exceeded once in a thousand choices of seeds.
         assert np.all(np.abs(estimate - truth) < 4 * deviation)
     assert 0.7 < found.dispersion < 1.3  # chi-square with 224 degrees of freedom: sd 0.094
-    assert "covariances explain the residual" in found.verdicts[0]
+    said = only(found.verdicts, FindingKind.CHI_SQUARE)
+    assert said["expected_low"] < said["chi_square"] < said["expected_high"]
     assert found.posterior.at(OMEGA).contains(response).mean() > 0.8
     assert not found.warnings
 
@@ -83,7 +86,8 @@ def test_posterior_widens_when_the_covariances_are_too_small(plant):
     options = IdentOptions(n_real=2, n_pairs=3)
     right, wide = identify_frf(honest, options), identify_frf(bold, options)
     assert wide.dispersion == pytest.approx(16 * right.dispersion, rel=1e-3)
-    assert "larger than the covariances explain" in wide.verdicts[0]
+    said = only(wide.verdicts, FindingKind.CHI_SQUARE)
+    assert said["chi_square"] > said["expected_high"]
     ratio = wide.posterior.at(OMEGA).enclosing_radius() / right.posterior.at(OMEGA).enclosing_radius()
     # Both rest on the same scatter; the honest one is not narrowed below its covariances.
     assert np.median(ratio) == pytest.approx(1.0, abs=0.15)

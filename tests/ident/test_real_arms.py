@@ -12,6 +12,7 @@ from ident.checks.validation import fit_on_fresh_data
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited
+from ident.finding import FindingKind
 from ident.frequency_fit import identify_frf
 from ident.identify import identify
 
@@ -143,7 +144,7 @@ def test_krauss_arm_has_its_two_modes_in_both_channels(sweeps, output, low_hz, e
 def test_krauss_arm_warns_of_the_band_that_was_not_excited(sweeps):
     options = IdentOptions(n_real=2, n_pairs=1, estimate_initial_state=False)
     result = identify([sweeps[0].siso("v_drive_counts", "accel_counts")], options)
-    assert any("not exciting above" in warning for warning in result.warnings)
+    assert any(warning.kind is FindingKind.WEAK_INPUT for warning in result.warnings)
 
 
 def test_emps_time_stamps_jitter_within_the_tolerance(flexlink_data):

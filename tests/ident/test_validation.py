@@ -81,11 +81,10 @@ def test_invalidation_alarms_at_its_level_and_finds_a_change():
     report = invalidate(estimate(rng, truth, 0.01), estimate(rng, changed, 0.02))
     assert report.invalidated
     assert report.worst_omega_rad_s == pytest.approx(50, abs=3)
-    assert "contradict the model" in report.verdict
     assert report.n_outside >= 3
-    assert stored_and_read(report).verdict == report.verdict
+    assert stored_and_read(report).finding == report.finding
     same = invalidate(estimate(rng, truth, 0.01), estimate(rng, truth, 0.02))
-    assert "do not contradict" in same.verdict or "more than" in same.verdict
+    assert not same.invalidated
 
 
 def test_invalidation_needs_one_grid():

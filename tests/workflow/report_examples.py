@@ -18,8 +18,10 @@ from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
+from ident.checks.nuisance_tests import NuisanceTest
 from ident.checks.validation import ScatterRow, fit_on_fresh_data
 from ident.data.record import Record
+from ident.finding import FindingKind, finding
 from ident.identify import Identification
 from ident.search.order_selection import OrderStep
 from ident.search.search_trace import PolishedMinimum, SearchStage, SearchTrace
@@ -112,7 +114,7 @@ def identification(of: GobfModel, used: list[Record]) -> Identification:
     trace = SearchTrace(
         stages=(SearchStage("pair 1", names, points, np.abs(points[:, 0] - np.log10(14.0))),),
         minima=(PolishedMinimum("pair 1", of.poles, rss),),
-        warnings=("the pole pair at 62 rad/s sits on your bound of zeta: widen it",),
+        warnings=(finding(FindingKind.DAMPING_BOUND, omega_rad_s=62.0, zeta=0.7),),
         evaluations=240,
     )
     fit = [
@@ -129,7 +131,7 @@ def identification(of: GobfModel, used: list[Record]) -> Identification:
         noise_std=float(np.sqrt(rss / sum(e.size for e in residuals))),
         tangent_optimality=1e-9,
         order_table=(OrderStep(1, 1, 2.5 * rss, 812.4), OrderStep(1, 2, rss, -95.1)),
-        verdicts=("offset left out: its columns lower the test statistic by 0.3",),
+        verdicts=(NuisanceTest("offset", 1, 0.3).finding,),
         search=trace,
     )
 

@@ -18,7 +18,7 @@ from workflow.tasks.results import IdentifiedPlant
 from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.tasks.summary import RunSummary, model_numbers, sections_of, uncertainty_numbers
 from workflow.text.formats import count
-from workflow.text.templates import rows_of
+from workflow.text.templates import rows_of, words
 
 
 def identify_logs(
@@ -109,7 +109,7 @@ def _summary(
         sections=sections_of(rows_of("summary/identification.j2", result=result)),
         numbers={
             **model_numbers(about),
-            "warnings": list(result.careful),
+            "warnings": [words(item) for item in result.careful],
             "logs": [_log_numbers(record) for record in (*result.measured, *result.fresh_records)],
             "uncertainty": uncertainty_numbers(spread),
             "file": None if out is None else str(out),

@@ -42,6 +42,7 @@ from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
+from workflow.text.templates import words
 
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
 _STATE_SPACE_FILES = (".json", ".mat", ".npz")
@@ -424,7 +425,7 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
     with naming(str(path)):
         found = identify_frf(response, options)
         nominal = found.model.to_control()
-        said = tuple(found.verdicts) + tuple(found.warnings)
+        said = tuple(words(item) for item in (*found.verdicts, *found.warnings))
         if about.ellipses == "fitted":
             plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
             return DesignSource(plant, "model fitted to a measured response", said)

@@ -10,10 +10,10 @@ import numpy as np
 from ident.basis.options import IdentOptions
 from ident.checks.residual_tests import residual_advice
 from ident.checks.validation import FreshFit, ResidualTest, fit_on_fresh_data, whiteness_test
-from ident.closed_loop import TwoStage, two_stage
-from ident.data.arrays import RealArray
+from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
+from ident.finding import Finding
 from ident.identify import Identification, identify
 from ident.stabilisation import Stabilisation, stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -28,13 +28,9 @@ from workflow.tasks.stages.uncertainty import (
     residual_tests,
     uncertain_channel,
 )
-from workflow.text.templates import said
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
-
-# A first stage that explains less of the input than this has gone wrong.
-_EXPLAINED_PERCENT = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +39,7 @@ class LogIdentification:
 
     `measured` are the records as read, `used` the same as the fit saw them (inside the band; with the input
     that the reference explains, where the logs come from a closed loop). `about` and `spread` are results as
-    of a run's stages; `careful` says what to look at, one sentence each. The stabilisation plot is None where
+    of a run's stages; `careful` says what to look at. The stabilisation plot is None where
     nobody asked for it.
     """
 
@@ -52,7 +48,7 @@ class LogIdentification:
     options: IdentOptions
     about: IdentifiedChannel
     spread: UncertainChannel
-    careful: tuple[str, ...]
+    careful: tuple[Finding, ...]
 
     @property
     def found(self) -> Identification:
@@ -150,7 +146,7 @@ def identify_records(
             fresh_roles=tuple("validation" for _ in fresh_records),
             stabilisation=plot,
             band_rad_s=band_rad_s,
-            two_stage=None if opened is None else opened.verdict,
+            two_stage=None if opened is None else opened.finding,
         )
         progress.finish("identify", 0.0, taken_up=False)
         progress.start("uncertainty")
@@ -183,7 +179,7 @@ def identify_records(
         careful=(
             *_doubts([*measured, *fresh_records]),
             *_careful(found, spread),
-            *_first_stage_error(opened, omega),
+            *(opened.warnings(omega) if opened else ()),
         ),
     )
 
@@ -212,33 +208,15 @@ def _posterior(
     return best[1], best[2]
 
 
-def _doubts(records: Sequence[Record]) -> list[str]:
+def _doubts(records: Sequence[Record]) -> list[Finding]:
     """Time columns that look like another unit, each said once."""
     doubted = {record.time_column: record.dt_s for record in records if record.time_column is not None}
-    return [said("time_doubt", column, dt_s) for column, dt_s in doubted.items() if column.doubtful]
+    return [column.doubt(dt_s) for column, dt_s in doubted.items() if column.doubtful]
 
 
-def _careful(found: Identification, spread: UncertainChannel) -> list[str]:
+def _careful(found: Identification, spread: UncertainChannel) -> list[Finding]:
     """Warnings of the fit, and what to do about residual tests that fail."""
     advice = residual_advice(
         spread.test("whiteness"), spread.test("independence"), noise_order=spread.noise_order
     )
     return [*found.warnings, *advice]
-
-
-def _first_stage_error(opened: TwoStage | None, omega_rad_s: RealArray) -> list[str]:
-    """What the ellipses of a second stage do not hold."""
-    if opened is None:
-        return []
-    error = 100 * float(np.median(opened.relative_error(omega_rad_s)))
-    explained = min(opened.fit_percent)
-    lost = [
-        f"the reference explains only {explained:.3g} % of the input: what is made of it is not to be relied "
-        "on; check the reference column, start the records at rest, or fit within a band"
-    ]
-    return [
-        *(lost if explained < _EXPLAINED_PERCENT else []),
-        "the logs come from a closed loop: the error of the first stage (reference to input, a standard "
-        f"deviation of {error:.2g} % of the response in the median) is in no ellipse; with four records or "
-        "more, uncertainty.method = 'records' of flexlink run takes it from their scatter",
-    ]

@@ -25,6 +25,7 @@ from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.validation import FreshFit, ResidualTest, ScatterRow
 from ident.data.record import Record
+from ident.finding import Finding
 from ident.identification import Identification
 from ident.search.order_selection import OrderStep
 from ident.stabilisation import Stabilisation
@@ -127,7 +128,7 @@ class IdentifiedChannel:
     increments: bool = False
     band_rad_s: Interval | None = None
     bounds_band_rad_s: Interval | None = None
-    two_stage: str | None = None
+    two_stage: Finding | None = None
 
     @property
     def model(self) -> GobfModel:
@@ -167,11 +168,11 @@ class IdentifiedChannel:
         return tuple(sorted(self.model.poles.real.tolist(), reverse=True))
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Finding, ...]:
         return self.identification.warnings
 
     @property
-    def verdicts(self) -> tuple[str, ...]:
+    def verdicts(self) -> tuple[Finding, ...]:
         return self.identification.verdicts
 
     @property

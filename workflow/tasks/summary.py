@@ -19,7 +19,7 @@ from workflow.tasks.results import (
     RunResults,
     UncertainChannel,
 )
-from workflow.text.templates import rows_of, said
+from workflow.text.templates import rows_of, said, words
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,13 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "input_delay_samples",
         "feedthrough",
     )
-    names += ("real_poles_per_s", "real_poles_z", "warnings", "verdicts", "order_table", "band_rad_s")
-    names += ("fit_estimation_percent", "fit_validation_percent", "fit_repeat_percent", "two_stage")
+    names += ("real_poles_per_s", "real_poles_z", "order_table", "band_rad_s")
+    names += ("fit_estimation_percent", "fit_validation_percent", "fit_repeat_percent")
     return {
         **{name: codec.plain(getattr(found, name)) for name in names},
+        "warnings": [words(item) for item in found.warnings],
+        "verdicts": [words(item) for item in found.verdicts],
+        "two_stage": None if found.two_stage is None else words(found.two_stage),
         "modes": [{"frequency_Hz": mode.frequency_Hz, **codec.plain(mode)} for mode in found.modes],
         "noise_std": found.identification.noise_std,
         "tangent_optimality": found.identification.tangent_optimality,
@@ -142,6 +145,8 @@ def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
     if spread.intervals is not None:
         for row, known in zip(found["intervals"]["modes"], spread.intervals.modes, strict=True):
             row["frequency_Hz"] = list(known.frequency_Hz)
+    for row, test in zip(found["tests"], spread.tests, strict=True):
+        row["verdict"] = words(test.finding)
     return {**found, "report": codec.plain(spread.posterior.report)}
 
 

@@ -161,6 +161,7 @@ def _nan(value: float) -> bool:
 TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": _nan}
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "number": number,
+    "fmt": format,
     "si": si,
     "percent": percent,
     "share": share,

@@ -9,6 +9,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from ident.finding import Finding
 from workflow.text.formats import FILTERS, TESTS
 
 
@@ -26,6 +27,7 @@ def environment(package: str = "workflow") -> Environment:
         lstrip_blocks=True,
     )
     made.filters.update(FILTERS)
+    made.filters["words"] = words
     made.tests.update(TESTS)
     return made
 
@@ -38,6 +40,16 @@ def render_text(template: str, **values: Any) -> str:
 def said(macro: str, *values: Any) -> str:
     """A sentence of sentences.j2 by the name of its macro, on one line; empty where nothing is to be said."""
     return _plain(getattr(environment().get_template("sentences.j2").module, macro)(*values))
+
+
+def words(found: Finding) -> str:
+    """The sentence of findings.j2 that says what ident found."""
+    return _plain(getattr(_findings(), found.kind.name.lower())(found.values))
+
+
+@cache
+def _findings() -> Any:
+    return environment().get_template("findings.j2").module
 
 
 def rows_of(template: str, **values: Any) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -46,7 +46,7 @@ def _identify_channel(
     first_stage = None
     if config.closed_loop_data.method == "two_stage":
         opened = two_stage(bounded, channel.identification, channel.uncertainty)
-        bounded, first_stage = list(opened.records), opened.verdict
+        bounded, first_stage = list(opened.records), opened.finding
         used = bounded
         if channel.bounds_band_rad_s is not None:
             used = [as_fitted(record, channel) for record in bounded]

@@ -1,0 +1,80 @@
+"""What a test or a check found, as numbers; its sentence stands in the template of those who show it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+
+Value = float | bool | int | str
+
+
+class FindingKind(Enum):
+    """Which question a finding answers, or what it warns of."""
+
+    # Poles at a bound of the search.
+    NO_POLE = auto()
+    SLOW_BOUND = auto()
+    FAST_BOUND = auto()
+    OVERDAMPED_PAIR = auto()
+    DAMPING_BOUND = auto()
+    NO_DECAY = auto()
+    FREQUENCY_BOUND = auto()
+    # Pole pairs that can be no mode, or that nothing measured surrounds.
+    SLOW_PAIR = auto()
+    DAMPED_PAIR = auto()
+    OUTSIDE_BAND = auto()
+    # Records.
+    TIME_UNIT = auto()
+    FEW_SAMPLES = auto()
+    UNKNOWN_TIME_CONSTANT = auto()
+    UNKNOWN_DAMPING = auto()
+    WEAK_INPUT = auto()
+    ALIKE_INPUTS = auto()
+    CLIPPED = auto()
+    SLOW_POLE_IS_DRIFT = auto()
+    DRIFT = auto()
+    FAR_FROM_ZERO = auto()
+    # Questions left to the data, and what was stated as known.
+    NUISANCE = auto()
+    INTEGRATORS = auto()
+    SPARE_INTEGRATORS = auto()
+    FIXED_POLES = auto()
+    DELAY = auto()
+    DIRECT_TERM = auto()
+    RELATIVE_DEGREE = auto()
+    TOO_FEW_POLES = auto()
+    # Residuals and noise.
+    COLOURED_NOISE = auto()
+    COLOURED_RESIDUAL = auto()
+    WHITENESS = auto()
+    INDEPENDENCE = auto()
+    NOT_WHITE = auto()
+    NOT_INDEPENDENT = auto()
+    CHI_SQUARE = auto()
+    INVALIDATION = auto()
+    # Records made in closed loop.
+    FEEDBACK = auto()
+    TWO_STAGE = auto()
+    UNEXPLAINED_INPUT = auto()
+    FIRST_STAGE_ERROR = auto()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A kind, and the numbers and names that belong to it (units in their names)."""
+
+    kind: FindingKind
+    values: Mapping[str, Value]
+
+
+def finding(kind: FindingKind, **values: Value | np.generic) -> Finding:
+    """Numbers of numpy become plain ones."""
+    return Finding(kind, {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()})
+
+
+def distinct(found: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Each one once, in their order."""
+    return tuple(item for i, item in enumerate(found) if item not in found[:i])

@@ -1,0 +1,105 @@
+"""The sentence of every finding, one line each: those of data/findings.txt, in the order of the kinds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ident.finding import FindingKind, finding
+from workflow.text.templates import words
+
+STORED = Path(__file__).parent / "data" / "findings.txt"
+# One value for every name that any sentence asks for.
+VALUES = {
+    "in_header": "s",
+    "dt_s": 1.0,
+    "a": 0.9999999,
+    "omega_rad_s": 12.3456,
+    "zeta": 0.0234,
+    "fewest_periods": 3.0,
+    "largest_zeta": 0.6,
+    "low_rad_s": 1.0,
+    "high_rad_s": 10.0,
+    "limit_rad_s": 60.123,
+    "time_constant_s": 49.73,
+    "longest_s": 5.0,
+    "n_samples": 800,
+    "unknowns": 90,
+    "worth": 123.4,
+    "inputs": "['a', 'b']",
+    "record": "r<1>",
+    "signal": "output",
+    "name": "y",
+    "input": "u",
+    "output": "y",
+    "share": 0.4234,
+    "drift": 1.234,
+    "mean": 50.0123,
+    "std": 1.23,
+    "prior": "what_was_stated = 2",
+    "refused": True,
+    "imposed": True,
+    "needed": True,
+    "columns": 3,
+    "statistic": 12.34,
+    "limit": 9.21,
+    "level": 0.99,
+    "accepted": 1,
+    "enough": 1,
+    "one_less": 2,
+    "order": 4,
+    "free_poles": "0.998, 0.9 +- 0.1j",
+    "other_delay": 2,
+    "half_power_Hz": 0.512,
+    "unpredictable_share": 0.0123,
+    "passed": False,
+    "probability": 1e-4,
+    "max_lag": 25,
+    "lag": 7,
+    "correlation": 0.314,
+    "precedes_input": True,
+    "noise_order": 0,
+    "independent": True,
+    "chi_square": 222.22,
+    "degrees_of_freedom": 224,
+    "expected_low": 178.0,
+    "expected_high": 276.12,
+    "invalidated": False,
+    "n": 60,
+    "outside": 9,
+    "expected": 6,
+    "worst_rad_s": 50.123,
+    "worst_distance": 3.21,
+    "reference_gain": 1.0,
+    "feedback_gain": 2.5,
+    "offset": 0.1,
+    "largest_error": 0.3,
+    "tolerance": 0.01,
+    "exact": False,
+    "least_percent": 90.0,
+    "most_percent": 95.0,
+    "explained_percent": 12.3,
+    "relative_std": 0.0342,
+}
+# Other values that lead to other words.
+OTHERWISE = {
+    "TIME_UNIT": [{"in_header": ""}],
+    "NUISANCE": [{"needed": False}],
+    "INTEGRATORS": [{"accepted": 0}, {"refused": False}],
+    "DELAY": [{"other_delay": 1}],
+    "RELATIVE_DEGREE": [{"imposed": False}],
+    "WHITENESS": [{"passed": True}, {"probability": 0.0}],
+    "INDEPENDENCE": [{"passed": True, "precedes_input": False}],
+    "NOT_WHITE": [{"independent": False}, {"noise_order": 8}, {"noise_order": 8, "independent": False}],
+    "CHI_SQUARE": [{"chi_square": 100.0}, {"chi_square": 400.0}],
+    "INVALIDATION": [{"invalidated": True}, {"outside": 2}],
+    "FEEDBACK": [{"exact": True}],
+}
+
+
+def test_every_kind_has_its_sentences():
+    said = [
+        words(finding(kind, **(VALUES | other)))
+        for kind in FindingKind
+        for other in ({}, *OTHERWISE.get(kind.name, ()))
+    ]
+    assert said == STORED.read_text(encoding="utf-8").splitlines()
