@@ -15,8 +15,8 @@ from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
 
 _WORDS = {
-    "validation": "fresh record",
-    "repeat": "repeat of a fitted one",
+    "validation": "validation record",
+    "repeat": "repeat of a fitted record",
     "estimation": "record of the fit",
 }
 
@@ -62,7 +62,7 @@ def draw_validation(
             time = time_s[part]
             upper, lower = grid[0, column], grid[1, column]
             upper.plot(*outline(time, measured[part]), **_THICK, label="measured")
-            upper.plot(*outline(time, fit.simulated[part]), **_THIN, label="model, free run")
+            upper.plot(*outline(time, fit.simulated[part]), **_THIN, label="model, simulated")
             lower.plot(
                 *outline(time, fit.residual[part]), **(style.MEASURED_LINE | {"lw": 0.7}), label="residual"
             )
