@@ -40,6 +40,7 @@ from workflow.figures.residuals import draw_residual_tests
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.style import ratio_unit
 from workflow.figures.validation import draw_validation
+from workflow.tasks.results import LoopRuns
 
 OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))
 HOSTILE = "a_$very$_<b>long</b>\nname & 漢 of a column that goes on and on and on"
@@ -113,22 +114,21 @@ def sensitivity_figure(name: str = "V") -> Figure:
 
 
 def loop_scene(name: str = "hub") -> tuple[LoopScene, LoopTraces, LoopTraces]:
-    data = example.closed_loop_data(example.config(), 3)
-    arrays = data.arrays
+    loop = example.loop_check(example.config(), 3)
     scene = LoopScene(
-        arrays["time_s"],
-        arrays["reference"],
-        arrays["disturbance"],
+        loop.time_s,
+        loop.reference,
+        loop.disturbance,
         (name, "rad"),
         ("voltage_V", "V"),
         (name, "m"),
         24.0,
     )
 
-    def traces(prefix: str) -> LoopTraces:
-        return LoopTraces(*(arrays[f"{prefix}/{key}"] for key in ("output", "command", "performance")))
+    def traces(runs: LoopRuns) -> LoopTraces:
+        return LoopTraces(runs.output, runs.command, runs.performance)
 
-    return scene, traces("predicted"), traces("achieved")
+    return scene, traces(loop.predicted_runs), traces(loop.achieved_runs)
 
 
 def closed_loop_figure(name: str = "hub") -> Figure:
@@ -138,27 +138,26 @@ def closed_loop_figure(name: str = "hub") -> Figure:
 
 def measured_sensitivity_figure(name: str = "") -> Figure:
     """No name of the user's stands in it."""
-    arrays = example.closed_loop_data(example.config(), 3).arrays
-    omega = arrays["sensitivity/0/omega_rad_s"]
-    size = arrays["sensitivity/0/magnitude"]
+    check = example.loop_check(example.config(), 3).sensitivity
+    omega, size = check.measured[0].omega_rad_s, check.measured[0].magnitude
     measured = [
-        MeasuredPeak(f"arm {k}", omega, arrays[f"sensitivity/{k}/magnitude"], arrays[f"sensitivity/{k}/std"])
-        for k in range(2)
+        MeasuredPeak(f"arm {k}", row.omega_rad_s, row.magnitude, row.std)
+        for k, row in enumerate(check.measured)
     ]
     return draw_measured_sensitivity(PredictedSensitivity(omega, size, 1.05 * size), measured, level=0.95)
 
 
 def conditions_figure(name: str = "hub") -> Figure:
-    arrays = example.closed_loop_data(example.config(), 3).arrays
+    loop = example.loop_check(example.config(), 3)
     rows = [
         ConditionTraces(
             f"condition {k}",  # our own words; only the output's name is the user's
             "words",
-            *(arrays[f"conditions/{key}"][k] for key in ("reference", "predicted", "achieved")),
+            *(getattr(loop.conditions[k], field) for field in ("reference", "predicted", "achieved")),
         )
         for k in (0, 1, 0, 1, 0)
     ]
-    return draw_conditions(arrays["time_s"][:400], rows, (name, "rad"), machine="simulated arm")
+    return draw_conditions(loop.time_s[:400], rows, (name, "rad"), machine="simulated arm")
 
 
 def validation_figure(name: str = "fresh") -> Figure:
