@@ -289,7 +289,11 @@ def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
     made = flexlink("simulate", "--config", FAST_ARM, "--out", tmp_path / "logs", "--json")
     assert made.code == 0, made.err
     files = json.loads(made.out)["files"]
-    assert [name.rsplit("/", 1)[1] for name in files] == ["01_prbs.csv", "02_fresh_b_prbs_b_.csv"]
+    assert [name.rsplit("/", 1)[1] for name in files] == [
+        "01_prbs.csv",
+        "02_fresh_b_prbs_b_.csv",
+        "truth.json",
+    ]
     found = flexlink(
         *("identify", files[0], "--input", "voltage_V", "--output", "hub_angle_rad", "--time", "time_s"),
         *("--real", 1, "--pairs", 1, "--integrators", 1, "--validation", files[1]),
@@ -297,7 +301,16 @@ def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
     )
     assert found.code == 0, found.err
     numbers = json.loads(found.out)["numbers"]
-    assert numbers["modes"][0]["frequency_Hz"] == pytest.approx(7.6, rel=0.03)
+    (mode,) = numbers["modes"]
+    assert mode["frequency_Hz"] == pytest.approx(7.6, rel=0.03)
+    # The true mode stands beside it, of the physical model alone, and nothing else has changed with it.
+    true = min(
+        json.loads((tmp_path / "logs" / "truth.json").read_text())["modes"]["hub_angle_rad"],
+        key=lambda entry: abs(entry["frequency_Hz"] / mode["frequency_Hz"] - 1),
+    )
+    assert true["frequency_Hz"] == pytest.approx(mode["frequency_Hz"], rel=0.03)
+    (row,) = [row["value"] for row in json.loads(found.out)["table"] if row["label"] == "mode"]
+    assert f"true {true['frequency_Hz']:.3g} Hz" in row
     assert min(numbers["fit_validation_percent"].values()) > 98
     specification = tmp_path / "specification.toml"
     specification.write_text("bandwidth_rad_s = 1.5\neffort_limit = 60.0\ncontroller_order = 2\n")

@@ -21,7 +21,7 @@ def test_readme_walkthrough_from_csv_files_to_a_certified_controller(flexlink, t
     shutil.copy(ROOT / "examples" / "own_log.toml", tmp_path)
     logs, model = tmp_path / "logs", tmp_path / "hub.npz"
     assert flexlink("simulate", "--out", logs).code == 0
-    first, second, third = sorted(logs.iterdir())
+    first, second, third = sorted(logs.glob("*.csv"))
     columns = ["--input", "voltage_V", "--output", "hub_angle_rad", "--time", "time_s"]
     structure = ["--integrators", 1, "--delay", 1, "--real", 1, "--pairs", 2]
     written = ["--report", tmp_path / "hub.html", "--export", tmp_path / "hub.mat", "--out", model]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from ident.data.record import Record
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress, Silence
+from workflow.tasks import truth
 from workflow.tasks.log_identification import LogIdentification, identify_records
 from workflow.tasks.model_files import MODEL_SUFFIXES, write_model
 from workflow.tasks.results import IdentifiedPlant
@@ -69,6 +71,7 @@ def identify_logs(
             references=references,
         )
 
+    true_modes = truth.truth_beside([*logs, *validation], output_name)
     measured = [read(Path(path)) for path in logs]
     fresh_logs = [read(Path(path)) for path in validation]
     for record in measured:
@@ -84,6 +87,7 @@ def identify_logs(
         with_plot=report is not None,
         progress=progress,
     )
+    result = replace(result, true_modes=truth.beside(result.about, true_modes))
     if report is not None:
         from workflow.report.identify_page import identify_page  # loads matplotlib: a second
 

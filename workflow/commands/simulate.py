@@ -1,4 +1,4 @@
-"""`flexlink simulate`: the experiments of a configuration as CSV files."""
+"""`flexlink simulate`: the experiments of a configuration as CSV files, and the true modes beside them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from workflow.config.run_config import SimulatedSource, built_in_config, load_si
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks import truth
 from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 
 
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
-    """Simulate the experiments of a configuration; one CSV per record, named after it.
+    """Simulate the experiments of a configuration; one CSV per record, named after it, then truth.json.
 
     Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises
     InputError.
@@ -38,6 +39,9 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
             path = out / f"{number:02d}_{file_name(record.name)}.csv"
             storage.write_text(path, csv_text(record))
             files.append(path)
+        path = out / truth.FILE_NAME
+        storage.write_text(path, truth.truth_of(config.source).model_dump_json(indent=1) + "\n")
+        files.append(path)
     except (OSError, InputError) as error:
         for path in files:  # all of the experiments or none
             path.unlink()

@@ -54,7 +54,11 @@ class ChannelView:
     @property
     def light(self) -> list[tuple[int, ModelMode]]:
         """Lightly damped modes with their place among all modes."""
-        return [(k, mode) for k, mode in enumerate(self.found.modes) if mode.damping < LIGHT]
+        return [
+            (k, mode)
+            for k, mode in enumerate(self.found.modes)
+            if mode.damping < LIGHT and self.found.is_mode(mode)
+        ]
 
     @property
     def shown_fresh(self) -> int | None:

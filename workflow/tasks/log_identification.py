@@ -28,6 +28,7 @@ from workflow.tasks.stages.uncertainty import (
     residual_tests,
     uncertain_channel,
 )
+from workflow.tasks.truth import TrueMode
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
@@ -39,8 +40,8 @@ class LogIdentification:
 
     `measured` are the records as read, `used` the same as the fit saw them (inside the band; with the input
     that the reference explains, where the logs come from a closed loop). `about` and `spread` are results as
-    of a run's stages; `careful` says what to look at. The stabilisation plot is None where
-    nobody asked for it.
+    of a run's stages; `careful` says what to look at. The stabilisation plot is None where nobody asked for
+    it. `true_modes`: beside each mode of `about` the true one, known of simulated logs.
     """
 
     measured: tuple[Record, ...]
@@ -49,6 +50,7 @@ class LogIdentification:
     about: IdentifiedChannel
     spread: UncertainChannel
     careful: tuple[Finding, ...]
+    true_modes: tuple[TrueMode | None, ...] = ()
 
     @property
     def found(self) -> Identification:

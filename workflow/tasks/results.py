@@ -23,6 +23,7 @@ from control_design.plants.plant_set import Channel as PlantChannel
 from control_design.plants.plant_set import UncertainPlant
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
+from ident.checks.plausible_modes import PairKind, kind_of_pair
 from ident.checks.validation import FreshFit, ResidualTest, ScatterRow
 from ident.data.record import Record
 from ident.finding import Finding
@@ -156,6 +157,15 @@ class IdentifiedChannel:
         poles = self.model.poles
         pairs = zip(poles.omega_rad_s(self.model.dt_s).tolist(), poles.zeta().tolist(), strict=True)
         return tuple(ModelMode(omega, zeta) for omega, zeta in sorted(pairs))
+
+    @property
+    def longest_s(self) -> float:
+        """Length of the longest record of the fit."""
+        return max((record.n_samples * record.dt_s for record in self.used), default=np.inf)
+
+    def is_mode(self, pair: ModelMode) -> bool:
+        """Whether a pole pair can be a mode, given its damping and the length of the records."""
+        return kind_of_pair(pair.omega_rad_s, pair.damping, self.longest_s) is PairKind.MODE
 
     @property
     def real_poles_per_s(self) -> tuple[float, ...]:

@@ -130,7 +130,10 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "warnings": [words(item) for item in found.warnings],
         "verdicts": [words(item) for item in found.verdicts],
         "two_stage": None if found.two_stage is None else words(found.two_stage),
-        "modes": [{"frequency_Hz": mode.frequency_Hz, **codec.plain(mode)} for mode in found.modes],
+        "modes": [
+            {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode), "is_mode": found.is_mode(mode)}
+            for mode in found.modes
+        ],
         "noise_std": found.identification.noise_std,
         "tangent_optimality": found.identification.tangent_optimality,
         "search_evaluations": found.identification.search.evaluations,
