@@ -58,7 +58,7 @@ def test_truth_is_read_beside_the_logs_of_one_folder_only(tmp_path):
     assert truth.truth_beside([tmp_path / "a.csv"], "z") == ()
     assert truth.truth_beside([tmp_path / "a.csv", tmp_path / "other" / "b.csv"], "y") == ()
     place.write_text(json.dumps({"format": "flexlink truth 1"}))
-    with pytest.raises(InputError, match="truth.json"):
+    with pytest.raises(InputError, match=r"truth\.json"):
         truth.truth_beside([tmp_path / "a.csv"], "y")
     place.write_text(json.dumps({"truth": 42}))  # somebody else's
     assert truth.truth_beside([tmp_path / "a.csv"], "y") == ()

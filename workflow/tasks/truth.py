@@ -74,7 +74,7 @@ def truth_beside(logs: Sequence[Path], output: str) -> tuple[TrueMode, ...]:
 
 
 def beside(found: IdentifiedChannel, true: Sequence[TrueMode]) -> tuple[TrueMode | None, ...]:
-    """For each pole pair that can be a mode the true one nearest in ratio, where each is nearest to the other."""
+    """For each pole pair that can be a mode the true one nearest in ratio; each is nearest to the other."""
     modes = [mode for mode in found.modes if found.is_mode(mode)]
     if not modes or not true:
         return (None,) * len(found.modes)
