@@ -10,11 +10,11 @@ OUT ?= runs/default
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help install run test test-fast lint types check clean
+.PHONY: help install run test test-all lint types check clean
 
 help:
 	@echo "make run    install into .venv and run the default arm end to end (OUT=$(OUT))"
-	@echo "make test   the whole test suite   make test-fast   without the slow Monte Carlo"
+	@echo "make test   everything that guards behaviour   make test-all   with the long Monte Carlo"
 	@echo "make check  what CI runs: tests, lint, types"
 
 # The run at the end fills the cache of compiled code: code compiled in the same process may round otherwise than code
@@ -35,10 +35,10 @@ run: $(STAMP)
 	$(BIN)/flexlink run --out $(OUT) --replace
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q
-
-test-fast: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m "not slow"
+
+test-all: $(STAMP)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -48,7 +48,7 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
-check: test lint types
+check: test-all lint types
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info

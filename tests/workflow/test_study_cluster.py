@@ -116,7 +116,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
 
 
 def test_scheduler_without_workers(cluster, refused, tmp_path, monkeypatch):
-    monkeypatch.setattr("workflow.study.cluster.WITHOUT_WORKERS_S", 0.5)
+    monkeypatch.setattr("workflow.engine.cluster.WITHOUT_WORKERS_S", 0.5)
     line = refused(
         "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", cluster.address
     )
@@ -129,7 +129,7 @@ def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
     # A client left half made is closed whenever it is collected: that could hang the next one.
     monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was made"))
-    monkeypatch.setattr("workflow.study.cluster.CONNECT_S", 1.0)
+    monkeypatch.setattr("workflow.engine.cluster.CONNECT_S", 1.0)
     address = f"tcp://127.0.0.1:{free_port()}"
     line = refused(
         "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", address
@@ -141,7 +141,7 @@ def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
 @pytest.mark.parametrize("address", ["", "nonsense://127.0.0.1:1", "127.0.0.1:nine"])
 def test_an_address_that_is_none(refused, tmp_path, address, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
-    monkeypatch.setattr("workflow.study.cluster.CONNECT_S", 1.0)
+    monkeypatch.setattr("workflow.engine.cluster.CONNECT_S", 1.0)
     line = refused(
         "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", address
     )
