@@ -407,7 +407,7 @@ def test_main_without_arguments_shows_help(capsys):
     ("command", "words"),
     [
         ("run", ["[default: runs/<name>-<date>-<time>]"]),
-        ("identify", ["time column [s]", "Sampling period [s]", "[samples]"]),
+        ("identify", ["Zeit [ms]", "Sampling period [s]", "[samples]"]),
         ("design", ["[specification]"]),
         ("simulate", ["[source]"]),
     ],

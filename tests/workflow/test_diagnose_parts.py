@@ -11,7 +11,8 @@ from plant.effects import in_words
 from tests.workflow.diagnosis_examples import small_rig
 from workflow.diagnose.controller_check import check_controller
 from workflow.diagnose.linear_machine import sampled_linear_machine
-from workflow.diagnose.words import parameter_words, probability_words, unit_of
+from workflow.diagnose.words import FILTERS, parameter_words, probability_words, unit_of
+from workflow.text import formats
 
 LINEAR = {
     "nothing": [],
@@ -98,3 +99,8 @@ def test_no_probability_is_called_certain():
     assert probability_words(0.0) == "under 0.1 %"
     assert probability_words(0.954) == "95.4 %"
     assert probability_words(0.996) == "99.6 %"
+
+
+def test_filters_of_diagnoses_hide_none_of_the_shared_ones():
+    """One environment serves all: a name taken twice would change the run's table after a diagnosis."""
+    assert not set(FILTERS) & (set(formats.FILTERS) | {"words"})

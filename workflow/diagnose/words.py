@@ -87,7 +87,7 @@ def sureness(p: float) -> str:
 
 FILTERS: Mapping[str, Callable[..., str]] = {
     "effect": in_words,
-    "unit": unit_of,
+    "parameter_unit": unit_of,
     "parameter": parameter_words,
     "rig_key": key_words,
     "setting_of": setting_words,
