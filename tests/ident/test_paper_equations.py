@@ -47,7 +47,7 @@ from tests.ident.paper_oracles import (
     real_realisation,
     rotated_numerators,
 )
-from validation.comparators.comparators import fir
+from validation.comparators.comparators import arx
 
 HERE = Path(__file__).parent
 DT_S = 0.005
@@ -76,7 +76,7 @@ EQUATIONS = (
     Equation(
         (2,),
         "FIR: the sum cut off",
-        ("validation.comparators.comparators.fir", "ident.basis.functions.regressor"),
+        ("validation.comparators.comparators.arx", "ident.basis.functions.regressor"),
         ("::test_2_zero_poles_are_the_fir_model", "test_basis.py::test_fir_is_delay"),
     ),
     Equation(
@@ -301,10 +301,10 @@ def test_2_zero_poles_are_the_fir_model():
     # The same numbers from the regression on delayed inputs, and cut off they miss what lies behind the cut.
     u = noise(1)
     y = model.simulate(u)
-    np.testing.assert_allclose(fir(record(u, y), 5).b, taps, atol=1e-12)
+    np.testing.assert_allclose(arx(record(u, y), 0, 5).b, taps, atol=1e-12)
     slow = GobfModel(Poles([0.9]), np.ones(1), DT_S)
     y = slow.simulate(u)
-    errors = [np.linalg.norm(fir(record(u, y), n).simulate(u) - y) for n in (10, 20, 40)]
+    errors = [np.linalg.norm(arx(record(u, y), 0, n).simulate(u) - y) for n in (10, 20, 40)]
     # What is cut off of a decay 0.9^k shrinks by 0.9^10 and 0.9^20; the fit of the rest can only help.
     assert errors[1] < 0.5 * errors[0]
     assert errors[2] < 0.2 * errors[1]

@@ -136,7 +136,7 @@ def test_instrumental_variables_are_exact_without_noise_and_unbiased_with():
     np.testing.assert_allclose(found_a, a, atol=1e-9)
     np.testing.assert_allclose(found_b, b, atol=1e-9)
     _, _, u, y = _driven(1.0)
-    by_arx, _ = arx_polynomials([(u, y)], 2, 2)
+    by_arx, _ = arx_polynomials(u, y, 2, 2)
     by_instruments, _ = instrumental_variables(u, y, 2, 2)
     # White output noise biases ARX however long the record; the instruments do not see the noise.
     assert np.linalg.norm(by_arx - a) > 0.3

@@ -14,7 +14,7 @@ from ident.basis.structure import filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from validation.comparators.polynomial_model import PolynomialModel
-from validation.comparators.prediction_error import Polynomials, arx_polynomials, minimise, monic, shifted
+from validation.comparators.prediction_error import arx_polynomials, best_end, monic, shifted
 from validation.comparators.stable_sections import stabilised
 
 _ONE = np.ones(1)
@@ -23,12 +23,9 @@ _ONE = np.ones(1)
 def usual_oe(record: Record, nb: int, nf: int) -> PolynomialModel:
     """y = (B / F) u + e by prediction-error minimisation, best of the two usual starts; delay one sample."""
     u, y = filter_input(record.input[:, 0], 0, 1), record.output[:, 0]
-    starts = [arx_polynomials([(u, y)], nf, nb), instrumental_variables(u, y, nf, nb)]
-    ends = [minimise(Polynomials(_ONE, b, _ONE, stabilised(a)), [(u, y)]) for a, b in starts]
-    best = min(ends, key=lambda end: end[1])[0]
-    return PolynomialModel(
-        best.a, best.b, best.c, best.f, 1, record.dt_s, record.input_names[0], record.output_names[0]
-    )
+    starts = [arx_polynomials(u, y, nf, nb), instrumental_variables(u, y, nf, nb)]
+    stable = [PolynomialModel(_ONE, b, _ONE, stabilised(a)) for a, b in starts]
+    return best_end(stable, u, y).of(record, 1)
 
 
 def instrumental_variables(u: RealArray, y: RealArray, na: int, nb: int) -> tuple[RealArray, RealArray]:
@@ -38,7 +35,7 @@ def instrumental_variables(u: RealArray, y: RealArray, na: int, nb: int) -> tupl
     and instruments simulated with the second stage. L. Ljung, System Identification, section 15.3. A model
     that makes instruments is reflected into the unit circle first: growing ones would drown everything.
     """
-    a, b = arx_polynomials([(u, y)], na, nb)
+    a, b = arx_polynomials(u, y, na, nb)
     a, b = _instrumented(u, y, lfilter(b, stabilised(a), u), na, nb, _ONE)
     residual = lfilter(a, _ONE, y) - lfilter(b, _ONE, u)
     order = na + nb
