@@ -113,7 +113,7 @@ def arx_polynomials(u: RealArray, y: RealArray, na: int, nb: int) -> tuple[RealA
     """Least-squares A (na + 1,), B (nb,) of A y = B u + e; samples with unrecorded past are left out."""
     first = max(na, nb - 1)
     columns = np.hstack([-shifted(y, range(1, na + 1)), shifted(u, range(nb))])
-    theta = np.linalg.lstsq(columns[first:], y[first:])[0]
+    theta = np.asarray(np.linalg.lstsq(columns[first:], y[first:])[0], dtype=np.float64)
     return monic(theta[:na]), theta[na:]
 
 
