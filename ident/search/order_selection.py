@@ -60,11 +60,11 @@ class OrderSelection:
         best = self._noted(self.search.rescan(first))
         for _ in range(3):
             order = best.poles.order
-            best = self._grow_pairs(best, most_pairs)
-            if options.n_real is None:
-                best = self._grow_real(best)
+            grown = self._grow_pairs(best, most_pairs)
+            best = self._grow_real(grown) if options.n_real is None else grown
             best = self._prune(best)
-            if best.poles.order == order:
+            # From where no pair was to be added, none will be: a second look would end the same.
+            if best is grown or best.poles.order == order:
                 break
         return best
 
