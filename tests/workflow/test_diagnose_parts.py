@@ -102,5 +102,5 @@ def test_no_probability_is_called_certain():
 
 
 def test_filters_of_diagnoses_hide_none_of_the_shared_ones():
-    """One environment serves all: a name taken twice would change the run's table after a diagnosis."""
+    """The shared macros of a diagnosis' page go through the shared ones."""
     assert not set(FILTERS) & (set(formats.FILTERS) | {"words"})

@@ -132,6 +132,14 @@ def test_a_template_draws_its_figures_and_escapes_what_it_is_given(line):
     assert "<script>" not in page.html
 
 
+def test_filters_of_one_page_are_not_those_of_the_next(line, monkeypatch):
+    filters = (("number", lambda value: f"own {value}"),)
+    monkeypatch.setattr(shared(*filters), "loader", shared().loader)
+    for own, cell in ((filters, "own 1.5"), ((), "1.5")):
+        page = rendering.render_page("test.html.j2", filters=own, title="t", name="n", values=[])
+        assert f"<td>{cell}</td>" in page.html
+
+
 def test_texts_are_not_escaped(line):
     assert render_text("test.txt.j2", name="a < b & c") == "a < b & c"
 

@@ -45,7 +45,7 @@ def scores_text(found: Mapping[str, Any]) -> str:
 
 
 def _by_template(found: Mapping[str, Any], document: Mapping[str, Any] | None) -> str:
-    template = environment("validation").get_template("blind_scores.txt.j2")
+    template = environment(package="validation").get_template("blind_scores.txt.j2")
     made = template.render(found=found, document=document, table=_table)
     return Markup(made).unescape().strip("\n") + "\n"
 

@@ -18,7 +18,7 @@ from workflow.text.templates import environment
 
 def headlines_of(results: PaperResults, findings: Findings) -> list[str]:
     """What the run found, one line a figure."""
-    template = environment("validation").get_template("paper_headlines.txt.j2")
+    template = environment(package="validation").get_template("paper_headlines.txt.j2")
     text = template.render(results=results, found=findings, methods=METHODS, peers=PEERS)
     return text.strip().splitlines()
 
@@ -28,7 +28,7 @@ def page_html(
 ) -> str:
     """The self-contained page; everything drawn stands inside it."""
     return (
-        environment("validation")
+        environment(package="validation")
         .get_template("paper.html.j2")
         .render(
             contents=[],

@@ -10,7 +10,6 @@ from plant.effects import in_words
 from workflow.diagnose.words import FILTERS
 from workflow.report.rendering import render_page
 from workflow.text.formats import MISSING, listing, number
-from workflow.text.templates import environment
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,6 @@ class CaseAnswer:
 
 def overview_page(documents: Sequence[Mapping[str, Any]], failed: Mapping[str, str]) -> str:
     """documents: the JSON answers; failed: case -> reason."""
-    environment().filters.update(FILTERS)
     taken = ("verdict", "probability", "gap_before", "gap_after", "noise_floor")
     cases = [
         CaseAnswer(
@@ -40,7 +38,8 @@ def overview_page(documents: Sequence[Mapping[str, Any]], failed: Mapping[str, s
         )
         for d in documents
     ]
-    return render_page("diagnosis/overview.html.j2", title="Gap diagnosis", cases=cases, failed=failed).html
+    page = "diagnosis/overview.html.j2"
+    return render_page(page, filters=FILTERS.items(), title="Gap diagnosis", cases=cases, failed=failed).html
 
 
 def short_answer(document: Mapping[str, Any]) -> str:

@@ -15,7 +15,6 @@ from workflow.diagnose.controller_check import ControllerCheck
 from workflow.diagnose.following import Following
 from workflow.diagnose.words import FILTERS
 from workflow.report.rendering import render_page
-from workflow.text.templates import environment
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +38,11 @@ class CasePage:
 
 def case_page(page: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
     """One self-contained HTML page; equal content gives equal bytes."""
-    environment().filters.update(FILTERS)
     versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba")]
     return render_page(
         "diagnosis/case.html.j2",
         progress,
+        filters=FILTERS.items(),
         title=page.loaded.case.name,
         page=page,
         look_alikes=LOOK_ALIKES,

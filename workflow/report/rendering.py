@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,9 +28,15 @@ class RenderedPage:
 
 
 def render_page(
-    template: str, progress: Callable[[float, str], None] | None = None, **values: Any
+    template: str,
+    progress: Callable[[float, str], None] | None = None,
+    *,
+    filters: Iterable[tuple[str, Callable[..., Any]]] = (),
+    **values: Any,
 ) -> RenderedPage:
     """A page whose template extends base.html.j2. Equal values give equal bytes.
+
+    filters: (name, function) of this page, beside those of all.
 
     Pictures are drawn where the template asks for them; progress(share, picture) is told of each. How many
     are to come is not known, so the share only approaches 1.
@@ -49,7 +55,7 @@ def render_page(
         pictures[stem] = render(figure)
         return embedded(stem, Markup(caption).striptags(), pictures[stem])
 
-    page = environment().get_template(template).render(draw=draw, contents=[], **values)
+    page = environment(*filters).get_template(template).render(draw=draw, contents=[], **values)
     return RenderedPage(page.strip() + "\n", pictures)
 
 

@@ -1,4 +1,4 @@
-"""The one environment of all templates; it loads no matplotlib, so texts for terminals come from it too."""
+"""The environments of all templates; they load no matplotlib, so texts for terminals come from them too."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from workflow.text.formats import FILTERS, TESTS
 
 
 @cache
-def environment(package: str = "workflow") -> Environment:
-    """The one environment of all pages and texts; another package's templates come before ours.
+def environment(*own: tuple[str, Callable[..., Any]], package: str = "workflow") -> Environment:
+    """The environment of all pages and texts; another package's templates come before ours.
 
-    Everything that comes from the user is escaped.
+    own: filters (name, function) beside those of all. Everything that comes from the user is escaped.
     """
     made = Environment(
         loader=ChoiceLoader([PackageLoader(name) for name in dict.fromkeys((package, "workflow"))]),
@@ -26,8 +26,8 @@ def environment(package: str = "workflow") -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters.update(FILTERS)
-    made.filters["words"] = words
+    made.filters.update(FILTERS, words=words)
+    made.filters.update(own)
     made.tests.update(TESTS)
     return made
 
