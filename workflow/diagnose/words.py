@@ -9,38 +9,26 @@ from collections.abc import Callable, Mapping, Sequence
 from plant.effects import in_words
 from workflow.text.formats import MISSING, fixed, interval, number, si
 
-# Longest ending first: "stiffness_Nm_rad" is no "rad".
-_UNITS: Mapping[str, str] = {
-    "_Nm_rad3": "N m/rad³",
-    "_Nm_rad": "N m/rad",
-    "_Nm_A": "N m/A",
-    "_Vs_rad": "V s/rad",
-    "_kg_m2": "kg m²",
-    "_kg_m3": "kg/m³",
-    "_rad_s": "rad/s",
-    "_m_s2": "m/s²",
-    "_m_s": "m/s",
-    "_Nms": "N m s",
-    "_Nm": "N m",
-    "_kg": "kg",
-    "_Pa": "Pa",
-    "_Hz": "Hz",
-    "_ohm": "ohm",
-    "_rad": "rad",
-    "_V": "V",
-    "_s": "s",
-    "_m": "m",
-}
+# A unit at the end of a name, as the rig file spells it: units multiplied, then after "_" those divided by.
+_FACTORS = r"(?:(?:rad|ohm|kg|Pa|Hz|N|m|s|V|A)[23]?)"
+_UNIT = re.compile(rf"_({_FACTORS}+)(?:_({_FACTORS}+))?$")
+_POWERS = str.maketrans("23", "²³")
 _SURE = {0.99: "practically certain", 0.9: "very likely", 0.66: "likely", 0.33: "possible", 0.0: "unlikely"}
 
 
 def unit_of(parameter: str) -> str:
-    """Unit from the ending of a parameter's name; empty for pure numbers."""
-    return _UNITS.get(_ending(parameter), "")
+    """Unit from the ending of a parameter's name, "N m/rad" for _Nm_rad; empty for pure numbers."""
+    found = _UNIT.search(parameter)
+    if found is None:
+        return ""
+    over, under = (" ".join(re.findall(_FACTORS, part or "")).translate(_POWERS) for part in found.groups())
+    # An inertia is the one product that is written with a "_" between.
+    return f"{over} {under}" if (over, under) == ("kg", "m²") else f"{over}/{under}" if under else over
 
 
 def _ending(parameter: str) -> str:
-    return next((ending for ending in _UNITS if parameter.endswith(ending)), "")
+    found = _UNIT.search(parameter)
+    return "" if found is None else found.group()
 
 
 def parameter_words(parameter: str, value: float, bounds: Sequence[float] | None = None) -> str:
