@@ -8,6 +8,7 @@ means "as nominal".
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from plant.rig import Rig
 
@@ -45,12 +46,18 @@ class DryFriction:
 
 
 @dataclass(frozen=True)
-class Ripple:
-    """Torque a sin(N angle + phase) between motor housing and motor shaft, referred to the hub."""
+class SmoothTorque:
+    """A torque (hub side of the gear) that is a smooth function of one angle, or of one speed.
 
-    amplitude_Nm: float
-    cycles_per_rev: float
-    phase_rad: float
+    law: how, one of the smooth forces of `plant.kernel`. values: its parameters, the size first; 0 is no
+    torque. at: what it acts on and depends on: "shaft", from housing to shaft, or "motor", from ground on the
+    motor side of the hub.
+    """
+
+    law: int
+    values: tuple[float, ...]
+    at: Literal["shaft", "motor"]
+    of: Literal["angle", "speed"] = "angle"
 
 
 @dataclass(frozen=True)
@@ -76,9 +83,8 @@ class JointPath:
     """What acts between voltage and link root."""
 
     friction: tuple[DryFriction, ...] = ()
-    ripple: tuple[Ripple, ...] = ()
+    torques: tuple[SmoothTorque, ...] = ()
     disturbance: tuple[Disturbance, ...] = ()
-    cubic_spring_Nm_rad3: float = 0.0
     ground_spring_Nm_rad: float = 0.0
     compliance: TorsionSpring | None = None
     base: TorsionSpring | None = None
@@ -104,3 +110,11 @@ class Machine:
     joint: JointPath = field(default_factory=JointPath)
     sensor: SensorPath = field(default_factory=SensorPath)
     gravity_m_s2: float = 0.0
+
+    @property
+    def linear(self) -> bool:
+        """Whether the outputs, noise aside, are linear in voltage and forces from outside."""
+        voltage, joint, sensor = self.voltage, self.joint, self.sensor
+        bent = voltage.dead_zone_V > 0 or voltage.limit_V < float("inf") or sensor.step_m > 0
+        bent = bent or bool(joint.friction or joint.torques or joint.backlash_gap_rad)
+        return not (bent or joint.disturbance or sensor.drift_m_s or self.gravity_m_s2)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
-from plant.kernel import CONTACT, CUBIC, FRICTION, GRAVITY, SINE, STRIBECK, run
+from plant.kernel import CONTACT, FRICTION, GRAVITY, SINE, STRIBECK, run
 from plant.machine import Machine
 from plant.modal import (
     MOTOR_SIDE_SHARE,
@@ -270,27 +270,27 @@ class _Builder:
         """Smooth forces: kinds (J,), parameters (J, 3), position rows (J, N), force columns (N, J)."""
         machine, eq = self.machine, self.equations
         kinds: list[int] = []
-        parameters: list[tuple[float, float, float]] = []
+        parameters: list[tuple[float, ...]] = []
         rows: list[Real] = []
         columns: list[Real] = []
 
-        def add(kind: int, values: tuple[float, float, float], row: Real, column: Real) -> None:
+        def add(kind: int, values: tuple[float, ...], row: Real, column: Real) -> None:
             kinds.append(kind)
-            parameters.append(values)
+            parameters.append((*values, 0.0, 0.0, 0.0)[:3])
             rows.append(row)
             columns.append(column)
 
         for e, (_, _, excess, velocity) in enumerate(self._friction()):
             if excess != 0:
                 add(STRIBECK, (excess, velocity, e), self._speed(eq.shaft), self._column(eq.shaft))
-        for ripple in machine.joint.ripple:
-            values = ripple.amplitude_Nm, ripple.cycles_per_rev, ripple.phase_rad
-            add(SINE, values, self._position(eq.shaft), self._column(eq.shaft))
-        if machine.joint.cubic_spring_Nm_rad3 != 0:
-            values = machine.joint.cubic_spring_Nm_rad3, 0.0, 0.0
-            add(CUBIC, values, self._position(eq.motor), self._column(eq.motor))
+        # By law: sums of two of them are the same to the last digit for either order of the effects.
+        for torque in sorted(machine.joint.torques, key=lambda t: t.law):
+            if torque.values[0] != 0:
+                place = eq.shaft if torque.at == "shaft" else eq.motor
+                row = self._position(place) if torque.of == "angle" else self._speed(place)
+                add(torque.law, torque.values, row, self._column(place))
         if machine.gravity_m_s2 != 0:
-            values = machine.gravity_m_s2, static_moment_kg_m(machine.rig), 0.0
+            values = machine.gravity_m_s2, static_moment_kg_m(machine.rig)
             add(GRAVITY, values, self._position(eq.root), self._column(eq.root))
             for direction in np.eye(eq.mass.shape[0])[eq.first_mode :]:
                 add(GRAVITY, values, self._position(direction), self._column(direction))
@@ -334,8 +334,9 @@ class _Builder:
         self, element: Real, element_rows: Real, held_columns: Real, substep_s: float
     ) -> float:
         longest = substep_s if element.shape[0] else 2 * substep_s
-        for ripple in self.machine.joint.ripple:
-            longest = min(longest, _RIPPLE_PHASE_RAD / (_SLEW_RAD_S * max(ripple.cycles_per_rev, 1.0)))
+        for torque in self.machine.joint.torques:
+            if torque.law == SINE:
+                longest = min(longest, _RIPPLE_PHASE_RAD / (_SLEW_RAD_S * max(torque.values[1], 1.0)))
         for e in range(element.shape[0]):
             stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
             mobility = abs(element_rows[e, 1] @ held_columns[:, 3 + e])

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic, Scales, log_axis
-from plant.machine import JointPath, Machine, SensorPath, VoltagePath
+from plant.machine import JointPath, Machine, SensorPath, SmoothTorque, VoltagePath
 from plant.rig import Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
@@ -46,6 +46,8 @@ class Effect(BaseModel, ABC):
         How the outputs depend on the parameters: smooth (differentiable), continuous, or non-smooth.
     environment : bool
         It comes from outside the machine.
+    friction : bool
+        It takes energy at the joint: closed loops are also tried without it and with twice its torques.
     multiplies : str or None
         Key of the stated value that its ratio multiplies, whose tolerance may explain it as well.
     harmonic : str or None
@@ -62,6 +64,7 @@ class Effect(BaseModel, ABC):
     neutral: ClassVar[Mapping[str, float] | None]
     dependence: ClassVar[Dependence] = "smooth"
     environment: ClassVar[bool] = False
+    friction: ClassVar[bool] = False
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None
     look_alike_of: ClassVar[str | None] = None
@@ -166,6 +169,10 @@ def with_voltage(machine: Machine, **changes: Any) -> Machine:
 
 def with_joint(machine: Machine, **changes: Any) -> Machine:
     return replace(machine, joint=_replaced(machine.joint, changes))
+
+
+def with_torque(machine: Machine, torque: SmoothTorque) -> Machine:
+    return with_joint(machine, torques=(*machine.joint.torques, torque))
 
 
 def with_sensor(machine: Machine, **changes: Any) -> Machine:

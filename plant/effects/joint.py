@@ -19,9 +19,11 @@ from plant.effects.base import (
     register,
     with_joint,
     with_parameters,
+    with_torque,
 )
 from plant.effects.search_space import PHASE, Axis, Candidate, Scales, geometric, log_axis
-from plant.machine import Disturbance, DryFriction, Machine, Ripple, TorsionSpring
+from plant.kernel import CUBIC, SINE
+from plant.machine import Disturbance, DryFriction, Machine, SmoothTorque, TorsionSpring
 from plant.modal import static_moment_kg_m
 from plant.rig import Rig
 
@@ -39,6 +41,7 @@ class CoulombFriction(Effect):
     id = "coulomb_friction"
     words = "dry (Coulomb) friction"
     group = "joint"
+    friction = True
     neutral = MappingProxyType({"torque_Nm": 0.0})
     dependence = "continuous"
 
@@ -62,6 +65,7 @@ class StribeckFriction(Effect):
     id = "stribeck_friction"
     words = "dry friction that falls with speed (Stribeck)"
     group = "joint"
+    friction = True
     neutral = MappingProxyType(
         {"static_torque_Nm": 0.0, "coulomb_torque_Nm": 0.0, "stribeck_velocity_rad_s": 0.1}
     )
@@ -117,6 +121,7 @@ class ViscousFriction(Effect):
     id = "viscous_friction"
     words = "additional viscous friction"
     group = "joint"
+    friction = True
     neutral = MappingProxyType({"coefficient_Nms": 0.0})
 
     coefficient_Nms: NotNegative = Field(description="added to the rig's viscous friction")
@@ -164,8 +169,7 @@ class TorqueRipple(Effect):
     phase_rad: float = Field(description="phase p at theta = 0")
 
     def modify(self, machine: Machine) -> Machine:
-        ripple = Ripple(self.amplitude_Nm, self.cycles_per_rev, self.phase_rad)
-        return with_joint(machine, ripple=(*machine.joint.ripple, ripple))
+        return with_torque(machine, SmoothTorque(SINE, tuple(self.parameters().values()), at="shaft"))
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -215,8 +219,7 @@ class HardeningSpring(Effect):
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
 
     def modify(self, machine: Machine) -> Machine:
-        total = machine.joint.cubic_spring_Nm_rad3 + self.cubic_Nm_rad3
-        return with_joint(machine, cubic_spring_Nm_rad3=total)
+        return with_torque(machine, SmoothTorque(CUBIC, (self.cubic_Nm_rad3,), at="motor"))
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:

@@ -9,6 +9,7 @@ import pytest
 
 from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs, simulate, without
 from plant.effects import CoulombFriction, InputDelay, TipPayload
+from plant.machine import Machine
 
 RIG = paper_link()
 VOLTAGE = prbs(7, 6, 3.0, 300, np.random.default_rng(4))
@@ -84,6 +85,12 @@ class TestContract:
         change = np.sqrt(np.mean((_output(_example(name)) - nominal) ** 2, axis=0))
         assert change[1] > 5e-4
         assert change[0] == 0 if EFFECTS[name].group == "sensor" else change[0] > 5e-4
+
+    def test_the_machine_knows_whether_it_is_linear(self, name):
+        effect = _example(name)
+        once, twice = (simulate(RIG, factor * VOLTAGE, [effect]).output for factor in (1, 2))
+        scales = bool(np.allclose(twice, 2 * once, rtol=0, atol=1e-9))
+        assert effect.modify(Machine(RIG)).linear == scales
 
     def test_it_vanishes_at_its_neutral_value(self, name, nominal):
         neutral = EFFECTS[name].neutral

@@ -19,8 +19,9 @@ from control_design.analysis.closed_loop import ClosedLoopTrajectory, SampledMac
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
-from plant import Rig, parse_effect
+from plant import EFFECTS, Rig, parse_effect
 from plant import simulate as simulate_arm
+from plant.machine import Machine
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
@@ -28,9 +29,6 @@ from workflow.tasks.simulated_rig import EncodedArm
 
 Real = npt.NDArray[np.float64]
 
-_FRICTION = ("coulomb_friction", "stribeck_friction", "viscous_friction")
-_FORCES = ("torque_Nm", "static_torque_Nm", "coulomb_torque_Nm", "coefficient_Nms")
-_LINEAR = ("viscous_friction", "tip_payload", "link_stiffness", "structural_damping", "hub_inertia")
 _SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
 _OVERDRIVEN = 2.0  # times the voltage limit that the large step would need
 _PUSH_S = 0.1
@@ -204,7 +202,8 @@ class ConditionBench:
         start, length = n // 20, max(2, round(_PUSH_S / dt))
         force = np.zeros(n)
         force[start : start + length] = np.sin(np.pi * (np.arange(length) + 0.5) / length)[: n - start]
-        linear = [parse_effect(effect) for name, effect in self.effects.items() if name in _LINEAR]
+        effects = [parse_effect(effect) for effect in self.effects.values()]
+        linear = [effect for effect in effects if effect.modify(Machine(self.rig)).linear]
         free = simulate_arm(
             self.rig, np.zeros(n), linear, rng=None, tip_force_N=force, n_modes=self.source.modes
         )
@@ -247,13 +246,14 @@ class ConditionBench:
 
     def frictions(self) -> list[ConditionRun]:
         """None of the arm's joint friction effects, and twice as much of each."""
-        own = {name: effect for name, effect in self.effects.items() if name in _FRICTION}
+        own = {name: effect for name, effect in self.effects.items() if EFFECTS[name].friction}
         if not own:
             return []
 
         def scaled(factor: float) -> dict[str, dict[str, Any]]:
+            # Torques, and coefficients that make torques of speeds.
             return {
-                name: {key: factor * value if key in _FORCES else value for key, value in effect.items()}
+                name: {key: factor * value if "_Nm" in key else value for key, value in effect.items()}
                 for name, effect in own.items()
             }
 
