@@ -12,7 +12,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.finding import Finding, FindingKind, distinct, finding
 from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
@@ -76,12 +76,9 @@ class FrfIdentification:
     search: SearchTrace
 
     def __post_init__(self) -> None:
-        for name in ("omega_rad_s", "distance", "decay_std_per_s", "omega_std_rad_s", "zeta_std"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        residual = np.array(self.residual, dtype=np.complex128)
-        residual.setflags(write=False)
-        object.__setattr__(self, "residual", residual)
-        if not (self.omega_rad_s.shape == residual.shape == self.distance.shape):
+        lock(self, "omega_rad_s", "distance", "decay_std_per_s", "omega_std_rad_s", "zeta_std")
+        lock(self, "residual", dtype=np.complex128)
+        if not (self.omega_rad_s.shape == self.residual.shape == self.distance.shape):
             raise ValueError("omega_rad_s, residual and distance must be (F,)")
         if not self.degrees_of_freedom > 0:
             raise ValueError(f"degrees_of_freedom must be positive; got {self.degrees_of_freedom}")

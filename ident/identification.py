@@ -12,7 +12,7 @@ from ident.basis.miso_model import MisoModel
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import PriorTest
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock, readonly_real
 from ident.finding import Finding, distinct
 from ident.search.order_selection import OrderStep
 from ident.search.search_trace import SearchTrace
@@ -72,8 +72,7 @@ class FittedRecords:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
-        object.__setattr__(self, "fit_percent", readonly_real(self.fit_percent))
-        object.__setattr__(self, "noise_filter", readonly_real(self.noise_filter))
+        lock(self, "fit_percent", "noise_filter")
         if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
             raise ValueError("residuals, record_names and fit_percent must have one entry per record")
         if not (self.rss >= 0 and self.noise_std >= 0 and self.tangent_optimality >= 0):

@@ -14,14 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ident.basis.options import IdentOptions
 from ident.coloured_noise import prewhitened
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression, fit
 from ident.fit.refinement import Refined
@@ -57,10 +57,8 @@ class Stabilisation:
 
     Attributes
     ----------
-    counts : (S,) int array
-        Pole pairs of each fit, 0, 1, 2 ...
     rss : (S,) array
-        Residual sum of squares of each fit.
+        Residual sum of squares of each fit, of 0, 1, 2 ... pairs.
     n_real : int
         Real poles of every fit (known ones not counted).
     chosen : int
@@ -76,7 +74,6 @@ class Stabilisation:
         Whether the data would miss the pair in that fit.
     """
 
-    counts: IntArray
     rss: RealArray
     n_real: int
     chosen: int
@@ -88,21 +85,12 @@ class Stabilisation:
     needed: BoolArray
 
     def __post_init__(self) -> None:
-        for name in ("rss", "omega_rad_s", "zeta"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        for name, kind in (
-            ("counts", np.int64),
-            ("n_pairs", np.int64),
-            ("previous", np.int64),
-            ("same_damping", np.bool_),
-            ("needed", np.bool_),
-        ):
-            array = np.array(getattr(self, name), dtype=kind)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        lock(self, "rss", "omega_rad_s", "zeta")
+        lock(self, "n_pairs", "previous", dtype=np.int64)
+        lock(self, "same_damping", "needed", dtype=np.bool_)
         each = (self.omega_rad_s, self.zeta, self.previous, self.same_damping, self.needed)
-        if any(array.shape != self.n_pairs.shape for array in each) or self.counts.shape != self.rss.shape:
-            raise ValueError("need one entry per pole pair (K,), and counts and rss one per fit (S,)")
+        if any(array.shape != self.n_pairs.shape for array in each):
+            raise ValueError("need one entry per pole pair (K,)")
 
     @property
     def stable(self) -> BoolArray:
@@ -164,51 +152,31 @@ def stabilisation(
             known = search.descend(found.model.poles, "the model's own poles")
             end = min(known, end, key=lambda candidate: candidate.rss)
         fits.append(end)
-    return _compared(data, fits, n_real, chosen, fixed_real, fixed_pairs)
+    return _compared(data, fits, n_real, chosen, fixed_pairs)
 
 
 def _compared(
-    data: Regression, fits: Sequence[Refined], n_real: int, chosen: int, fixed_real: int, fixed_pairs: int
+    data: Regression, fits: Sequence[Refined], n_real: int, chosen: int, fixed_pairs: int
 ) -> Stabilisation:
-    n_pairs: list[int] = []
-    previous: list[int] = []
-    omegas: list[float] = []
-    zetas: list[float] = []
-    same_damping: list[bool] = []
-    needed: list[bool] = []
-    before: tuple[RealArray, RealArray, int] = (np.zeros(0), np.zeros(0), 0)
+    columns: list[tuple[npt.NDArray[Any], ...]] = [(np.zeros(0),) * 6]
+    start, omega_before, zeta_before = 0, np.zeros(0), np.zeros(0)
     for count, end in enumerate(fits):
         order = np.argsort(end.poles.omega_rad_s(data.dt_s)[fixed_pairs:]) + fixed_pairs
         omega, zeta = end.poles.omega_rad_s(data.dt_s)[order], end.poles.zeta()[order]
-        match = _counterparts(omega, before[0])
-        first = len(n_pairs)
-        n_pairs += [count] * omega.size
-        omegas += omega.tolist()
-        zetas += zeta.tolist()
-        previous += [before[2] + j if j >= 0 else -1 for j in match]
-        same_damping += [
-            bool(j >= 0 and abs(z - before[1][j]) < DAMPING_TOLERANCE * before[1][j])
-            for z, j in zip(zeta, match, strict=True)
-        ]
-        needed += _needed(data, end, order)
-        before = (omega, zeta, first)
-    return Stabilisation(
-        counts=np.arange(len(fits)),
-        rss=np.array([end.rss for end in fits]),
-        n_real=n_real,
-        chosen=chosen,
-        n_pairs=np.array(n_pairs, dtype=np.int64),
-        omega_rad_s=np.array(omegas),
-        zeta=np.array(zetas),
-        previous=np.array(previous, dtype=np.int64),
-        same_damping=np.array(same_damping, dtype=np.bool_),
-        needed=np.array(needed, dtype=np.bool_),
-    )
+        match = _counterparts(omega, omega_before)
+        known, same = match >= 0, np.zeros(omega.size, dtype=np.bool_)
+        there = zeta_before[match[known]]
+        same[known] = np.abs(zeta[known] - there) < DAMPING_TOLERANCE * there
+        previous = np.where(known, match + start - omega_before.size, -1)
+        columns.append((np.full(omega.size, count), omega, zeta, previous, same, _needed(data, end, order)))
+        start, omega_before, zeta_before = start + omega.size, omega, zeta
+    rss = np.array([end.rss for end in fits])
+    return Stabilisation(rss, n_real, chosen, *map(np.concatenate, zip(*columns, strict=True)))
 
 
-def _counterparts(omega: RealArray, before: RealArray) -> list[int]:
+def _counterparts(omega: RealArray, before: RealArray) -> IntArray:
     """For each frequency the index of its counterpart, nearest first and each used once; -1 without one."""
-    match = [-1] * omega.size
+    match = np.full(omega.size, -1)
     if before.size == 0:
         return match
     away = np.abs(omega[:, None] - before) / before
@@ -221,13 +189,9 @@ def _counterparts(omega: RealArray, before: RealArray) -> list[int]:
     return match
 
 
-def _needed(data: Regression, end: Refined, pairs: IntArray) -> list[bool]:
+def _needed(data: Regression, end: Refined, pairs: IntArray) -> BoolArray:
     """Whether the data miss each pair when it is taken out and the other poles stay where they are."""
     worth = data.colour(data.residual(end.poles)).effective_samples
     floor = max(EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
-    answers = []
-    for index in pairs:
-        without = fit(data, end.poles.without_pair(index)).rss
-        gain = worth * np.log(max(without, floor) / max(end.rss, floor))
-        answers.append(bool(gain > 4 * np.log(worth)))
-    return answers
+    without = [max(fit(data, end.poles.without_pair(index)).rss, floor) for index in pairs]
+    return np.asarray(worth * np.log(np.array(without) / max(end.rss, floor)) > 4 * np.log(worth))

@@ -16,7 +16,7 @@ import numpy as np
 
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray, kernel_array, readonly_real
+from ident.data.arrays import RealArray, kernel_array, lock
 
 # A pair this close to critical damping is two real poles in disguise; its two columns become dependent.
 ZETA_LIMIT = 0.98
@@ -41,8 +41,7 @@ class SearchSpace:
     dt_s: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "low", readonly_real(self.low))
-        object.__setattr__(self, "high", readonly_real(self.high))
+        lock(self, "low", "high")
         if not np.all(self.low < self.high):
             names = ("real pole", "pair frequency", "pair damping")
             i = int(np.flatnonzero(~(self.low < self.high))[0])

@@ -11,7 +11,7 @@ import numpy as np
 from ident.basis.functions import basis_state_space
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, lock
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,7 @@ class MisoModel:
     input_delay_samples: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "coefficients", readonly_real(self.coefficients))
-        object.__setattr__(self, "feedthrough", readonly_real(self.feedthrough))
+        lock(self, "coefficients", "feedthrough")
         object.__setattr__(self, "input_names", tuple(self.input_names))
         n_inputs = len(self.input_names)
         if not n_inputs or len(set(self.input_names)) != n_inputs:

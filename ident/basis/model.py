@@ -11,7 +11,7 @@ import scipy.linalg
 from ident.basis.functions import basis_response, basis_state_space, regressor
 from ident.basis.poles import Poles
 from ident.basis.structure import filter_input
-from ident.data.arrays import ComplexArray, RealArray, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, lock
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class GobfModel:
     output_name: str = "y"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "coefficients", readonly_real(self.coefficients))
+        lock(self, "coefficients")
         if self.coefficients.shape != (self.poles.order,):
             raise ValueError(
                 f"need one coefficient per basis function, shape ({self.poles.order},); got "

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from ident.basis.functions import basis_response, regressor
 from ident.basis.poles import Poles
 from ident.basis.structure import filter_input, front_response
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.ellipses import ellipse_distance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 
@@ -69,8 +69,8 @@ class ResponsePosterior:
     report: EmbeddingReport | None = None
 
     def __post_init__(self) -> None:
-        mean = np.array(self.mean, dtype=np.float64)
-        factor = np.array(self.covariance_factor, dtype=np.float64)
+        lock(self, "mean", "covariance_factor")
+        mean, factor = self.mean, self.covariance_factor
         size = self.poles.order + int(self.has_feedthrough) + self.fir_length
         if mean.shape != (size,) or factor.ndim != 2 or factor.shape[0] != size:
             raise ValueError(
@@ -82,9 +82,6 @@ class ResponsePosterior:
             raise ValueError(f"dt_s must be positive and finite; got {self.dt_s}")
         if min(self.fir_length, self.integrators, self.input_delay_samples) < 0:
             raise ValueError("fir_length, integrators and input_delay_samples must not be negative")
-        for name, array in (("mean", mean), ("covariance_factor", factor)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
 
     def frequency_rows(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
         """(F,P) matrix that maps coefficients to the response at omega (F,) [rad/s], 0 <= omega <= pi / dt_s.

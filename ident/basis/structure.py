@@ -45,14 +45,9 @@ class Structure:
         """Number of polynomial nuisance columns per record, degrees 0, 1, ..."""
         return max(int(self.estimate_offset), self.integrators if self.estimate_initial_state else 0)
 
-    def filter_input(self, u: RealArray) -> RealArray:
-        """(1 - q^-1)^-integrators q^-delay u, from rest, (T,) -> (T,)."""
-        return filter_input(u, self.integrators, self.input_delay_samples)
-
 
 def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
-    """u (T,) delayed by whole samples (zeros before the record), then summed `integrators` times: 1/(1 -
-    q^-1)^k, exact."""
+    """(1 - q^-1)^-integrators q^-delay u (T,), from rest: delayed by whole samples, then summed, exact."""
     u = np.asarray(u, dtype=np.float64)
     delayed = np.zeros_like(u)
     delayed[delay_samples:] = u[: max(u.size - delay_samples, 0)]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock
 from ident.finding import Finding, FindingKind, finding
 
 
@@ -33,8 +33,7 @@ class ResidualTest:
     precedes_input: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("lags", "correlation", "band"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        lock(self, "lags", "correlation", "band")
         if not (self.lags.shape == self.correlation.shape == self.band.shape and self.lags.ndim == 1):
             raise ValueError("lags, correlation and band must be (K,) arrays")
 

@@ -14,7 +14,7 @@ from ident.basis.functions import free_response
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.residual_tests import ResidualTest, independence_test, whiteness_test
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock
 from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
@@ -58,8 +58,7 @@ class FreshFit:
     residual: RealArray
 
     def __post_init__(self) -> None:
-        for name in ("simulated", "residual"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        lock(self, "simulated", "residual")
 
 
 def fit_on_fresh_data(
@@ -118,8 +117,7 @@ class Invalidation:
     n_expected_outside: int
 
     def __post_init__(self) -> None:
-        for name in ("omega_rad_s", "distance", "probability"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        lock(self, "omega_rad_s", "distance", "probability")
 
     @property
     def finding(self) -> Finding:

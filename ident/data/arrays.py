@@ -21,6 +21,14 @@ def kernel_array(array: RealArray) -> RealArray:
     return array if flags.c_contiguous and flags.writeable else array.copy(order="C")
 
 
+def lock(record: object, *names: str, dtype: npt.DTypeLike = np.float64) -> None:
+    """Replace these fields of a frozen record by copies that cannot be written to."""
+    for name in names:
+        array = np.array(getattr(record, name), dtype=dtype)
+        array.setflags(write=False)
+        object.__setattr__(record, name, array)
+
+
 def readonly_real(values: Any) -> RealArray:
     """A float64 copy that cannot be written to."""
     array = np.array(values, dtype=np.float64)

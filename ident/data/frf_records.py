@@ -9,7 +9,7 @@ from typing import Literal, Self
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
 from ident.data.record_files import read_table
@@ -31,8 +31,8 @@ class FrfRepeats:
     label: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "omega_rad_s", readonly_real(self.omega_rad_s))
-        object.__setattr__(self, "response", readonly_complex(self.response))
+        lock(self, "omega_rad_s")
+        lock(self, "response", dtype=np.complex128)
         size = self.omega_rad_s.size
         object.__setattr__(self, "label", tuple(self.label) or ("",) * size)
         if self.omega_rad_s.shape != (size,) or self.response.shape != (size,) or len(self.label) != size:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Self
@@ -91,19 +91,12 @@ class Record:
                 f"{self.label}: {key} has {signal.shape[0]} samples and input {np.shape(self.input)[0]}; "
                 "they must be equally long, at least one"
             )
-        bad = np.argwhere(~np.isfinite(signal))
+        bad = np.argwhere(~(np.abs(signal) <= _LARGEST))
         if bad.size:
             k, column = bad[0]
             raise ValueError(
-                f"{self.label}: {key} column '{names[column]}' is {signal[k, column]} at index {k}; "
-                "expected finite numbers"
-            )
-        large = np.argwhere(np.abs(signal) > _LARGEST)
-        if large.size:
-            k, column = large[0]
-            raise ValueError(
                 f"{self.label}: {key} column '{names[column]}' is {signal[k, column]:.6g} at index {k}; "
-                f"expected magnitudes up to {_LARGEST:g} (choose another unit)"
+                f"expected finite numbers, magnitudes up to {_LARGEST:g} (else choose another unit)"
             )
 
     @property
@@ -148,13 +141,12 @@ class Record:
                 f"{self.label}: samples {start} to {stop} asked for; expected 0 <= start < stop <= "
                 f"{self.n_samples}, the number there are"
             )
-        part = slice(start, stop)
-        return replace(
-            self,
-            input=self.input[part],
-            output=self.output[part],
-            reference=None if self.reference is None else self.reference[part],
-        )
+        return self.each(lambda signal: signal[start:stop])
+
+    def each(self, change: Callable[[RealArray], RealArray]) -> Record:
+        """The record with its input, output and reference, (T, .) each, changed alike."""
+        reference = None if self.reference is None else change(self.reference)
+        return replace(self, input=change(self.input), output=change(self.output), reference=reference)
 
     @classmethod
     def from_file(

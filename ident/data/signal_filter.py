@@ -3,7 +3,6 @@ rest."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -59,12 +58,7 @@ def band_limited(
         columns = [scipy.signal.sosfilt(sections, x, zi=settled * x[0])[0] for x in signal.T]
         return np.column_stack(columns)[skip:]
 
-    return replace(
-        record,
-        input=filtered(record.input),
-        output=filtered(record.output),
-        reference=None if record.reference is None else filtered(record.reference),
-    )
+    return record.each(filtered)
 
 
 def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float, *, filter_order: int = 2) -> float:
@@ -87,9 +81,4 @@ def increments(record: Record) -> Record:
     """
     if record.n_samples < 2:
         raise ValueError(f"{record.label}: differences need at least two samples")
-    return replace(
-        record,
-        input=np.diff(record.input, axis=0),
-        output=np.diff(record.output, axis=0),
-        reference=None if record.reference is None else np.diff(record.reference, axis=0),
-    )
+    return record.each(lambda signal: np.diff(signal, axis=0))

@@ -11,7 +11,7 @@ import numpy as np
 from ident.basis.coordinates import SearchSpace
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock
 from ident.data.record import Record
 from ident.fit.regression import prepare
 
@@ -39,8 +39,7 @@ class ErrorSurface:
     pole: tuple[float, float]
 
     def __post_init__(self) -> None:
-        for key in ("first", "second", "mean_square"):
-            object.__setattr__(self, key, readonly_real(getattr(self, key)))
+        lock(self, "first", "second", "mean_square")
         if self.mean_square.shape != (self.first.size, self.second.size):
             raise ValueError(
                 f"mean_square must be ({self.first.size}, {self.second.size}); got {self.mean_square.shape}"

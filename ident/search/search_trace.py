@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, lock
 from ident.finding import Finding
 
 
@@ -20,8 +20,7 @@ class SearchStage:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "coordinate_names", tuple(self.coordinate_names))
-        object.__setattr__(self, "points", readonly_real(self.points))
-        object.__setattr__(self, "log_cost", readonly_real(self.log_cost))
+        lock(self, "points", "log_cost")
         if self.points.shape != (self.log_cost.size, len(self.coordinate_names)):
             raise ValueError(
                 f"points must be ({self.log_cost.size}, {len(self.coordinate_names)}); got "

@@ -20,7 +20,7 @@ from scipy.stats import norm
 from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import ComplexArray, RealArray, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, lock
 
 # Points of the circle on which the two coefficients are read off; 16 determine a Laurent series to rounding
 # when the next pole is three radii away (1/3^15 = 7e-8 of it is left, far below any interval).
@@ -42,8 +42,7 @@ class PoleIntervals:
     decay_per_s: RealArray
 
     def __post_init__(self) -> None:
-        for name in ("omega_rad_s", "zeta", "decay_per_s"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        lock(self, "omega_rad_s", "zeta", "decay_per_s")
 
 
 def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.95) -> PoleIntervals:

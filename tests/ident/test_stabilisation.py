@@ -47,7 +47,7 @@ def test_one_mode_and_integrators():
 
 
 def test_fits_are_nested_and_marks_follow_the_definition(p2_plot):
-    assert p2_plot.counts.tolist() == list(range(8))
+    assert p2_plot.rss.size == 8
     assert np.all(np.diff(p2_plot.rss) <= 0)
     assert np.bincount(p2_plot.n_pairs, minlength=8).tolist() == list(range(8))
     for k, j in enumerate(p2_plot.previous):
@@ -79,7 +79,7 @@ def test_growth_ends_where_the_data_end():
     short = p2(0, 60).record
     found = identify([short], IdentOptions(n_real=1, n_pairs=1))
     plot = stabilisation([short], found)
-    assert plot.counts.size < 1 + 3 + 1 + 12  # 60 samples do not carry twelve pairs
+    assert plot.rss.size < 1 + 3 + 1 + 12  # 60 samples do not carry twelve pairs
     rng = np.random.default_rng(0)
     noise = as_record(rng.normal(size=500), rng.normal(size=500))
     assert stabilisation([noise], identify([noise])).columns() == ()

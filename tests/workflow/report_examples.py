@@ -139,7 +139,6 @@ def identification(of: GobfModel, used: list[Record]) -> Identification:
 def stabilisation_plot() -> Stabilisation:
     """Two modes that stay and a pair that moves."""
     return Stabilisation(
-        counts=np.arange(5),
         rss=np.array([9.0, 4.0, 1.0, 0.99, 0.98]),
         n_real=1,
         chosen=2,

@@ -109,7 +109,7 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: EmpiricalResponse 
                 omega[here], count[here], ls="none", marker=marker, ms=size, mfc=face, mec=edge, label=label
             )
     axes.axhline(plot.chosen, color=style.HIGHLIGHT, lw=5, alpha=0.35, label="number of pairs in the model")
-    axes.set_ylim(-0.4, max(int(plot.counts.max()), 1) + 0.6)
+    axes.set_ylim(-0.4, max(plot.rss.size - 1, 1) + 0.6)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     if response is None and omega.size:
         axes.set_xlim(omega.min() / 1.5, omega.max() * 1.5)

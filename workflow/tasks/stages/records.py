@@ -100,10 +100,7 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
         return tuple(source.units.get(name) or written_unit(name) for name in names)
 
     return replace(
-        record,
-        input=sign * record.input,
-        output=sign * record.output,
-        reference=None if record.reference is None else sign * record.reference,
+        record.each(lambda signal: sign * signal),
         input_units=units(record.input_names),
         output_units=units(record.output_names),
     )
