@@ -232,36 +232,37 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
     return np.asarray(distance * scale, dtype=np.float64)
 
 
-def distance_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
-    """min |1 + G k| over G in E at every frequency, (F,); 0 where some member puts the loop on -1. Exact."""
-    size = np.abs(loop_gain)
+def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
+    """min |1 + G k| over G in E at every frequency, (F,); 0 where some member puts the loop on -1. Exact.
+
+    k (F,): what multiplies the member, the controller with its delay; not the loop gain.
+    """
+    size = np.abs(k)
     with np.errstate(divide="ignore", invalid="ignore"):
         # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k
         # centre.
         turned = np.where(
             size > 0,
-            (1.0 + loop_gain * ellipses.centre)
-            * np.conj(loop_gain * ellipses.direction)
-            / np.where(size > 0, size, 1.0),
+            (1.0 + k * ellipses.centre) * np.conj(k * ellipses.direction) / np.where(size > 0, size, 1.0),
             1.0,
         )
     return nearest_distance(turned, size * ellipses.semi_major, size * ellipses.semi_minor)
 
 
-def scale_to_minus_one(loop_gain: Complex, ellipses: Ellipses) -> Real:
+def scale_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
     """Factor (F,) on each ellipse's axes with which it just reaches -1 with K: below 1 it covers -1, the
     deeper the smaller; inf where no size of it does (K = 0, or an axis of no length in the way)."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        turned = (1.0 + loop_gain * ellipses.centre) * np.conj(ellipses.direction) / loop_gain
+        turned = (1.0 + k * ellipses.centre) * np.conj(ellipses.direction) / k
         sides = [
             np.where(part == 0, 0.0, np.abs(part) / axis)
             for part, axis in ((turned.real, ellipses.semi_major), (turned.imag, ellipses.semi_minor))
         ]
     scale = np.hypot(*sides)
-    return np.asarray(np.where((loop_gain == 0) | np.isnan(scale), np.inf, scale), dtype=np.float64)
+    return np.asarray(np.where((k == 0) | np.isnan(scale), np.inf, scale), dtype=np.float64)
 
 
-def largest_disturbance_gain(loop_gain: Complex, ellipses: Ellipses, *, iterations: int = 60) -> Real:
+def largest_disturbance_gain(k: Complex, ellipses: Ellipses, *, iterations: int = 60) -> Real:
     """max |G / (1 + G k)| over G in E at every frequency, (F,); inf where some member puts the loop on -1.
     Exact.
 
@@ -270,7 +271,6 @@ def largest_disturbance_gain(loop_gain: Complex, ellipses: Ellipses, *, iteratio
     nearest/farthest distance from g0; h by bisection (the same lossless statement as the S-lemma of the
     design notes, without multipliers).
     """
-    k = np.asarray(loop_gain, dtype=np.complex128)
     blocked = distance_to_minus_one(k, ellipses) <= 0.0
     centre_value = np.abs(ellipses.centre) / np.maximum(np.abs(1.0 + k * ellipses.centre), 1e-300)
     upper = np.where(
