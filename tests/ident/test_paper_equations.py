@@ -53,7 +53,7 @@ HERE = Path(__file__).parent
 DT_S = 0.005
 MIXED = Poles([0.5, 0.9, -0.3], [0.8 * np.exp(0.4j), 0.95 * np.exp(2.0j)])
 Z = np.exp(1j * np.array([0.05, 0.3, 1.1, 2.0, 3.1]))
-ALGORITHMS = typing.get_args(Algorithm)
+DIRECT = [name for name in typing.get_args(Algorithm) if "DIRECT" in name]
 
 
 @dataclass(frozen=True)
@@ -595,11 +595,11 @@ def test_30_cost_of_eta_is_that_of_the_fitted_coefficients():
 
 def test_31_all_variants_of_nlopt_are_there():
     offered = {name for name in dir(nlopt) if name.startswith("GN_") and "DIRECT" in name}
-    assert offered <= set(ALGORITHMS)
-    assert {"SCIPY_DIRECT", "SCIPY_DIRECT_L"} <= set(ALGORITHMS)
+    assert offered <= set(DIRECT)
+    assert {"SCIPY_DIRECT", "SCIPY_DIRECT_L"} <= set(DIRECT)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", DIRECT)
 def test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum(algorithm):
     """(30) by (31): a well-damped pair at 20 dB, in the paper's (beta, gamma); smooth near its optimum."""
     pole = 0.8 * np.exp(0.9j)

@@ -16,7 +16,7 @@ from ident.search.direct import best_apart, minimise
 from ident.search.pole_search import PoleSearch
 from tests.ident.benchmark_plants import as_record, p1, p2
 
-ALGORITHMS = typing.get_args(Algorithm)
+DIRECT = [name for name in typing.get_args(Algorithm) if "DIRECT" in name]
 
 
 @settings(deadline=None)  # the first example may compile
@@ -63,7 +63,7 @@ def test_an_empty_box_is_refused():
         search_space(1, 1, 1000, 0.01, IdentOptions(omega_min_rad_s=1e4))
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", DIRECT)
 def test_every_variant_of_direct_finds_the_lowest_of_many_minima(algorithm):
     def cost(x):
         return np.sum((x - [0.3, 0.8]) ** 2 - 0.02 * np.cos(40 * (x - [0.3, 0.8])), axis=-1)
