@@ -144,11 +144,11 @@ def test_texts_are_not_escaped(line):
     assert render_text("test.txt.j2", name="a < b & c") == "a < b & c"
 
 
-def test_every_figure_that_a_template_names_can_be_drawn():
-    environment = shared()
+def test_templates_name_every_drawing_that_is_there_and_no_other():
+    environment, named = shared(), set()
     for template in environment.list_templates(extensions=["j2"]):
         assert environment.loader is not None
         source = environment.loader.get_source(environment, template)[0]
         source = re.sub(r"{#.*?#}", "", source, flags=re.DOTALL)
-        for name in re.findall(r'call figure\("([^"]+)"', source):
-            assert name in drawings(), f"{template}: {name}"
+        named.update(re.findall(r'call figure\("([^"]+)"', source))
+    assert named == set(drawings())
