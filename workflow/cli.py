@@ -126,7 +126,9 @@ def simulate(
 def identify(
     log: Annotated[
         list[Path],
-        typer.Argument(help="CSV (commas, one header line), npz or mat; several files are fitted together."),
+        typer.Argument(
+            help="CSV (one header line) or named arrays (npz, mat, ...); several files are fitted together."
+        ),
     ],
     input_name: Annotated[str, typer.Option("--input", help="Name of the input column.")],
     output_name: Annotated[str, typer.Option("--output", help="Name of the output column.")],

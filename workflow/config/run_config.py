@@ -79,7 +79,7 @@ class FileRecord(Section):
     """One log file; keys left out are taken from [source]."""
 
     path: InputPath = Field(
-        description="csv, npz or mat; relative to this file; ${FLEXLINK_DATA} is expanded"
+        description="csv or named arrays (npz, mat, ...); relative to this file; ${FLEXLINK_DATA} is expanded"
     )
     name: Name | None = Field(None, description="default: the file name without its ending")
     role: Role = "estimation"
