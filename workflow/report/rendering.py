@@ -60,7 +60,10 @@ def render_page(
 
 
 def embedded(name: str, label: str, picture: Picture) -> Markup:
-    """The picture inside the page: SVG elements with ids of their own, or a base64 image."""
+    """The picture inside the page: SVG elements with ids of their own, or a base64 image.
+
+    name: its file's, unlike any other on the page; begins those ids. label: plain text, read in its place.
+    """
     label = html.escape(label, quote=True)
     if picture.kind == "svg":
         return Markup(inline_svg(picture.content, f"{name}-", label))

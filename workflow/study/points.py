@@ -66,7 +66,13 @@ class Point:
 
 
 def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
-    """The base with the study's `changes` and seed applied. Raises InputError."""
+    """What the study starts from, with its `changes` and seed applied.
+
+    base: None, the built-in configuration; a file, that one; a directory, the configuration of a run whose
+    records, model and ellipses the points take over. study_path: file that paths in the changes are relative
+    to. Raises InputError: a file that cannot be read, changes that contradict the rest, or a run without
+    one of those stages.
+    """
     run: RunDirectory | None = None
     if base is None:
         config, _ = built_in_config()
@@ -74,7 +80,7 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
         run = RunDirectory.open(base)
         config = config_of(run)
         for stage in PLANT_STAGES:
-            run.stage_digest(stage.name)
+            run.stage_digest(stage.name)  # says which one is missing
     else:
         config, _ = load_config(base)
     # The points share the processors already, and a Dask worker may start no processes of its own.

@@ -22,7 +22,7 @@ UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
 
 @dataclass(frozen=True, eq=False)
 class SimulatedExperiment:
-    """A record as measured, and the outputs (T, Y) before sensor effects and noise."""
+    """A record as measured, and the outputs (T, 2), hub and tip, before sensor effects and noise."""
 
     record: Record
     noise_free_output: npt.NDArray[np.float64]
@@ -36,8 +36,12 @@ def rig_of(source: SimulatedSource) -> Rig:
 
 
 def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> SimulatedExperiment:
-    """Run one experiment; excitation and sensor noise have streams of their own, keyed by the record's
-    name."""
+    """Run one experiment on the rig with the effects of the source.
+
+    The record has the commanded voltage, and hub angle (in encoder steps) and tip position as measured, from
+    rest. Excitation and sensor noise have random streams of their own, keyed by the record's name: a record
+    stays as it is when others come or go.
+    """
     rig = rig_of(source)
     voltage = entry.excitation.signal(rig.sampling.dt_s, stage_rng(seed, "records", entry.name, "excitation"))
     trajectory = simulate(

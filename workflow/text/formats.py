@@ -93,7 +93,7 @@ def degrees(radians: float) -> float:
 
 
 def decibels(factor: float) -> str:
-    """A gain factor with its dB."""
+    """A gain factor with its dB; as a gain margin, inf sets no upper limit and 0 no lower one."""
     if math.isinf(factor):
         return "unlimited"
     return f"{number(factor)} ({20 * math.log10(factor):+.1f} dB)" if factor > 0 else "no lower limit"
