@@ -15,7 +15,7 @@ import pytest
 
 from tests.workflow.test_figures import panels
 from validation.paper import command
-from validation.paper.command import DRAWERS, OWN_FILES, PAGE, redraw_paper, write_all
+from validation.paper.command import DRAWERS, PAGE, redraw_paper
 from validation.paper.experiments import run_experiments
 from validation.paper.findings import findings_of
 from validation.paper.methods import METHODS
@@ -23,7 +23,6 @@ from validation.paper.page import headlines_of, page_html
 from validation.paper.quotes import OPEN_CHOICES, REPORTED
 from validation.paper.settings import PaperSettings
 from validation.paper.table import csv_text, rows_of
-from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.figures import style
 
@@ -170,7 +169,7 @@ def test_terminal_shows_one_line_a_figure(flexlink, ready, tmp_path):
 def test_a_directory_with_something_in_it_is_refused_at_once(refused, monkeypatch, tmp_path):
     monkeypatch.setattr(command, "run_experiments", lambda *_: pytest.fail("computed before looking"))
     (tmp_path / "notes.txt").write_text("mine")
-    assert "not empty" in refused("paper", "--out", tmp_path)
+    assert "no redrawn paper" in refused("paper", "--out", tmp_path)
     assert "no redrawn paper" in refused("paper", "--out", tmp_path, "--replace")
     assert "not a directory" in refused("paper", "--out", tmp_path / "notes.txt")
     assert os.listdir(tmp_path) == ["notes.txt"]
@@ -194,16 +193,6 @@ def test_an_empty_directory_is_filled(flexlink, ready, tmp_path):
     assert PAGE in os.listdir(tmp_path)
 
 
-def test_nothing_is_left_when_the_disk_refuses(monkeypatch, tmp_path):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("workflow.engine.storage.os.fsync", full)
-    with pytest.raises(InputError, match="No space left"):
-        write_all(tmp_path / "paper", {PAGE: b"x"})
-    assert os.listdir(tmp_path) == []
-
-
 def test_an_interrupted_computation_leaves_nothing(monkeypatch, tmp_path):
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -214,25 +203,25 @@ def test_an_interrupted_computation_leaves_nothing(monkeypatch, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_the_page_comes_last(tmp_path):
-    """In a directory that was there files are exchanged one by one; until the last there is no page."""
+def test_a_full_disk_leaves_no_page_and_the_next_call_begins_afresh(flexlink, ready, monkeypatch, tmp_path):
+    """The page goes first and comes last: none ever stands over other figures."""
     out = tmp_path / "paper"
-    out.mkdir()
-    write_all(out, dict.fromkeys(OWN_FILES, b"old"))
-    seen = []
-    real = os.replace
+    assert flexlink("paper", "--out", out).code == 0
+    real, seen = os.replace, []
 
-    def watched(source, target):
-        if str(target).startswith(str(out)):
-            seen.append((os.path.basename(target), (out / PAGE).exists()))
+    def full(source, target):
+        seen.append((out / PAGE).exists())
+        if os.fspath(target).endswith(PAGE):
+            raise OSError(28, "No space left on device")
         real(source, target)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("validation.paper.command.os.replace", watched)
-        write_all(out, dict.fromkeys(OWN_FILES, b"new"))
-    assert [name for name, _ in seen][-1] == PAGE
-    assert not any(page_there for _, page_there in seen)
-    assert {path.read_bytes() for path in out.iterdir()} == {b"new"}
+    with monkeypatch.context() as patch:
+        patch.setattr("workflow.engine.storage.os.replace", full)
+        assert "No space left" in flexlink("paper", "--out", out, "--replace").err
+    assert len(seen) == 10
+    assert not any(seen)
+    assert PAGE not in os.listdir(out)
+    assert flexlink("paper", "--out", out).code == 0
 
 
 @pytest.mark.parametrize("change", [{"seed": -1}, {"repeats": 0}, {"evaluations": 5}, {"grids": ()}])

@@ -1,10 +1,8 @@
-"""`flexlink paper`: compute, draw, and write the whole directory or nothing."""
+"""`flexlink paper`: compute, draw, and only then write."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -31,18 +29,25 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import package_versions
+from workflow.engine.store import Store
 from workflow.figures.style import render
 from workflow.tasks.summary import Row, RunSummary, Section
 
 PAGE = "paper.html"
 TABLE_CSV, TABLE_JSON = "table.csv", "table.json"
-# All that this command ever writes, the page last: only these are removed by --replace.
-OWN_FILES = (
-    *(f"figure-{item.number}.{kind}" for item in REPORTED for kind in ("svg", "png")),
-    TABLE_CSV,
-    TABLE_JSON,
-    PAGE,
-)
+
+
+class PaperDirectory(Store):
+    """Figures, tables and, last, the page: only these are removed by --replace."""
+
+    what = "redrawn paper"
+    manifest_name = PAGE
+    own_files = (
+        *(f"figure-{item.number}.{kind}" for item in REPORTED for kind in ("svg", "png")),
+        TABLE_CSV,
+        TABLE_JSON,
+    )
+
 
 DRAWERS: Mapping[int, Callable[[PaperResults], Figure]] = {
     1: lambda results: draw_surface(results.surface),
@@ -64,12 +69,13 @@ def redraw_paper(
 ) -> RunSummary:
     """Redraw Figs. 1-7 into `out`, new or empty: paper.html, figure-N.svg, table.csv, table.json.
 
-    Nothing is written before everything is computed and drawn; then each file appears whole, the page last.
-    With `replace` the files of an earlier call are exchanged, and nothing else is touched. Raises InputError
-    when `out` cannot be written or is not empty.
+    Nothing is written before everything is computed and drawn; then each file appears whole, the page last:
+    no page ever stands over other figures. With `replace` the files of an earlier call are exchanged, and
+    nothing else is touched. Raises InputError when `out` cannot be written or holds something.
     """
-    settings, progress, out = settings or PaperSettings(), progress or Silence(), Path(out)
-    check_free(out, replace=replace)
+    settings, progress, store = settings or PaperSettings(), progress or Silence(), PaperDirectory(Path(out))
+    if store.refuse_unless_free(replace=True) and not replace:
+        raise InputError(f"{out}: not empty, a redrawn paper is there; choose another --out or --replace it")
     progress.plan(STAGES)
     results = run_experiments(settings, progress)
     progress.start("page")
@@ -96,66 +102,16 @@ def redraw_paper(
         ],
         "rows": [asdict(row) for row in rows],
     }
-    files = {f"figure-{number}.{picture.kind}": picture.content for number, picture in pictures.items()}
-    files[TABLE_CSV] = csv_text(rows).encode("utf-8")
+    page = page_html(results, pictures, findings, rows)
+    store.prepare(replace=True)
+    for number, picture in pictures.items():
+        storage.write_bytes(store.path / f"figure-{number}.{picture.kind}", picture.content)
+    storage.write_text(store.path / TABLE_CSV, csv_text(rows))
     text = json.dumps(storage.strict_json(document), allow_nan=False, ensure_ascii=False, indent=1)
-    files[TABLE_JSON] = f"{text}\n".encode()
-    files[PAGE] = page_html(results, pictures, findings, rows).encode("utf-8")
-    write_all(out, files)
+    storage.write_text(store.path / TABLE_JSON, f"{text}\n")
+    storage.write_text(store.manifest_path, page)
     progress.finish("page", time.monotonic() - started, taken_up=False)
-    return _summary(out, document)
-
-
-def check_free(out: Path, *, replace: bool) -> None:
-    """Refuse what cannot be written or is not empty; with `replace`, what holds no page of ours."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"cannot write {out}: it is not a directory")
-    held = _held(out)
-    strangers = sorted(held - set(OWN_FILES))
-    if held and not replace:
-        raise InputError(
-            f"{out}: not empty (it holds {min(held)!r}); choose another --out, or --replace an earlier page"
-        )
-    if strangers and PAGE not in held:
-        raise InputError(
-            f"{out}: no redrawn paper is there (it holds {strangers[0]!r}); choose another --out"
-        )
-    ancestor = out.absolute()
-    while not ancestor.exists():
-        ancestor = ancestor.parent
-    storage.check_writable(ancestor / "trial")
-
-
-def _held(out: Path) -> set[str]:
-    try:
-        names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
-    except OSError as error:
-        raise InputError(f"cannot read {out}: {error.strerror or error}") from error
-    return {name for name in names if not name.endswith(storage.TEMPORARY_SUFFIX)}
-
-
-def write_all(out: Path, files: Mapping[str, bytes]) -> None:
-    """All files or none: written and flushed in a directory beside `out`, then moved over, the page last."""
-    beside = out.absolute().parent
-    staging = beside / f".{out.absolute().name}.{os.getpid()}{storage.TEMPORARY_SUFFIX}"
-    try:
-        beside.mkdir(parents=True, exist_ok=True)
-        staging.mkdir()
-        try:
-            for name, content in files.items():
-                storage.write_bytes(staging / name, content)
-            if not out.exists():
-                os.rename(staging, out)
-                return
-            # The old page goes first and the new one comes last: no page ever stands over other figures.
-            for name in reversed(OWN_FILES):
-                (out / name).unlink(missing_ok=True)
-            for name in files:
-                os.replace(staging / name, out / name)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-    except OSError as error:
-        raise InputError(f"cannot write {out}: {error.strerror or error}") from error
+    return _summary(store.path, document)
 
 
 def _summary(out: Path, document: Mapping[str, Any]) -> RunSummary:
