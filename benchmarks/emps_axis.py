@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.signal import butter, filtfilt
 
+from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
-
-Real = npt.NDArray[np.float64]
 
 DT_S = 1e-3
 FORCE_PER_VOLT_N = 35.15065188
@@ -34,43 +32,6 @@ PERIOD, FIRST = 6240, 200
 # Share of the output's RMS that a rigid axis with friction may miss of a real one.
 MODEL_ERROR = 0.1
 _RUN_IN, _SUBSTEPS = 400, 4
-# Values below stand for "no such effect".
-_NEUTRAL = {
-    "coulomb": 0.0,
-    "static": 0.0,
-    "stribeck_velocity": 1.0,
-    "offset": 0.0,
-    "asymmetry": 0.0,
-    "quadratic": 0.0,
-    "spring": 0.0,
-    "cubic": 0.0,
-    "gain": 1.0,
-    "delay": 0.0,
-    "lag": 0.0,
-    "dead_zone": 0.0,
-    "limit": LIMIT_V,
-    "encoder": 0.0,
-}
-# effect -> parameter -> name in the list above
-_MEANING = {
-    "coulomb_friction": {"force_N": "coulomb"},
-    "constant_offset": {"force_N": "offset"},
-    "stribeck_friction": {
-        "static_N": "static",
-        "coulomb_share": "coulomb",
-        "velocity_m_s": "stribeck_velocity",
-    },
-    "viscous_asymmetry": {"coefficient_Ns_m": "asymmetry"},
-    "quadratic_friction": {"coefficient_Ns2_m2": "quadratic"},
-    "cable_spring": {"stiffness_N_m": "spring"},
-    "hardening_spring": {"cubic_N_m3": "cubic"},
-    "actuator_gain": {"relative_error": "gain"},
-    "input_delay": {"delay_s": "delay"},
-    "actuator_lag": {"time_constant_s": "lag"},
-    "actuator_dead_zone": {"width_V": "dead_zone"},
-    "actuator_saturation": {"limit_V": "limit"},
-    "encoder_quantisation": {"step_m": "encoder"},
-}
 
 
 def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
@@ -80,7 +41,7 @@ def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
     shapes of the viscous friction.
     """
     P = EffectParameter
-    friction = P("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear"), P("velocity_m_s", 1e-3, 0.1)
+    friction = SHARE, P("velocity_m_s", 1e-3, 0.1)
     found = [
         PlantEffect("coulomb_friction", (P("force_N", 1e-2, 150.0),), dependence="continuous"),
         PlantEffect("constant_offset", (P("force_N", 1e-2, 100.0),), signed=True, dependence="continuous"),
@@ -111,26 +72,30 @@ def simulate(
     parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
 ) -> Real:
     """Reference position (T, 1) -> motor force (T, 1), after a run-in at the reference's first speed."""
-    values = dict(_NEUTRAL)
-    for effect, given in effects.items():
-        for key, value in given.items():
-            name = _MEANING[effect][key]
-            if name == "gain":
-                value += 1.0
-            elif key == "coulomb_share":
-                value *= given["static_N"]
-            # Dry friction adds up when two laws of it are tried together.
-            values[name] = value + (values[name] if name in ("coulomb", "static") else 0.0)
-    if "coulomb_friction" in effects and "stribeck_friction" in effects:
-        values["static"] += effects["coulomb_friction"]["force_N"]
-    values["static"] = max(values["static"], values["coulomb"])
+    value = given(effects)
+    # Dry friction adds up when two laws of it are tried together.
+    coulomb = value("coulomb_friction", "force_N")
+    stribeck = value("stribeck_friction", "static_N")
     reference = inputs[:, 0]
     before = reference[0] - (reference[1] - reference[0]) * np.arange(_RUN_IN, 0, -1)
     force = _run(
         np.concatenate([before, reference]),
         parameters["mass_kg"],
         parameters["viscous_Ns_m"],
-        *(float(values[name]) for name in _NEUTRAL),
+        coulomb + value("stribeck_friction", "coulomb_share") * stribeck,
+        coulomb + stribeck,
+        value("stribeck_friction", "velocity_m_s", 1.0),
+        value("constant_offset", "force_N"),
+        value("viscous_asymmetry", "coefficient_Ns_m"),
+        value("quadratic_friction", "coefficient_Ns2_m2"),
+        value("cable_spring", "stiffness_N_m"),
+        value("hardening_spring", "cubic_N_m3"),
+        1 + value("actuator_gain", "relative_error"),
+        value("input_delay", "delay_s"),
+        value("actuator_lag", "time_constant_s"),
+        value("actuator_dead_zone", "width_V"),
+        value("actuator_saturation", "limit_V", LIMIT_V),
+        value("encoder_quantisation", "step_m"),
     )
     return np.asarray(force[_RUN_IN:, None])
 
@@ -163,20 +128,16 @@ def _run(
     q = reference[0] - v / POSITION_GAIN
     seen1 = q - v * DT_S
     seen2 = q - 2 * v * DT_S
-    pull, whole = 0.0, int(delay / DT_S)
-    part = delay / DT_S - whole
+    pull = 0.0
     for k in range(T):
         seen = q if encoder <= 0.0 else encoder * np.round(q / encoder)
         volts = VELOCITY_GAIN * (POSITION_GAIN * (reference[k] - seen) - (seen - seen2) / (2 * DT_S))
         seen2, seen1 = seen1, seen
         volts = min(max(volts, -limit), limit)
         force[k] = FORCE_PER_VOLT_N * volts
-        late = (1 - part) * force[max(k - whole, 0)] + part * force[max(k - whole - 1, 0)]
-        dead = dead_zone * FORCE_PER_VOLT_N
-        late = gain * np.sign(late) * max(abs(late) - dead, 0.0)
+        late = gain * late_value(force, k, delay / DT_S, dead_zone * FORCE_PER_VOLT_N)
         for _ in range(_SUBSTEPS):
-            # Exact step of the lag towards the held force.
-            pull = late if lag <= 0.0 else late + (pull - late) * np.exp(-h / lag)
+            pull = lagged(pull, late, h, lag)
             level = coulomb + (static - coulomb) * np.exp(-abs(v) / stribeck_velocity)
             side = viscous + (asymmetry if v > 0 else -asymmetry)
             free = v + h / mass * (pull - offset - spring * q - cubic * q**3 - quadratic * v * abs(v))
@@ -193,36 +154,27 @@ def forces(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, f
     Effects of the actuator are inverted: the force of the record is the one commanded.
     """
     q, v, a = inputs.T
-    force = parameters["mass_kg"] * a + parameters["viscous_Ns_m"] * v
-    for effect in effects:
-        given = effects[effect]
-        if effect == "coulomb_friction":
-            force = force + given["force_N"] * np.sign(v)
-        elif effect == "constant_offset":
-            force = force + given["force_N"]
-        elif effect == "stribeck_friction":
-            share, speed = given["coulomb_share"], given["velocity_m_s"]
-            force = force + given["static_N"] * np.sign(v) * (
-                share + (1 - share) * np.exp(-np.abs(v) / speed)
-            )
-        elif effect == "viscous_asymmetry":
-            force = force + given["coefficient_Ns_m"] * np.abs(v)
-        elif effect == "quadratic_friction":
-            force = force + given["coefficient_Ns2_m2"] * v * np.abs(v)
-        elif effect == "cable_spring":
-            force = force + given["stiffness_N_m"] * q
-        elif effect == "hardening_spring":
-            force = force + given["cubic_N_m3"] * q**3
+    value = given(effects)
+    share, speed = (
+        value("stribeck_friction", "coulomb_share"),
+        value("stribeck_friction", "velocity_m_s", 1.0),
+    )
+    stribeck = value("stribeck_friction", "static_N") * (share + (1 - share) * np.exp(-np.abs(v) / speed))
+    force = (
+        parameters["mass_kg"] * a
+        + parameters["viscous_Ns_m"] * v
+        + (value("coulomb_friction", "force_N") + stribeck) * np.sign(v)
+        + value("constant_offset", "force_N")
+        + value("viscous_asymmetry", "coefficient_Ns_m") * np.abs(v)
+        + value("quadratic_friction", "coefficient_Ns2_m2") * v * np.abs(v)
+        + value("cable_spring", "stiffness_N_m") * q
+        + value("hardening_spring", "cubic_N_m3") * q**3
+    )
     t = np.arange(q.size) * DT_S
-    if "input_delay" in effects:
-        force = np.interp(t + effects["input_delay"]["delay_s"], t, force)
-    if "actuator_lag" in effects:
-        force = force + effects["actuator_lag"]["time_constant_s"] * np.gradient(force, DT_S)
-    if "actuator_dead_zone" in effects:
-        force = force + effects["actuator_dead_zone"]["width_V"] * FORCE_PER_VOLT_N * np.sign(force)
-    if "actuator_gain" in effects:
-        force = force / (1 + effects["actuator_gain"]["relative_error"])
-    return np.asarray(force[:, None])
+    force = np.interp(t + value("input_delay", "delay_s"), t, force)
+    force = force + value("actuator_lag", "time_constant_s") * np.gradient(force, DT_S)
+    force = force + value("actuator_dead_zone", "width_V") * FORCE_PER_VOLT_N * np.sign(force)
+    return np.asarray(force[:, None] / (1 + value("actuator_gain", "relative_error")))
 
 
 def record(folder: Path) -> Real:

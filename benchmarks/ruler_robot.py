@@ -14,14 +14,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
+from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-
-Real = npt.NDArray[np.float64]
 
 DT_S, SUBSTEPS = 0.002, 1
 # A spring that pushes away makes the arm unstable: such a fit has to end somewhere finite.
@@ -43,7 +41,7 @@ GUESS = {
 
 def effects() -> tuple[PlantEffect, ...]:
     P = EffectParameter
-    dry = P("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear"), P("velocity_counts_s", 1.0, 1000.0)
+    dry = SHARE, P("velocity_counts_s", 1.0, 1000.0)
     return (
         PlantEffect("coulomb_friction", (P("drive_counts", 0.01, 40.0),), dependence="continuous"),
         PlantEffect("stribeck_friction", (P("static_counts", 0.01, 60.0), *dry), dependence="continuous"),
@@ -65,9 +63,7 @@ def simulate(
 ) -> Real:
     """Reference (T, 1) -> theta (T, 1), both in counts, from rest."""
 
-    def value(effect: str, parameter: str, without: float = 0.0) -> float:
-        return float(effects[effect][parameter]) if effect in effects else without
-
+    value = given(effects)
     static = value("stribeck_friction", "static_counts")
     coulomb = value("coulomb_friction", "drive_counts")
     A, B = state_space(parameters)
@@ -127,16 +123,13 @@ def _run(
     h = DT_S / SUBSTEPS
     theta, command = np.zeros(T), np.zeros(T)
     x, y = np.zeros(6), np.zeros(6)
-    whole = int(delay / DT_S)
-    part = delay / DT_S - whole
     pull = 0.0
     for k in range(T):
         theta[k] = x[0] + angle_offset
         command[k] = min(max(reference[k] - theta[k], -limit), limit)
-        late = (1 - part) * command[max(k - whole, 0)] + part * command[max(k - whole - 1, 0)]
-        late = np.sign(late) * max(abs(late) - dead_zone, 0.0)
+        late = late_value(command, k, delay / DT_S, dead_zone)
         for _ in range(SUBSTEPS):
-            pull = late if lag <= 0.0 else late + (pull - late) * np.exp(-h / lag)
+            pull = lagged(pull, late, h, lag)
             drive = pull + offset - quadratic * x[3] * abs(x[3]) / 100 - cubic * (x[0] / 10) ** 3
             free = B[3] * drive
             for c in range(6):

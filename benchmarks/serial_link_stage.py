@@ -12,14 +12,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-
-Real = npt.NDArray[np.float64]
 
 DT_S, PERIOD, SUBSTEPS = 0.002, 5000, 2
 LIMIT_A, FILTER_RAD_S = 0.94, 150.0
@@ -55,7 +53,7 @@ TOLERANCES = {
 
 def effects() -> tuple[PlantEffect, ...]:
     P = EffectParameter
-    dry = P("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear"), P("velocity_rad_s", 1e-3, 1.0)
+    dry = SHARE, P("velocity_rad_s", 1e-3, 1.0)
     return (
         PlantEffect("coulomb_friction", (P("current_A", 1e-4, 0.5),), dependence="continuous"),
         PlantEffect("stribeck_friction", (P("static_A", 1e-4, 0.8), *dry), dependence="continuous"),
@@ -79,9 +77,7 @@ def simulation(gains: Real):
     def simulate(
         parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
     ) -> Real:
-        def value(effect: str, parameter: str, without: float = 0.0) -> float:
-            return float(effects[effect][parameter]) if effect in effects else without
-
+        value = given(effects)
         coulomb = value("coulomb_friction", "current_A")
         static = value("stribeck_friction", "static_A")
         steady = coulomb + static * value("stribeck_friction", "coulomb_share")
@@ -158,8 +154,6 @@ def _run(
     x[0] = start
     keep = np.exp(-FILTER_RAD_S * DT_S)
     last0, last1, speed0, speed1 = start, strain_offset, 0.0, 0.0
-    whole = int(delay / DT_S)
-    part = delay / DT_S - whole
     pull = gains[0] * (reference[0] - start)
     for k in range(T):
         theta, alpha = x[0], strain_gain * x[1] + strain_offset
@@ -169,10 +163,9 @@ def _run(
         last0, last1 = theta, alpha
         i = gains[0] * (reference[k] - theta) - gains[1] * alpha - gains[2] * speed0 - gains[3] * speed1
         command[k] = min(max(i, -LIMIT_A), LIMIT_A)
-        late = (1 - part) * command[max(k - whole, 0)] + part * command[max(k - whole - 1, 0)]
-        late = np.sign(late) * max(abs(late) - dead_zone, 0.0)
+        late = late_value(command, k, delay / DT_S, dead_zone)
         for _ in range(SUBSTEPS):
-            pull = late if lag <= 0.0 else late + (pull - late) * np.exp(-h / lag)
+            pull = lagged(pull, late, h, lag)
             drive = pull + offset - cubic * x[0] ** 3
             free = A[2, 0] * x[0] + A[2, 1] * x[1] + A[2, 2] * x[2] + A[2, 3] * x[3] + B[2, 0] * drive
             free += B[2, 1] * outside[k]

@@ -15,12 +15,14 @@ from plant.effects import parse_effects
 from plant.rig import Rig
 from plant.simulate import simulate
 from validation.blind.cases import NOT_TOGETHER, SHARES, schedule
-from validation.blind.generate import answer_toml, folder_hash, generate, refuse_filled
-from validation.blind.protocol import diagnose_in_process, run_blind
+from validation.blind.generate import answer_toml, folder_hash, generate
+from validation.blind.protocol import run_blind
 from validation.blind.rigs import TOLERANCES, draw_rig, draw_tolerances, rig_toml, stated
 from validation.blind.seal import COMMITMENT, close_seal, open_seal
 from validation.blind.truth import LISTED, UNLISTED
+from validation.blind.worker import BlindCase
 from workflow.engine.errors import InputError
+from workflow.engine.executor import LocalProcesses
 from workflow.engine.storage import read_json
 
 LABELS = [{"case": "a", "verdict": "none", "size": 0.1}, {"case": "b", "verdict": "effect", "size": 2.0}]
@@ -135,8 +137,6 @@ def test_generated_cases_hold_what_their_answers_say(tmp_path):
             assert rms < slack * answer["pooled_gap"][f"{role}_gap_after_oracle"]
     again = generate(5, 5, tmp_path / "again", finished={a["case"]: a for a in answers[:-1]})
     assert again == [*answers[:-1], {**answers[-1], "sha256": again[-1]["sha256"]}]
-    with pytest.raises(InputError, match="is not empty"):
-        refuse_filled(tmp_path / "open")
 
 
 def _noise(rig):
@@ -167,9 +167,9 @@ def finished_run(tmp_path_factory):
     return out
 
 
-def _says_none(folder, sealed):
+def _says_none(folder):
     assert not list(folder.rglob("answer*"))
-    assert sealed not in folder.parents
+    assert "run" not in folder.parts
     return {
         "case": folder.name,
         "verdict": "none",
@@ -193,7 +193,7 @@ def test_a_run_leaves_scores_and_a_verified_seal(finished_run):
 
 @pytest.mark.slow
 def test_a_finished_run_resumes_without_a_diagnosis_and_only_as_itself(finished_run):
-    def never(folder, sealed):
+    def never(folder):
         raise AssertionError("everything is there")
 
     before = (finished_run / "scores.json").read_bytes()
@@ -228,7 +228,7 @@ def test_bad_requests_are_one_line(tmp_path):
         run_blind(1, 1, tmp_path / "a", resume=True)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    with pytest.raises(InputError, match="is not empty"):
+    with pytest.raises(InputError, match="holds 'file'"):
         run_blind(1, 1, tmp_path / "full")
     assert not (tmp_path / "a").exists()
 
@@ -256,11 +256,12 @@ def test_the_diagnosing_process_cannot_reach_the_labels(tmp_path):
     assert done.stdout.count("refused") == 7, done.stdout
 
 
-def test_a_process_that_fails_counts_as_a_wrong_answer(tmp_path):
+def test_a_diagnosis_that_fails_counts_as_a_wrong_answer(tmp_path):
     folder = tmp_path / "case_0001"
     folder.mkdir()
     (folder / "case.toml").write_text("case = 3\n")
-    document = diagnose_in_process(folder, tmp_path / "sealed")
+    with LocalProcesses(1) as processes:
+        ((_, document),) = processes.run([BlindCase(folder, tmp_path / "sealed")])
     assert document["verdict"] == "failed"
     assert "case.toml" in document["reason"]
 

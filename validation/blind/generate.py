@@ -7,22 +7,20 @@ writes open cases for development: DIR/<case>/answer.toml and rig_exact.toml lie
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import tomlkit
+import typer
 
 from validation.blind.cases import SIMULATORS, BlindCase, Simulator, Sort, make_case, schedule
-from validation.blind.exudyn_truth import load_exudyn
 from validation.blind.rigs import rig_toml
-from workflow.engine.errors import InputError
 from workflow.engine.storage import write_text
 
 Answer = dict[str, Any]
@@ -113,12 +111,6 @@ def generate(
     finished: answers of cases that are there already (case name -> answer) and are not drawn again.
     keep: called with every answer as soon as its case is written.
     """
-    if n_cases < 1 or seed < 0 or jobs < 1:
-        raise InputError(
-            f"cases and jobs must be at least 1, the seed at least 0; got {n_cases}, {jobs}, {seed}"
-        )
-    if simulator == "exudyn":
-        load_exudyn()
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
     work = partial(_one, seed, out, open_cases, simulator)
@@ -139,36 +131,20 @@ def generate(
     return [answers[name] for name in sorted(answers)]
 
 
-def refuse_filled(out: Path) -> None:
-    """Raises InputError where `out` already holds something."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is not a directory")
-    if out.is_dir() and any(out.iterdir()):
-        raise InputError(f"{out} is not empty: cases need a directory of their own")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--cases", type=int, required=True)
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--simulator", choices=SIMULATORS, default="ritz")
-    parser.add_argument("--open", action="store_true", help="write answers and exact rigs beside the records")
-    given = parser.parse_args()
-    try:
-        refuse_filled(given.out)
-        generate(
-            given.cases,
-            given.seed,
-            given.out,
-            jobs=given.jobs,
-            open_cases=given.open,
-            simulator=given.simulator,
-        )
-    except InputError as error:
-        parser.exit(2, f"{error}\n")
+def main(
+    cases: Annotated[int, typer.Option(min=1)],
+    seed: Annotated[int, typer.Option(min=0)],
+    out: Annotated[Path, typer.Option(help="Directory, new or empty.")],
+    jobs: Annotated[int, typer.Option(min=1)] = 1,
+    simulator: Annotated[str, typer.Option(help=f"One of {', '.join(SIMULATORS)}.")] = "ritz",
+    open_cases: Annotated[
+        bool, typer.Option("--open", help="Write answers and exact rigs beside the records.")
+    ] = False,
+) -> None:
+    if simulator not in SIMULATORS or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
+        raise typer.BadParameter(f"need one of {', '.join(SIMULATORS)} and an empty directory")
+    generate(cases, seed, out, jobs=jobs, simulator=simulator, open_cases=open_cases)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -68,6 +68,20 @@ class Physics(NamedTuple):
     sensor_lag: float
 
 
+class Link(NamedTuple):
+    """Coupling (4, R) of the bodies to the free angles, and the link as in `beam.LinkBasis`.
+
+    lumps (G + 1,): mass at the Gauss points and at the tip; weights (G,).
+    """
+
+    couple: Real
+    angle: Real
+    integral: Real
+    lumps: Real
+    weights: Real
+    stiffness: Real
+
+
 @numba.njit(cache=True)
 def _level(p: Physics, speed: float) -> float:
     fall = np.exp(-abs(speed) / p.stribeck_velocity)
@@ -94,13 +108,8 @@ def _stribeck(p: Physics, stretch: float, speed: float) -> float:
 @numba.njit(cache=True)
 def _accelerations(
     p: Physics,
-    couple: Real,
-    angle: Real,
+    link: Link,
     arms: Real,
-    integral: Real,
-    lumps: Real,
-    weights: Real,
-    stiffness: Real,
     q: Real,
     v: Real,
     current: float,
@@ -113,6 +122,7 @@ def _accelerations(
     a: Real,
 ) -> float:
     """Fill a with the accelerations; returns the derivative of the motor current."""
+    couple, angle, integral, lumps, weights, stiffness = link
     G, n = angle.shape
     R = couple.shape[1]
     size = R + n
@@ -259,8 +269,9 @@ def _accelerations(
 
 
 @numba.njit(cache=True)
-def _outputs(p: Physics, couple: Real, angle: Real, integral: Real, q: Real) -> tuple[float, float]:
+def _outputs(p: Physics, link: Link, q: Real) -> tuple[float, float]:
     """Hub angle as an encoder sees it, and (r + L) theta + deflection across the turned hub axis."""
+    couple, angle, integral, _, _, _ = link
     G, n = angle.shape
     R = couple.shape[1]
     base, hub, root = 0.0, 0.0, 0.0
@@ -283,12 +294,7 @@ def _outputs(p: Physics, couple: Real, angle: Real, integral: Real, q: Real) -> 
 @numba.njit(cache=True)
 def run(
     p: Physics,
-    couple: Real,
-    angle: Real,
-    integral: Real,
-    lumps: Real,
-    weights: Real,
-    stiffness: Real,
+    link: Link,
     acting: Real,
     commanded: Real,
     late_s: float,
@@ -308,6 +314,7 @@ def run(
     are filled in on the way: the command of row k + 1 is computed from the noisy hub angle of row k.
     static: (gain, dead zone, limit, cubic part). Returns whether everything stayed finite and within a turn.
     """
+    couple, angle, integral, _, _, _ = link
     G, n = angle.shape
     R = couple.shape[1]
     size = R + n
@@ -329,7 +336,7 @@ def run(
     fractions = np.array([0.0, 0.5, 0.5, 1.0])
     T = commanded.size
     for k in range(T):
-        hub, tip = _outputs(p, couple, angle, integral, q)
+        hub, tip = _outputs(p, link, q)
         if not (abs(hub) < 7.0 and abs(tip) < 50.0):
             return False
         outputs[k, 0] = hub
@@ -377,13 +384,8 @@ def run(
                         kq[stage, i] = v_stage[i]
                     ki[stage] = _accelerations(
                         p,
-                        couple,
-                        angle,
+                        link,
                         arms,
-                        integral,
-                        lumps,
-                        weights,
-                        stiffness,
                         q_stage,
                         v_stage,
                         amps,
@@ -412,7 +414,7 @@ def run(
                     dry[1] = _stribeck(p, dry[1] + turned, slip)
                 if p.sensor_lag > 0.0:
                     # Exact for a tip that moves linearly over the substep.
-                    _, now = _outputs(p, couple, angle, integral, q)
+                    _, now = _outputs(p, link, q)
                     slope = (now - tip) / step
                     decay = np.exp(-step / p.sensor_lag)
                     seen_tip = now - slope * p.sensor_lag + (seen_tip - tip + slope * p.sensor_lag) * decay

@@ -12,19 +12,14 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import workflow
 from validation.blind.cases import SIMULATORS, SORTS, Simulator, Sort
 from validation.blind.exudyn_truth import load_exudyn
-from validation.blind.generate import Answer, folder_hash, generate, refuse_filled
+from validation.blind.generate import Answer, folder_hash, generate
 from validation.blind.report import confusion_figure, summary, text
 from validation.blind.scores import scores
 from validation.blind.seal import (
@@ -35,7 +30,9 @@ from validation.blind.seal import (
     private_directory,
     write_private,
 )
-from workflow.engine.errors import InputError, one_line
+from validation.blind.worker import BlindCase, diagnose_folder
+from workflow.engine.errors import InputError
+from workflow.engine.executor import LocalProcesses
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.storage import (
     read_json,
@@ -45,14 +42,22 @@ from workflow.engine.storage import (
     write_json,
     write_text,
 )
+from workflow.engine.store import Store
 from workflow.tasks.summary import RunSummary
 
 _FORMAT = "flexlink-blind-1"
 # Expected seconds per case: they shape the progress bar only.
 _CASE_S, _DIAGNOSIS_S = 8.0, 40.0
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-Diagnose = Callable[[Path, Path], dict[str, Any]]
+Diagnose = Callable[[Path], dict[str, Any]]
+
+
+class BlindDirectory(Store):
+    """A run; what it was begun with stands in the manifest."""
+
+    what = "blind run"
+    manifest_name = "blind.json"
+    folders = ("cases", "predictions")
 
 
 def run_blind(
@@ -65,12 +70,12 @@ def run_blind(
     only: str | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-    diagnose: Diagnose | None = None,
+    diagnose: Diagnose = diagnose_folder,
 ) -> RunSummary:
     """Generate, seal, diagnose, open, score. Raises InputError, one line, for whatever was given wrongly.
 
     only: cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
-    diagnose: (case folder, directory it must keep out of) -> document; the default starts a process.
+    diagnose: case folder -> document; runs in processes that are kept out of the run's directory.
     """
     progress = progress or Silence()
     chosen = next((name for name in SIMULATORS if name == simulator), None)
@@ -87,11 +92,11 @@ def run_blind(
         raise InputError(f"--cases must be at least 1 and --seed at least 0; got {n_cases} and {seed}")
     width = jobs or os.cpu_count() or 1
     settings = {"format": _FORMAT, "cases": n_cases, "seed": seed, "simulator": simulator}
-    _begin(out, settings if sort is None else {**settings, "only": sort}, resume)
+    _begin(BlindDirectory(out), settings if sort is None else {**settings, "only": sort}, resume)
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
     _sealed_cases(out, n_cases, seed, width, chosen, sort, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
-    _predict(out, names, width, diagnose or diagnose_in_process, progress)
+    _predict(out, names, width, diagnose, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
     write_json(
         out / "predictions.json",
@@ -103,32 +108,27 @@ def run_blind(
     document["commitment"] = read_json(out / COMMITMENT)["sha256"]
     document["settings"] = read_json(out / "blind.json")
     write_text(out / "scores.json", json.dumps(strict_json(document), indent=1, allow_nan=False) + "\n")
-    write_text(out / "scores.txt", text(document))
+    write_text(out / "scores.txt", text(document["diagnosis"], document))
     write_bytes(out / "confusion.png", confusion_figure(document["diagnosis"]))
     return summary(document, out)
 
 
-def _begin(out: Path, settings: Mapping[str, Any], resume: bool) -> None:
-    manifest = out / "blind.json"
-    if manifest.is_file():
-        before = read_json(manifest)
-        if not resume:
-            raise InputError(f"{out} holds a blind run already; --resume continues it")
-        for key in {**before, **settings}:
-            begun, value = before.get(key), settings.get(key)
-            if begun != value:
-                raise InputError(
-                    f"{out}: cannot resume, the run was begun with {key} = {begun!r}, not {value!r}"
-                )
+def _begin(store: BlindDirectory, settings: Mapping[str, Any], resume: bool) -> None:
+    if store.manifest_path.is_file() != resume:
+        raise InputError(
+            f"{store.path}: "
+            + ("no blind run to resume" if resume else "a blind run is there already; --resume continues it")
+        )
+    if not store.prepare(resume=True):
+        write_json(store.manifest_path, settings)
         return
-    if resume:
-        raise InputError(f"{out} holds no blind run to resume")
-    refuse_filled(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot use {out}: {error.strerror or error}") from error
-    write_json(manifest, settings)
+    before = read_json(store.manifest_path)
+    for key in {**before, **settings}:
+        begun, value = before.get(key), settings.get(key)
+        if begun != value:
+            raise InputError(
+                f"{store.path}: cannot resume, the run was begun with {key} = {begun!r}, not {value!r}"
+            )
 
 
 def _sealed_cases(
@@ -174,56 +174,15 @@ def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, pro
     progress.start("diagnosis")
     started = time.monotonic()
     folder = out / "predictions"
-    folder.mkdir(exist_ok=True)
     todo = [name for name in names if not (folder / f"{name}.json").is_file()]
     done = len(names) - len(todo)
-
-    def one(name: str) -> tuple[str, dict[str, Any]]:
-        # Under a neutral path: not even the name of the run is known to the process.
-        with tempfile.TemporaryDirectory() as room:
-            copy = Path(room) / name
-            shutil.copytree(out / "cases" / name, copy)
-            return name, diagnose(copy, out)
-
-    pool = ThreadPoolExecutor(max(1, min(jobs, len(todo))))
-    try:
-        for name, document in pool.map(one, todo):
-            write_json(folder / f"{name}.json", document)
+    work = [BlindCase(out / "cases" / name, out.resolve(), diagnose) for name in todo]
+    with LocalProcesses(jobs, preload=["validation.blind.worker"]) as processes:
+        for index, document in processes.run(work):
+            write_json(folder / f"{todo[index]}.json", document)
             done += 1
             progress.update("diagnosis", done / len(names), f"{done} of {len(names)}")
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
     progress.finish("diagnosis", time.monotonic() - started, taken_up=not todo)
-
-
-def diagnose_in_process(folder: Path, sealed: Path) -> dict[str, Any]:
-    """A fresh interpreter gets the folder and is kept out of the run's directory.
-
-    A process that fails leaves a document with the verdict "failed": it counts as a wrong answer.
-    """
-    environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}
-    root = str(Path(workflow.__file__).resolve().parents[1])
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH")]))
-    done = subprocess.run(
-        [sys.executable, "-m", "validation.blind.worker", str(folder), "--keep-out", str(sealed.resolve())],
-        cwd=folder.parent,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode == 0:
-        document: dict[str, Any] = json.loads(done.stdout)
-        return document
-    reason = one_line(done.stderr.strip().splitlines()[-1]) if done.stderr.strip() else "no message"
-    return {
-        "case": folder.name,
-        "verdict": "failed",
-        "effects": [],
-        "combination": [],
-        "gap_after": None,
-        "reason": f"exit code {done.returncode}: {reason}",
-    }
 
 
 def _check_cases(out: Path, labels: Sequence[Answer]) -> None:

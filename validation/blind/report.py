@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from validation.blind.truth import LISTED
+from workflow.figures import style
 from workflow.tasks.summary import Row, RunSummary, Section
 from workflow.text.templates import environment
 
@@ -34,17 +36,11 @@ def cell(numbers: Mapping[str, Any]) -> str:
     return "-" if math.isnan(numbers["value"]) else f"{numbers['value']:.3f}"
 
 
-def text(document: Mapping[str, Any]) -> str:
-    """The whole of scores.json as a page of plain text."""
-    return _by_template(document["diagnosis"], document)
+def text(found: Mapping[str, Any], document: Mapping[str, Any] | None = None) -> str:
+    """One set of scores in plain text: table, counts, calibration, and every case that is wrong.
 
-
-def scores_text(found: Mapping[str, Any]) -> str:
-    """One set of scores: table, counts, calibration, and every case that is wrong."""
-    return _by_template(found, None)
-
-
-def _by_template(found: Mapping[str, Any], document: Mapping[str, Any] | None) -> str:
+    document: the whole of scores.json, whose other parts are then told as well.
+    """
     template = environment(package="validation").get_template("blind_scores.txt.j2")
     made = template.render(found=found, document=document, table=_table)
     return Markup(made).unescape().strip("\n") + "\n"
@@ -88,24 +84,19 @@ def summary(document: Mapping[str, Any], out: Path) -> RunSummary:
 
 def confusion_figure(scored: Mapping[str, Any]) -> bytes:
     """PNG: true causes against answers, counts in the cells."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    table = scored["confusion"]
+    table = pd.DataFrame.from_dict(scored["confusion"], orient="index").fillna(0)
     order = ["none", *LISTED, "unknown"]
-    rows = [name for name in order if name in table]
-    said = {name for columns in table.values() for name in columns}
-    columns = [name for name in order if name in said or name in rows] + sorted(said - set(order))
-    counts = np.array([[table[r].get(c, 0) for c in columns] for r in rows], dtype=float)
-    with mpl.rc_context({"font.family": ["DejaVu Sans"], "font.size": 8.5}):
-        figure = Figure(figsize=(2.6 + 0.33 * max(len(columns), 1), 2.2 + 0.27 * max(len(rows), 1)), dpi=140)
-        FigureCanvasAgg(figure)
+    rows = [name for name in order if name in table.index]
+    columns = [name for name in order if name in table.columns or name in rows]
+    columns += sorted(set(table.columns) - set(order))
+    counts = table.reindex(index=rows or ["none"], columns=columns or ["none"], fill_value=0).to_numpy()
+    with style.house_style():
+        figure = style.new_figure(2.2 + 0.27 * counts.shape[0], 2.6 + 0.33 * counts.shape[1])
         axes = figure.add_subplot()
-        shown = counts if counts.size else np.zeros((1, 1))
-        share = shown / np.maximum(shown.sum(axis=1, keepdims=True), 1)
+        share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1.3, aspect="auto")
-        for (i, j), n in np.ndenumerate(shown):
+        axes.grid(visible=False)
+        for (i, j), n in np.ndenumerate(counts):
             if n:
                 colour = "white" if share[i, j] > 0.6 else "black"
                 axes.text(j, i, f"{n:.0f}", ha="center", va="center", color=colour)
@@ -113,8 +104,7 @@ def confusion_figure(scored: Mapping[str, Any]) -> bytes:
         axes.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows])
         axes.set_xlabel("first answer")
         axes.set_ylabel("truth")
-        axes.set_title("Blind cases with one cause or none: truth against answer", loc="left")
-        figure.tight_layout()
+        axes.set_title("Blind cases with one cause or none: truth against answer")
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", metadata={"Software": None})
+        figure.savefig(buffer, format="png", dpi=140, metadata={"Software": None})
     return buffer.getvalue()

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from validation.blind.beam import LinkBasis, link_basis
-from validation.blind.kernel import BASE, HUB, MOTOR, ROOT, Physics, run
+from validation.blind.kernel import BASE, HUB, MOTOR, ROOT, Link, Physics, run
 
 Real = npt.NDArray[np.float64]
 RigTable = Mapping[str, Mapping[str, float]]
@@ -118,9 +118,11 @@ class Truth:
         bending = link["youngs_modulus_Pa"] * section * link["thickness_m"] ** 2 / 12 * stiffness_ratio
         line = link["density_kg_m3"] * section
         tip_mass = rig["payload"]["mass_kg"] + get("tip_payload", "mass_kg", 0.0)
-        self._basis = _basis(link["length_m"], bending, line, tip_mass)
-        self._lumps = np.append(line * self._basis.weights_m, tip_mass)
-        self._couple = _couple(set(by_name))
+        basis = _basis(link["length_m"], bending, line, tip_mass)
+        lumps = np.append(line * basis.weights_m, tip_mass)
+        self._link = Link(
+            _couple(set(by_name)), basis.angle, basis.integral, lumps, basis.weights_m, basis.stiffness
+        )
         J = hub["inertia_kg_m2"] * get("hub_inertia", "ratio", 1.0)
         backlash = "backlash" in by_name
         contact = 0.21 * J * (2 * pi * _CONTACT_HZ) ** 2
@@ -197,12 +199,10 @@ class Truth:
             reference = np.array(feedback.reference_rad)
             noise = np.zeros(commanded.size) if hub_noise_rad is None else np.array(hub_noise_rad)
             commanded[:], acting[:] = 0.0, 0.0
-        basis = self._basis
         outputs = np.zeros((commanded.size, 2))
         fine = run(
-            p, self._couple, basis.angle, basis.integral, self._lumps, basis.weights_m, basis.stiffness,
-            acting, commanded, late, self.dt_s, self.substeps, gains, static, noise, reference, whole,
-            outputs,
+            p, self._link, acting, commanded, late, self.dt_s, self.substeps, gains, static, noise,
+            reference, whole, outputs,
         )  # fmt: skip
         if not fine or not np.all(np.isfinite(outputs)):
             raise ValueError("the motion leaves every bound: the loop is unstable or the voltage too high")
@@ -242,19 +242,19 @@ class Truth:
 
     def _substeps(self) -> int:
         """Substeps per sample from the fastest eigenvalue of the machine at rest, contacts closed."""
-        p, basis, couple = self._physics, self._basis, self._couple
-        R, n = couple.shape[1], basis.stiffness.size
+        p, link, couple = self._physics, self._link, self._link.couple
+        R, n = couple.shape[1], link.stiffness.size
         size = R + n
         M, K, C = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
         shapes = np.column_stack(
-            [p.radius_m + basis.integral @ np.ones(basis.weights_m.size), basis.integral @ basis.angle]
+            [p.radius_m + link.integral @ np.ones(link.weights.size), link.integral @ link.angle]
         )
         to_link = np.zeros((1 + n, size))
         to_link[0, :R] = couple[ROOT]
         to_link[1:, R:] = np.eye(n)
-        M += to_link.T @ (shapes.T @ (self._lumps[:, None] * shapes)) @ to_link
-        K[R:, R:] += np.diag(basis.stiffness)
-        C[R:, R:] += p.kelvin_voigt_s * np.diag(basis.stiffness)
+        M += to_link.T @ (shapes.T @ (link.lumps[:, None] * shapes)) @ to_link
+        K[R:, R:] += np.diag(link.stiffness)
+        C[R:, R:] += p.kelvin_voigt_s * np.diag(link.stiffness)
 
         def spring(one: Real, other: Real, k: float, c: float) -> None:
             d = np.zeros(size)

@@ -1,21 +1,28 @@
-"""The process that diagnoses one case of the blind protocol: it knows a folder and nothing else.
+"""What diagnoses one case of the blind protocol, in a process of its own: it knows a folder and nothing else.
 
-    python -m validation.blind.worker FOLDER [--keep-out DIRECTORY] [--no-baselines]
-
-prints one JSON document. From its first line on it cannot open, list, rename or remove anything below
-DIRECTORY (the run with its sealed labels), nor start a process that could.
+From before the diagnosis on the process cannot open, list, rename or remove anything below the directory of
+the run with its sealed labels, nor start a process that could.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
+import shutil
 import sys
+import tempfile
 import time
-import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from diagnosis.diagnosis import diagnose
+from validation.blind.baselines import baselines
+from workflow.diagnose.case_files import load_case
+from workflow.diagnose.document import document_of, json_text
+from workflow.engine.errors import one_line
+from workflow.engine.executor import Report
 
 _PATH_EVENTS = (
     "open",
@@ -49,45 +56,45 @@ def keep_out(directory: Path) -> None:
     sys.addaudithook(watch)
 
 
-def diagnose_folder(folder: Path, with_baselines: bool) -> dict[str, Any]:
+def diagnose_folder(folder: Path) -> dict[str, Any]:
     """Answer about a case folder with the processor time it took, and the baselines' answers."""
-    from diagnosis.diagnosis import diagnose
-    from validation.blind.baselines import baselines
-    from workflow.diagnose.case_files import load_case
-    from workflow.diagnose.document import document_of
-
     loaded = load_case(folder)
-    found = diagnose(loaded.case)
-    document = document_of(loaded, found)
-    document["cpu_s"] = time.process_time()
-    if with_baselines:
-        start = time.process_time()
-        document["baselines"] = baselines(loaded.case)
-        document["baselines_cpu_s"] = time.process_time() - start
-    return document
+    start = time.process_time()
+    document = document_of(loaded, diagnose(loaded.case))
+    document["cpu_s"] = time.process_time() - start
+    document["baselines"] = baselines(loaded.case)
+    document["baselines_cpu_s"] = time.process_time() - start - document["cpu_s"]
+    plain: dict[str, Any] = json.loads(json_text(document))
+    return plain
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--keep-out", type=Path)
-    parser.add_argument("--no-baselines", action="store_true")
-    given = parser.parse_args()
-    if given.keep_out is not None:
-        keep_out(given.keep_out)
-    from workflow.engine.errors import one_line
+@dataclass(frozen=True)
+class BlindCase:
+    """A case folder to be diagnosed by a process that is kept out of `sealed`."""
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            document = diagnose_folder(given.folder, not given.no_baselines)
-        except Exception as error:
-            sys.stderr.write(f"{type(error).__name__}: {one_line(error)}\n")
-            raise SystemExit(1) from error
-    from workflow.diagnose.document import json_text
+    folder: Path
+    sealed: Path
+    diagnose: Callable[[Path], dict[str, Any]] = diagnose_folder
 
-    sys.stdout.write(json.dumps(json.loads(json_text(document))) + "\n")
+    def run(self, report: Report) -> dict[str, Any]:
+        """The answer; whatever goes wrong is one too, and counts as wrong."""
+        # Under a neutral path: not even the name of the run is in what is diagnosed.
+        with tempfile.TemporaryDirectory() as room:
+            copy = Path(room) / self.folder.name
+            shutil.copytree(self.folder, copy)
+            keep_out(self.sealed)
+            try:
+                return self.diagnose(copy)
+            except Exception as error:
+                return self.failed(f"{type(error).__name__}: {one_line(error)}")
 
-
-if __name__ == "__main__":
-    main()
+    def failed(self, reason: str) -> dict[str, Any]:
+        """An answer with the verdict "failed"."""
+        return {
+            "case": self.folder.name,
+            "verdict": "failed",
+            "effects": [],
+            "combination": [],
+            "gap_after": None,
+            "reason": reason,
+        }

@@ -1,0 +1,40 @@
+"""What the simulations of the real machines share: effects by name, and the path of a delayed command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from diagnosis import EffectParameter
+
+Real = npt.NDArray[np.float64]
+
+# Coulomb friction as a share of the static one.
+SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear")
+
+
+def given(effects: Mapping[str, Mapping[str, float]]) -> Callable[..., float]:
+    """value(effect, parameter, without=0.0): `without` where the effect is not there."""
+
+    def value(effect: str, parameter: str, without: float = 0.0) -> float:
+        return float(effects[effect][parameter]) if effect in effects else without
+
+    return value
+
+
+@njit
+def late_value(command: Real, k: int, delay_samples: float, dead_zone: float) -> float:
+    """Command (T,) at sample k behind a delay (linear between samples) and a dead zone."""
+    whole = int(delay_samples)
+    part = delay_samples - whole
+    late = (1 - part) * command[max(k - whole, 0)] + part * command[max(k - whole - 1, 0)]
+    return float(np.sign(late) * max(abs(late) - dead_zone, 0.0))
+
+
+@njit
+def lagged(pull: float, held: float, step_s: float, lag_s: float) -> float:
+    """Exact step of a first-order lag towards a held value."""
+    return held if lag_s <= 0.0 else held + (pull - held) * np.exp(-step_s / lag_s)
