@@ -153,7 +153,7 @@ def identify_frf(
             f"has {needed} unknowns; expected at least {needed // 2 + 1}"
         )
     search = PoleSearch(data, options)
-    selection = OrderSelection(search, lambda fraction, message: None)
+    selection = OrderSelection(search)
     best = selection.run()
     poles = in_order(best.poles, fixed)
     fit = fit_response(data, poles)

@@ -36,7 +36,7 @@ from ident.fit.refinement import Bounds, Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification
-from ident.search.order_selection import OrderSelection, Progress
+from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import PoleSearch
 from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import PolishedMinimum, SearchTrace
@@ -71,7 +71,7 @@ def identify(
     The result is deterministic: the same records and options give the same numbers.
     """
     options = options or IdentOptions()
-    report = progress or _silent
+    report = progress or silent
     if options.noise == "auto":
 
         def in_white_noise(
@@ -295,10 +295,6 @@ def _moved(data: Regression, best: Refined, search: PoleSearch) -> Refined:
     search.minima += other.minima
     search.evaluations += other.evaluations
     return end
-
-
-def _silent(fraction: float, message: str) -> None:
-    """Default progress: nobody listens."""
 
 
 def _result(

@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-import numpy as np
-
 from ident.basis.miso_model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.checks.input_checks import few_samples
+from ident.checks.input_checks import few_samples, least_independence, refuse_unusable
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.finding import Finding, FindingKind, finding
@@ -24,12 +22,10 @@ from ident.fit.refinement import Bounds, free_optimality
 from ident.fit.regression import prepare_inputs
 from ident.identification import MisoIdentification
 from ident.identify import description, fitted_on_all, in_order, least_order, searched
-from ident.search.order_selection import Progress
+from ident.search.order_selection import Progress, silent
 from ident.search.pole_warnings import pole_warnings
 
-# Inputs are one signal if a combination of them, each scaled to unit length, has less than the first share of
-# the power; below the second the channels are told apart badly.
-_SAME_INPUT = 1e-12
+# Where a combination of the inputs has less of the power the channels are told apart badly.
 _ALIKE_INPUT = 1e-2
 # A residual worth less than this share of its samples is not white.
 _COLOURED = 0.8
@@ -70,9 +66,9 @@ def identify_miso(
         raise ValueError(
             f"relative_degree = {options.relative_degree} is not available with several inputs; leave it out"
         )
-    report: Progress = progress or (lambda fraction, message: None)
+    report = progress or silent
     data = prepare_inputs(records, options.structure())
-    _refuse_unusable(records, data, least_order(options))
+    refuse_unusable(records, data, least_order(options))
     outcome, _ = searched(records, data, options, report)
     data, best, verdicts = fitted_on_all(records, outcome)
     fixed, poles = outcome.search.fixed, in_order(best.poles, outcome.search.fixed)
@@ -98,45 +94,11 @@ def identify_miso(
     )
 
 
-def _refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> None:
-    names = records[0].input_names
-    for i, name in enumerate(names):
-        if all(np.ptp(record.input[:, i]) == 0 for record in records):
-            raise ValueError(
-                f"{records[0].label}: input column '{name}' is constant in every record; "
-                "expected a signal that varies in at least one"
-            )
-    for record in records:
-        if np.ptp(record.output[:, 0]) == 0:
-            raise ValueError(
-                f"{record.label}: output column '{record.output_names[0]}' is constant "
-                f"({record.output[0, 0]:.6g}); expected a signal that varies"
-            )
-    if _least_independence(data) <= _SAME_INPUT:
-        raise ValueError(
-            f"{records[0].label}: the inputs {list(names)} are linearly dependent, so their channels cannot "
-            "be told apart; expected independent signals"
-        )
-    needed = data.n_parameters(order)
-    if not data.n_samples > needed:
-        labels = records[0].label if len(records) == 1 else f"{len(records)} records"
-        raise ValueError(
-            f"{labels}: {data.n_samples} samples are too few for order {order} from {len(names)} inputs, "
-            f"which has {needed} unknowns; expected at least {needed + 1}"
-        )
-
-
-def _least_independence(data: Regression) -> float:
-    """Least power of a unit combination of the inputs, each of unit length: 1 uncorrelated, 0 dependent."""
-    rows = data.u / np.linalg.norm(data.u, axis=1, keepdims=True)
-    return float(np.linalg.eigvalsh(rows @ rows.T)[0])
-
-
 def _advice(
     data: Regression, model: MisoModel, residual: RealArray, fixed: Poles, bounds: Bounds
 ) -> list[Finding]:
     found = pole_warnings(model.poles, fixed, bounds, data.dt_s) + few_samples(data, model.order)
-    if _least_independence(data) < _ALIKE_INPUT:
+    if least_independence(data) < _ALIKE_INPUT:
         found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
     worth = data.colour(residual).effective_samples
     if worth < _COLOURED * data.n_samples:

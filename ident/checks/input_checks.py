@@ -38,23 +38,40 @@ _DRIFT_SHARE = 0.2
 _DRIFT_LEVEL = 1e-5
 # A line serves as well as a slow pole if it leaves at most this much more.
 _AS_WELL = 1.05
+# Inputs are one signal if a combination of them, each scaled to unit length, has less of the power.
+_SAME_INPUT = 1e-12
 # Deviations from an operating point this many times larger are lost beside it.
 _LARGE_OFFSET = 10.0
 
 
 def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> None:
-    """Raise ValueError for a constant input or output, or too few samples for `order` poles; names the
-    record."""
+    """Raise ValueError for an output without variation, inputs that cannot be told apart, or too few samples
+    for `order` poles; names the record.
+
+    A single input varies in every record, each of several in one of them at least.
+    """
+    names = records[0].input_names
     for record in records:
-        for kind, signal, names in (
-            ("input", record.input, record.input_names),
-            ("output", record.output, record.output_names),
-        ):
-            if np.ptp(signal[:, 0]) == 0:
+        signals = [("output", record.output[:, 0], record.output_names[0])]
+        if len(names) == 1:
+            signals.insert(0, ("input", record.input[:, 0], record.input_names[0]))
+        for kind, signal, name in signals:
+            if np.ptp(signal) == 0:
                 raise ValueError(
-                    f"{record.label}: {kind} column '{names[0]}' is constant ({signal[0, 0]:.6g}); "
+                    f"{record.label}: {kind} column '{name}' is constant ({signal[0]:.6g}); "
                     "expected a signal that varies"
                 )
+    for i, name in enumerate(names):
+        if all(np.ptp(record.input[:, i]) == 0 for record in records):
+            raise ValueError(
+                f"{records[0].label}: input column '{name}' is constant in every record; "
+                "expected a signal that varies in at least one"
+            )
+    if least_independence(data) <= _SAME_INPUT:
+        raise ValueError(
+            f"{records[0].label}: the inputs {list(names)} are linearly dependent, so their channels cannot "
+            "be told apart; expected independent signals"
+        )
     needed = data.n_parameters(order)
     if not data.n_samples > needed:
         labels = records[0].label if len(records) == 1 else f"{len(records)} records"
@@ -62,6 +79,14 @@ def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> 
             f"{labels}: {data.n_samples} samples are too few for order {order}, which has {needed} unknowns; "
             f"expected at least {needed + 1}"
         )
+
+
+def least_independence(data: Regression) -> float:
+    """Least power of a unit combination of the inputs, each of unit length: 1 uncorrelated, 0 dependent."""
+    if data.n_inputs == 1:
+        return 1.0
+    rows = data.u / np.linalg.norm(data.u, axis=1, keepdims=True)
+    return float(np.linalg.eigvalsh(rows @ rows.T)[0])
 
 
 def advice(
@@ -76,16 +101,13 @@ def advice(
     `fixed` are the poles that were given (they come first among the model's).
     """
     return [
-        *_too_short(data, model, fixed),
+        *few_samples(data, model.order),
+        *_unknown_rates(data, model, fixed),
         *_weak_input(records, data, model, residuals),
         *clipped(records),
         *_drifting(records, data, model, residuals, fixed),
         *_far_from_zero(records, data),
     ]
-
-
-def _too_short(data: Regression, model: GobfModel, fixed: Poles) -> list[Finding]:
-    return few_samples(data, model.order) + _unknown_rates(data, model, fixed)
 
 
 def few_samples(data: Regression, order: int) -> list[Finding]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
-from ident.checks.prior_tests import ROUGH, Fitted, PriorTest, judged, limit, silent, statistic
+from ident.checks.prior_tests import ROUGH, Fitted, PriorTest, judged, limit, statistic
 from ident.data.record import Record
 from ident.finding import FindingKind
 from ident.fit.least_squares import Regression
@@ -85,7 +85,7 @@ def _without_integrators(
             pair = np.exp(2 * np.pi * turns / longest * np.array([-0.3 + 1j]))
             starts.append(others.appended(Poles(rest, pair)))
     ends = [small.descend(start, "integrators freed", ROUGH) for start in starts]
-    ends.append(OrderSelection(small, silent).run())
+    ends.append(OrderSelection(small).run())
     best = min(ends, key=lambda end: end.rss)
     data = prepared(records, given.data.structure)
     search = PoleSearch(data, options)
@@ -99,15 +99,11 @@ def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int
     own = np.sort(free.end.poles.real[n_fixed:])
     if own.size < fewer:
         return np.inf
-    structure = replace(free.data.structure, integrators=fewer)
-    options = free.search.options.model_copy(update={"integrators": fewer})
-    data = replace(prepare(records, structure), polynomials=free.data.polynomials)
     start = Poles(
         np.concatenate([np.zeros(fewer), free.end.poles.real[:n_fixed], own[: own.size - fewer]]),
         free.end.poles.pairs,
     )
-    end = PoleSearch(data, options).descend(start, "fewer integrators")
-    return statistic(end.rss, free)
+    return statistic(free.refitted(records, start, integrators=fewer).end.rss, free)
 
 
 def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, float, float] | None:
@@ -120,11 +116,8 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, f
     for fewer in range(k - 1, -1, -1):
         if others.order + fewer == 0:
             break
-        structure = replace(given.data.structure, integrators=fewer)
-        data = replace(prepare(records, structure), polynomials=given.data.polynomials)
-        search = PoleSearch(data, given.search.options.model_copy(update={"integrators": fewer}))
         start = Poles(np.concatenate([np.zeros(fewer), others.real]), others.pairs)
-        value = statistic(search.descend(start, "fewer integrators").rss, given)
+        value = statistic(given.refitted(records, start, integrators=fewer).end.rss, given)
         if value > (k - fewer) * one:
             break
         found = fewer, value, (k - fewer) * one

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -84,6 +85,17 @@ class Fitted:
         """Independent samples that the residual is worth."""
         return self.data.colour(self.residual).effective_samples
 
+    def refitted(self, records: Sequence[Record], start: Poles, **changed: Any) -> Fitted:
+        """The optimum from `start` with other settings, which structure and options call by the same names.
+
+        Where the rows are the same their nuisances are, so that both sides of a comparison have them.
+        """
+        data = prepare(records, replace(self.data.structure, **changed))
+        if data.n_samples == self.data.n_samples:
+            data = replace(data, polynomials=self.data.polynomials)
+        search = PoleSearch(data, self.search.options.model_copy(update=changed))
+        return Fitted(data, search.descend(start, "other structure"), search)
+
 
 def statistic(rss_with_prior: float, without: Fitted) -> float:
     """Ne ln(J with the prior / J without); not below 0, where only descents that ended early can bring it."""
@@ -120,7 +132,7 @@ def fixed_poles_test(
         }
     )
     small = PoleSearch(prepare(*searched), options)
-    ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small, silent).run()]
+    ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small).run()]
     best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
     freed = Fitted(given.data, search.descend(best.poles, "fixed poles freed"), search)
@@ -150,9 +162,7 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
     for other in (delay - 1, delay + 1):
         if other < 0:
             continue
-        data = prepare(records, replace(structure, input_delay_samples=other))
-        search = PoleSearch(data, given.search.options.model_copy(update={"input_delay_samples": other}))
-        shifted = Fitted(data, search.descend(given.end.poles, "other delay"), search)
+        shifted = given.refitted(records, given.end.poles, input_delay_samples=other)
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
         residuals = [
@@ -163,8 +173,8 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
         ]
         common = max(delay, other)
         ours = _power_from(residuals[0], given.data, common - delay)
-        theirs = _power_from(residuals[1], data, common - other)
-        worth = data.colour(residuals[1]).effective_samples
+        theirs = _power_from(residuals[1], shifted.data, common - other)
+        worth = shifted.data.colour(residuals[1]).effective_samples
         value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
         if ours <= 1e-18 * float(given.data.y @ given.data.y):
             value = 0.0
@@ -174,16 +184,13 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
 
 
 def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
-    parts = [residual[data.segment(i)][skip:] for i in range(data.n_records)]
+    parts = [residual[here][skip:] for here in data.segments]
     return float(sum(part @ part for part in parts))
 
 
 def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
     """Relative degree 1 (no direct term) against a model with one."""
-    data = prepare(records, replace(given.data.structure, feedthrough=True))
-    data = replace(data, polynomials=given.data.polynomials)
-    search = PoleSearch(data, given.search.options.model_copy(update={"feedthrough": True}))
-    free = Fitted(data, search.descend(given.end.poles, "direct term"), search)
+    free = given.refitted(records, given.end.poles, feedthrough=True)
     return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(given.end.rss, free), 1)
 
 
@@ -243,7 +250,3 @@ def _distance(one: Poles, other: Poles) -> float:
             np.max(np.abs(np.log(first.imag / second.imag)), initial=0.0),
         )
     )
-
-
-def silent(fraction: float, message: str) -> None:
-    """Default progress: nobody listens."""

@@ -15,6 +15,11 @@ from ident.search.pole_search import PoleSearch
 
 Progress = Callable[[float, str], None]
 
+
+def silent(fraction: float, message: str) -> None:
+    """Default progress: nobody listens."""
+
+
 # (J, order) -> criterion of that model, lower is better (`ident.fit.problem.PoleProblem.criterion`).
 Criterion = Callable[[float, int], float]
 
@@ -41,7 +46,7 @@ class OrderStep:
 class OrderSelection:
     """Grows and prunes the set of poles of one search."""
 
-    def __init__(self, search: PoleSearch, progress: Progress) -> None:
+    def __init__(self, search: PoleSearch, progress: Progress = silent) -> None:
         self.search = search
         self.options: IdentOptions = search.options
         self.progress = progress
