@@ -99,6 +99,12 @@ def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
     return _response_and_all_pass(poles, z)[0]
 
 
+def block_responses(poles: Poles, z: ComplexArray) -> ComplexArray:
+    """Responses (F, B) of the states of each block by itself to the signal that enters it."""
+    parts = [basis_response(block, z) for block in poles.blocks()]
+    return np.hstack([np.zeros((z.size, 0), dtype=np.complex128), *parts])
+
+
 def all_pass_response(poles: Poles, z: ComplexArray) -> ComplexArray:
     """B(z) = prod (1 - conj(x) z)/(z - x) at the points z (F,); modulus 1 on the unit circle."""
     return _response_and_all_pass(poles, z)[1]
@@ -152,6 +158,13 @@ def free_response(poles: Poles, n_samples: int) -> RealArray:
     rows = np.empty((poles.order, n_samples))
     run_cascade_free(block_parameters(poles), poles.real.size, rows, 0, n_samples)
     return rows.T
+
+
+def nuisance_columns(poles: Poles, n_samples: int, n_polynomials: int, free: bool) -> RealArray:
+    """Powers 0 .. n_polynomials - 1 of a ramp from -1 to 1 and, if `free`, the free responses of the poles,
+    (T, n)."""
+    powers = np.vander(np.linspace(-1.0, 1.0, n_samples), n_polynomials, increasing=True)
+    return np.hstack([powers, free_response(poles, n_samples)]) if free else powers
 
 
 @numba.njit(cache=True, forceinline=True, fastmath={"contract"})

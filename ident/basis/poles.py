@@ -11,14 +11,6 @@ import numpy as np
 from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
 
 
-def _no_real() -> RealArray:
-    return np.zeros(0)
-
-
-def _no_pairs() -> ComplexArray:
-    return np.zeros(0, dtype=np.complex128)
-
-
 @dataclass(frozen=True, eq=False)
 class Poles:
     """Discrete-time poles, real ones first, each pair by its member in the upper half plane.
@@ -41,8 +33,8 @@ class Poles:
     basis functions.
     """
 
-    real: RealArray = field(default_factory=_no_real)
-    pairs: ComplexArray = field(default_factory=_no_pairs)
+    real: RealArray = field(default_factory=lambda: np.zeros(0))
+    pairs: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "real", readonly_real(self.real))

@@ -12,7 +12,7 @@ from ident.basis.functions import basis_response, regressor
 from ident.basis.poles import Poles
 from ident.basis.structure import filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
-from ident.data.ellipses import ellipse_distance
+from ident.data.ellipses import ellipse_distance, spread_covariance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 
 # Responses times frequencies that are drawn at once for simultaneous bands.
@@ -105,12 +105,7 @@ class ResponsePosterior:
     def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:
         """Centre and 2x2 covariances at any strictly increasing omega (F,) [rad/s]."""
         rows = self.frequency_rows(omega_rad_s)
-        spread = rows @ self.covariance_factor
-        re, im = spread.real, spread.imag
-        covariance = np.empty((rows.shape[0], 2, 2))
-        covariance[:, 0, 0] = np.einsum("fp,fp->f", re, re)
-        covariance[:, 1, 1] = np.einsum("fp,fp->f", im, im)
-        covariance[:, 0, 1] = covariance[:, 1, 0] = np.einsum("fp,fp->f", re, im)
+        covariance = spread_covariance(rows @ self.covariance_factor)
         method = self.report.method if self.report is not None else "coefficient posterior"
         return FrequencyUncertainty(
             np.asarray(omega_rad_s, dtype=np.float64), rows @ self.mean, covariance, self.dt_s, level, method

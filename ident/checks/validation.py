@@ -10,27 +10,14 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import binom, chi2
 
-from ident.basis.functions import free_response
+from ident.basis.functions import nuisance_columns
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.checks.residual_tests import ResidualTest, independence_test, whiteness_test
 from ident.data.arrays import RealArray, lock
 from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.finding import Finding, FindingKind, finding
-
-__all__ = [
-    "FreshFit",
-    "Invalidation",
-    "ResidualTest",
-    "ScatterRow",
-    "fit_on_fresh_data",
-    "independence_test",
-    "invalidate",
-    "repeat_scatter",
-    "whiteness_test",
-]
 
 
 class SimulatedModel(Protocol):
@@ -84,11 +71,8 @@ def fit_on_fresh_data(
         raise ValueError(f"{record.label}: the output is constant")
     simulated = model.simulate(record.input[:, 0])
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
-    columns = [np.linspace(-1.0, 1.0, y.size)[:, None] ** degree for degree in range(degrees)]
-    if estimate_initial_state:
-        columns.append(free_response(model.poles, y.size))
-    if columns:
-        nuisance = np.hstack(columns)
+    nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
+    if nuisance.shape[1]:
         coefficients, *_ = np.linalg.lstsq(nuisance, y - simulated, rcond=1e-10)
         simulated = simulated + nuisance @ coefficients
     residual = y - simulated

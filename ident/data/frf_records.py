@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from ident.data.arrays import ComplexArray, RealArray, lock
-from ident.data.ellipses import chi2_radius
+from ident.data.ellipses import hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
 from ident.data.record_files import read_table
 
@@ -138,11 +137,8 @@ class FrfRepeats:
                 f"at omega = {grid[at]:.6g} rad/s there are {count[at]} repeats: a 2x2 covariance needs "
                 "at least 3 (or pool_neighbours > 0)"
             )
-        # Hotelling: n (mean - G)^T S^-1 (mean - G) ~ 2 f / (f - 1) F(2, f - 1), f degrees of freedom in S.
-        hotelling = 2 * freedom / (freedom - 1) * f_distribution.ppf(level, 2, freedom - 1)
-        widening = hotelling / chi2_radius(level) ** 2
         share = 1 / count if of == "mean" else 1 + 1 / count
-        covariance = scatter * (widening * share / freedom)[:, None, None]
+        covariance = scatter * (hotelling_widening(freedom, level) * share / freedom)[:, None, None]
         method = "repeated measurements" if of == "mean" else "one more run"
         return FrequencyUncertainty(grid, centre, covariance, dt_s, level, method)
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from ident.basis.coordinates import SearchSpace
-from ident.basis.functions import all_pass_response, basis_response
+from ident.basis.functions import all_pass_response, basis_response, block_responses
 from ident.basis.poles import Poles
 from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray
@@ -107,8 +107,7 @@ class FrfRegression:
         here = fit_response(self, poles)
         if not here.rss < below:
             return Linearisation(here.rss, np.zeros((0, 0)), np.zeros(0))
-        states = [basis_response(block, self.z) for block in poles.blocks()]
-        rows = self.whiten(here.response[:, np.newaxis] * np.hstack([np.zeros((self.z.size, 0)), *states]))
+        rows = self.whiten(here.response[:, np.newaxis] * block_responses(poles, self.z))
         rows -= here.q @ (here.q.T @ rows)
         return Linearisation(here.rss, rows.T @ rows, rows.T @ here.residual)
 

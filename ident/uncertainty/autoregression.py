@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular, toeplitz
+from scipy.linalg import cholesky, hankel, solve_triangular, toeplitz
 from scipy.signal import lfilter
 
 from ident.data.arrays import RealArray
@@ -116,14 +116,13 @@ def autocovariance(whitening: RealArray, max_lag: int) -> RealArray:
     The Yule-Walker equations sum_i a_i gamma_|k - i| = (k == 0) for k = 0 .. n, then the recursion.
     """
     order = whitening.size - 1
-    equations = np.zeros((order + 1, order + 1))
-    for k in range(order + 1):
-        for i in range(order + 1):
-            equations[k, abs(k - i)] += whitening[i]
-    gamma = np.linalg.solve(equations, np.eye(order + 1)[0]).tolist()
+    equations = toeplitz(whitening, np.zeros(order + 1))
+    equations[:, 1:] += hankel(whitening)[:, 1:]
+    gamma = np.zeros(max(order, max_lag) + 1)
+    gamma[: order + 1] = np.linalg.solve(equations, np.eye(order + 1)[0])
     for k in range(order + 1, max_lag + 1):
-        gamma.append(-sum(float(whitening[i]) * gamma[k - i] for i in range(1, order + 1)))
-    return np.array(gamma[: max_lag + 1], dtype=np.float64)
+        gamma[k] = -whitening[:0:-1] @ gamma[k - order : k]
+    return gamma[: max_lag + 1]
 
 
 def _moved(whitening: RealArray, step: RealArray) -> RealArray:

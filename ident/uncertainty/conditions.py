@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
-from ident.data.ellipses import chi2_radius
+from ident.data.ellipses import hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.uncertainty.embedding import EmbeddingOptions, common_fir_length, tangent
@@ -119,5 +118,4 @@ def _widening(count: int, level: float | None) -> float:
         return 1.0
     if count < 4:
         raise ValueError(f"a small-sample region needs at least four conditions; got {count}")
-    hotelling = 2 * (count - 1) / (count - 2) * float(f_distribution.ppf(level, 2, count - 2))
-    return hotelling / chi2_radius(level) ** 2
+    return float(hotelling_widening(count - 1, level))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from ident.basis.functions import all_pass_signal, free_response, regressor
+from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
@@ -84,18 +84,16 @@ class EmbeddingRows:
         nuisance columns and the first rows, which A(q) does not whiten, are made from plain signals.
         """
         structure, whitening = self.structure, self.whitening
-        n_samples, first = record.n_samples, first_rows(whitening)
+        first = first_rows(whitening)
         plain = filter_input(record.input[:, 0], structure.integrators, structure.input_delay_samples)
         head = plain[: len(first)]
         u = plain if whitening.size == 1 else np.asarray(lfilter(whitening, np.ones(1), plain))
         regressors = self._driven(u)
         if first.size:
             regressors[: len(first)] = first @ self._driven(head)
-        ramp = np.linspace(-1.0, 1.0, n_samples)
-        nuisance = [ramp[:, None] ** degree for degree in range(structure.n_polynomials)]
-        if structure.estimate_initial_state:
-            nuisance.append(free_response(self.poles, n_samples))
-        known = np.hstack(nuisance) if nuisance else np.zeros((n_samples, 0))
+        known = nuisance_columns(
+            self.poles, record.n_samples, structure.n_polynomials, structure.estimate_initial_state
+        )
         return Rows(
             nuisance=whitened(known, whitening),
             regressors=regressors,

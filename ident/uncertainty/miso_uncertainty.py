@@ -16,11 +16,12 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ident.basis.functions import basis_response
+from ident.basis.functions import basis_response, block_responses
 from ident.basis.miso_model import MisoModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, front_response
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import RealArray
+from ident.data.ellipses import spread_covariance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.fit.least_squares import Projection, Regression, block_states, fitted_output, project
@@ -78,7 +79,7 @@ def response_uncertainty(
     centre = model.frequency_response(omega)
     basis = basis_response(model.poles, z)
     front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
-    states = _block_responses(model.poles, z)[:, free]
+    states = block_responses(model.poles, z)[:, free]
     result = []
     n, n_inputs = model.order, model.n_inputs
     for i in range(n_inputs):
@@ -87,13 +88,11 @@ def response_uncertainty(
         if data.structure.feedthrough:
             columns[:, n_inputs * n + i] = front
         columns[:, factor.shape[0] - free.size :] = states * centre[:, i : i + 1]
-        spread = columns @ factor
-        pair = np.stack([spread.real, spread.imag], axis=1)
         result.append(
             FrequencyUncertainty(
                 omega_rad_s=omega,
                 centre=centre[:, i],
-                covariance=np.einsum("fap,fbp->fab", pair, pair),
+                covariance=spread_covariance(columns @ factor),
                 dt_s=model.dt_s,
                 level=level,
                 method="shared poles, first order",
@@ -126,9 +125,3 @@ def _covariance_factor(
     scale = np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
     triangle = np.linalg.qr((columns / scale[:, None]).T, mode="r")
     return np.asarray(noise_std * np.linalg.pinv(triangle, rcond=1e-12) / scale[:, None])
-
-
-def _block_responses(poles: Poles, z: ComplexArray) -> ComplexArray:
-    """Responses (F, B) of each block's states to the signal that enters the block."""
-    parts = [basis_response(block, z) for block in poles.blocks()]
-    return np.hstack(parts) if parts else np.zeros((z.size, 0), dtype=np.complex128)

@@ -12,7 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from control_design.analysis.stability import closed_loop_poles
-from ident.checks.validation import fit_on_fresh_data, independence_test, whiteness_test
+from ident.checks.residual_tests import independence_test, whiteness_test
+from ident.checks.validation import fit_on_fresh_data
 from ident.search.error_surface import error_surface
 from ident.uncertainty import FrequencyUncertainty
 from tests.workflow import report_examples as example

@@ -13,7 +13,7 @@ import numpy as np
 
 from ident.basis.options import IdentOptions
 from ident.basis.posterior import ResponsePosterior
-from ident.checks.validation import whiteness_test
+from ident.checks.residual_tests import whiteness_test
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.identify import Identification, identify

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.checks.validation import ResidualTest
+from ident.checks.residual_tests import ResidualTest
 from workflow.figures import style
 from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView

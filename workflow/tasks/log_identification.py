@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.basis.options import IdentOptions
-from ident.checks.residual_tests import residual_advice
-from ident.checks.validation import FreshFit, ResidualTest, fit_on_fresh_data, whiteness_test
+from ident.checks.residual_tests import ResidualTest, residual_advice, whiteness_test
+from ident.checks.validation import FreshFit, fit_on_fresh_data
 from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s

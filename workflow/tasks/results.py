@@ -24,7 +24,8 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
-from ident.checks.validation import FreshFit, ResidualTest, ScatterRow
+from ident.checks.residual_tests import ResidualTest
+from ident.checks.validation import FreshFit, ScatterRow
 from ident.data.record import Record
 from ident.finding import Finding
 from ident.identification import Identification

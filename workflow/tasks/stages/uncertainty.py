@@ -14,14 +14,8 @@ from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.checks.validation import (
-    ResidualTest,
-    ScatterRow,
-    fit_on_fresh_data,
-    independence_test,
-    repeat_scatter,
-    whiteness_test,
-)
+from ident.checks.residual_tests import ResidualTest, independence_test, whiteness_test
+from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
