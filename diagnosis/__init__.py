@@ -6,8 +6,7 @@ from diagnosis.evidence.search import Search, search
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
-from diagnosis.next_experiment.competing import competing_hypotheses
-from diagnosis.next_experiment.discrimination import CompetingHypothesis
+from diagnosis.next_experiment.discrimination import CompetingHypothesis, competing_hypotheses
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment
 from diagnosis.where.findings import Where

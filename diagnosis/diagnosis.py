@@ -18,8 +18,11 @@ from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.machine.rounding import Rounding, leads_over, rounding_effect
-from diagnosis.next_experiment.competing import competing_hypotheses, competing_hypothesis
-from diagnosis.next_experiment.discrimination import CompetingHypothesis
+from diagnosis.next_experiment.discrimination import (
+    CompetingHypothesis,
+    competing_hypotheses,
+    competing_hypothesis,
+)
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, disagreement_gain
 from diagnosis.fit.discrepancy import Discrepancy, discrepancy
-from diagnosis.fit.fit import Fit, difference_quotients
+from diagnosis.fit.fit import Fit, box, difference_quotients
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import solver_spread, without_drift
 from diagnosis.machine.machine_protocol import Real
@@ -146,9 +146,6 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
 def _inside(end: Fit, step: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which of (d, x) stay in their ranges after a step (P + A,)."""
     P = end.deviations.size
-    inside = np.ones(step.size, dtype=bool)
-    if end.candidates:
-        x = np.concatenate(end.coordinates) + step[P:]
-        low, high = (np.concatenate(ends) for ends in zip(*(c.box for c in end.candidates), strict=True))
-        inside[P:] = (low <= x) & (x <= high)
-    return inside
+    x = np.concatenate([np.zeros(0), *end.coordinates]) + step[P:]
+    low, high = box(end.candidates)
+    return np.concatenate([np.ones(P, dtype=bool), (low <= x) & (x <= high)])

@@ -154,6 +154,16 @@ class Probabilities:
         return max(self.cause, key=self.cause.__getitem__)
 
 
+def best_of_sets(hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, ...], Hypothesis]:
+    """Sorted effect names -> the hypothesis of this set with the largest weight, in order of appearance."""
+    best: dict[tuple[str, ...], Hypothesis] = {}
+    for hypothesis in hypotheses:
+        key = tuple(sorted(hypothesis.names))
+        if key not in best or hypothesis.log_weight > best[key].log_weight:
+            best[key] = hypothesis
+    return best
+
+
 def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     """Probabilities from the evidence of everything that was fitted.
 
@@ -164,11 +174,7 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     """
     if not hypotheses:
         raise ValueError("probabilities need at least one hypothesis")
-    best: dict[tuple[str, ...], Hypothesis] = {}
-    for hypothesis in (h for h in hypotheses if h.is_answer):
-        key = tuple(sorted(hypothesis.names))
-        if key not in best or hypothesis.log_weight > best[key].log_weight:
-            best[key] = hypothesis
+    best = best_of_sets([h for h in hypotheses if h.is_answer])
     unknown = max(h.unknown_weight for h in hypotheses)
     keys = [*best, _UNKNOWN]
     logs = np.array([*(h.log_weight for h in best.values()), unknown])

@@ -95,20 +95,19 @@ def fit(
     """
     P = deviations.size
     splits = np.cumsum([len(c.axes) for c in candidates])
-    low, high = _box(candidates)
-    steps = _steps(candidates)
+    low, high = box(candidates)
     x = np.clip(np.concatenate([np.zeros(0), *coordinates]), low, high)
     d = deviations.copy()
 
-    def effects(x: Real) -> tuple[Any, ...]:
-        return _effects(candidates, x)
+    def residuals(d: Real, x: Real) -> Real:
+        return model.of(d, effects_at(candidates, x))
 
     exact = nominal_jacobian is None and all(c.dependence == "smooth" for c in candidates)
-    e = model.of(d, effects(x))
+    e = residuals(d, x)
     cost = float(e @ e) + prior_cost(d)
     damping, converged = 1e-3, False
     for _ in range(iterations):
-        J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
+        J = _jacobian(model, candidates, d, x, e, nominal_jacobian)
         H = J.T @ J
         H[range(P), range(P)] += prior_curvature(d)
         gradient = J.T @ e
@@ -127,16 +126,14 @@ def fit(
             step[use] = -np.linalg.solve(damped, gu)
             if exact:
                 probe = _PROBE * step
-                ahead = model.of(
-                    model.nominal.within(d + probe[:P]), effects(np.clip(x + probe[P:], low, high))
-                )
+                ahead = residuals(model.nominal.within(d + probe[:P]), np.clip(x + probe[P:], low, high))
                 bend = 2 / _PROBE * ((ahead - e) / _PROBE - J @ step)
                 second = -0.5 * np.linalg.solve(damped, Ju.T @ bend)
                 if float(np.linalg.norm(size * second)) < _BEND * float(np.linalg.norm(size * step[use])):
                     step[use] += second
             trial_d = model.nominal.within(d + step[:P])
             trial_x = np.clip(x + step[P:], low, high)
-            trial_e = model.of(trial_d, effects(trial_x))
+            trial_e = residuals(trial_d, trial_x)
             trial_cost = float(trial_e @ trial_e) + prior_cost(trial_d)
             if trial_cost < cost:
                 reached = trial_cost
@@ -154,7 +151,7 @@ def fit(
             if left < _LEFT / model.scale:
                 converged = True
                 break
-    J = _jacobian(model, d, x, e, effects, steps, high, nominal_jacobian)
+    J = _jacobian(model, candidates, d, x, e, nominal_jacobian)
     parts = tuple(np.split(x, splits[:-1])) if candidates else ()
     return Fit(tuple(candidates), d, parts, e, J, cost, converged, model.case.machine.weighing)
 
@@ -172,16 +169,26 @@ def difference_quotients(
 ) -> Real:
     """Derivatives (N, P + A) by (d, x) of the residuals e (N,) that a fit leaves in these experiments."""
 
-    def effects(x: Real) -> tuple[Any, ...]:
-        return _effects(end.candidates, x)
-
     x = np.concatenate([np.zeros(0), *end.coordinates])
-    _, high = _box(end.candidates)
-    steps = _steps(end.candidates)
-    return _jacobian(model, end.deviations, x, e, effects, steps, high, None, experiments)
+    return _jacobian(model, end.candidates, end.deviations, x, e, experiments=experiments)
 
 
-def _box(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
+def quotients(
+    function: Callable[[Real], Real], at: Real, start: Real, steps: Real, high: Real | float = np.inf
+) -> Real:
+    """Derivatives (N, A) at a point (A,) of a function (A,) -> (N,) that is `start` there.
+
+    Difference quotients, forwards by steps (A,) where that stays below `high`, else backwards.
+    """
+    J = np.empty((start.size, at.size))
+    for i, step in enumerate(np.where(at + steps <= high, steps, -steps)):
+        moved = at.copy()
+        moved[i] += step
+        J[:, i] = (function(moved) - start) / step
+    return J
+
+
+def box(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
     """Bounds (A,), (A,) of all coordinates in a row."""
     boxes = [candidate.box for candidate in candidates]
     low = np.concatenate([np.zeros(0), *(box[0] for box in boxes)])
@@ -202,7 +209,7 @@ def _steps(candidates: Sequence[Candidate]) -> Real:
     )
 
 
-def _effects(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:
+def effects_at(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:
     """Effects at the coordinates of all candidates in a row (A,)."""
     splits = np.cumsum([len(c.axes) for c in candidates])[:-1]
     return tuple(c.effect_at(part) for c, part in zip(candidates, np.split(x, splits), strict=False))
@@ -210,32 +217,25 @@ def _effects(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:
 
 def _jacobian(
     model: ResidualModel,
+    candidates: Sequence[Candidate],
     d: Real,
     x: Real,
     e: Real,
-    effects: Callable[[Real], tuple[Any, ...]],
-    steps: Real,
-    high: Real,
-    nominal_jacobian: Real | None,
+    nominal_jacobian: Real | None = None,
     experiments: Sequence[RecordOfMachine] | None = None,
 ) -> Real:
-    P = d.size
-    J = np.empty((e.size, P + x.size))
-    if nominal_jacobian is not None:
-        J[:, :P] = nominal_jacobian
-    else:
-        here = effects(x)
-        step = max([_DEVIATION_STEP["smooth"], *(_DEVIATION_STEP[effect.dependence] for effect in here)])
-        for i in range(P):
-            moved = d.copy()
-            moved[i] += step
-            J[:, i] = (model.of(moved, here, experiments) - e) / step
-    for i in range(x.size):
-        moved = x.copy()
-        step = steps[i] if x[i] + steps[i] <= high[i] else -steps[i]
-        moved[i] += step
-        J[:, P + i] = (model.of(d, effects(moved), experiments) - e) / step
-    return J
+    if nominal_jacobian is None:
+        here = effects_at(candidates, x)
+        step = max([_DEVIATION_STEP["smooth"], *(_DEVIATION_STEP[c.dependence] for c in candidates)])
+        nominal_jacobian = quotients(lambda d: model.of(d, here, experiments), d, e, np.full(d.size, step))
+    by_x = quotients(
+        lambda x: model.of(d, effects_at(candidates, x), experiments),
+        x,
+        e,
+        _steps(candidates),
+        box(candidates)[1],
+    )
+    return np.hstack([nominal_jacobian, by_x])
 
 
 def _free(x: Real, gradient: Real, low: Real, high: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

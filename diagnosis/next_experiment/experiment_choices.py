@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from diagnosis.machine.case import Case
-from diagnosis.machine.machine_protocol import Real
-from plant.excitation import doublet, log_chirp, multisine, multisine_lines, prbs
+from diagnosis.machine.machine_protocol import Real, readonly
+from plant.excitation import Grid, doublet, log_chirp, multisine, multisine_lines, prbs
 
 Integer = npt.NDArray[np.int64]
+Parameters = Mapping[str, float | int | str]
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,11 @@ class Excitation:
     """One experiment: voltage (T,) of a kind with its parameters; `amplitude_V` is its largest value."""
 
     kind: str
-    parameters: Mapping[str, float | int | str]
+    parameters: Parameters
     voltage_V: Real
 
     def __post_init__(self) -> None:
-        voltage = np.array(self.voltage_V, dtype=np.float64)
-        voltage.setflags(write=False)
-        object.__setattr__(self, "voltage_V", voltage)
+        object.__setattr__(self, "voltage_V", readonly(self.voltage_V))
 
     @property
     def amplitude_V(self) -> float:
@@ -145,9 +144,8 @@ def tailored_excitations(
 ) -> list[Excitation]:
     """Multisine of the given lines, two periods, and the binary signal of its signs, which has more power."""
     period = n_samples // 2
-    signal = multisine(lines, period, 1.0, rng, periods=2, draws=20)
-    signal = np.concatenate([signal, signal[: n_samples - signal.size]])
-    parameters: dict[str, float | int | str] = {
+    signal = _two_periods(lines, n_samples, rng)
+    parameters: Parameters = {
         "from_Hz": round(float(lines[0] / (period * dt_s)), 3),
         "to_Hz": round(float(lines[-1] / (period * dt_s)), 3),
         "lines": int(lines.size),
@@ -165,20 +163,22 @@ def _binary(voltage: float, T: int, hold: int, rng: np.random.Generator) -> Exci
 
 
 def _multisine(
-    voltage: float, T: int, dt: float, high_Hz: float, grid: str, rng: np.random.Generator
+    voltage: float, T: int, dt: float, high_Hz: float, grid: Grid, rng: np.random.Generator
 ) -> Excitation:
     period = T // 2
-    chosen = "odd_random" if grid == "odd_random" else "full"
     low = 0.99 / (period * dt)
-    lines = multisine_lines(period, dt, (low, max(high_Hz, 12 * low)), chosen, rng)  # type: ignore[arg-type]
-    signal = multisine(lines, period, 1.0, rng, periods=2, draws=20)
-    signal = np.concatenate([signal, signal[: T - signal.size]])
-    parameters: dict[str, float | int | str] = {
+    lines = multisine_lines(period, dt, (low, max(high_Hz, 12 * low)), grid, rng)
+    signal = _two_periods(lines, T, rng)
+    parameters: Parameters = {
         "lines": grid.replace("_", " "),
         "up_to_Hz": round(float(lines[-1] / (period * dt)), 3),
         "periods": 2,
     }
     return Excitation("multisine", parameters, signal * (voltage / np.max(np.abs(signal))))
+
+
+def _two_periods(lines: Integer, T: int, rng: np.random.Generator) -> Real:
+    return np.resize(multisine(lines, T // 2, 1.0, rng, periods=2, draws=20), T)
 
 
 def _doublet(voltage: float, T: int, dt: float, pulse: int) -> Excitation:

@@ -8,8 +8,9 @@ from itertools import combinations
 
 import numpy as np
 
+from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.next_experiment.discrimination import CompetingHypothesis, distances, noise_of
+from diagnosis.next_experiment.discrimination import CompetingHypothesis, distances
 from diagnosis.next_experiment.experiment_choices import (
     ALSO_WEAK,
     Excitation,
@@ -18,7 +19,6 @@ from diagnosis.next_experiment.experiment_choices import (
     tailored_excitations,
     within,
 )
-from plant.rig import Rig
 from plant.simulate import simulate
 
 # A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
@@ -102,17 +102,14 @@ def next_experiment(
     limits: Limits,
     *,
     n_samples: int = 1400,
-    choices: Sequence[Excitation] | None = None,
     rng: np.random.Generator | None = None,
 ) -> NextExperiment:
-    """Choose among excitations within the limits.
+    """Choose among `excitations` of n_samples within the limits, and two made for these hypotheses.
 
     Parameters
     ----------
     competing
         Two at least, all with the same sampling period and noise.
-    choices
-        Excitations to choose from, by default `excitations` of the voltage limit and n_samples.
     rng
         Of the random excitations; without it a fixed sequence.
 
@@ -126,40 +123,52 @@ def next_experiment(
     _check(competing)
     weights = _pair_weights(competing)
     dt = competing[0].rig.sampling.dt_s
-    if choices is None:
-        rng = np.random.default_rng(0) if rng is None else rng
-        choices = excitations(limits.voltage_V, n_samples, dt, rng)
-        own = [_Prospect.of(choice, limits, competing) for choice in choices]
-        weak = [p.excitation.scaled(1 / 3) for p in own if p is not None and p.excitation.kind in ALSO_WEAK]
-        feasible = [p for p in own if p is not None]
-        tailored = _tailored(feasible, competing, weights, limits, rng)
-        looked_at = own + [_Prospect.of(choice, limits, competing) for choice in (*weak, *tailored)]
-        choices = (*choices, *weak, *tailored)
-    else:
-        looked_at = [_Prospect.of(choice, limits, competing) for choice in choices]
+    rng = np.random.default_rng(0) if rng is None else rng
+    choices = list(excitations(limits.voltage_V, n_samples, dt, rng))
+    looked_at = [_Prospect.of(choice, limits, competing) for choice in choices]
+    feasible = [p for p in looked_at if p is not None]
+    further = [p.excitation.scaled(1 / 3) for p in feasible if p.excitation.kind in ALSO_WEAK]
+    further += _tailored(feasible, competing, weights, limits, rng)
+    looked_at += [_Prospect.of(choice, limits, competing) for choice in further]
+    choices += further
     prospects = sorted((p for p in looked_at if p is not None), key=lambda p: p.bound, reverse=True)
     if not prospects:
         raise ValueError(
             f"no experiment stays within {limits.hub_angle_rad} rad and {limits.deflection_m} m at a "
             f"hundredth of {limits.voltage_V} V or more: give wider limits"
         )
-    best: tuple[tuple[float, float], _Prospect, Real] | None = None
+    chosen, best, distance = prospects[0], (-np.inf, -np.inf), np.zeros(0)
     for prospect in prospects:
         # Absorbing parameters only lessen a difference: what cannot win without them need not be computed.
-        if best is not None and prospect.bound[0] <= best[0][0]:
+        if prospect.bound[0] <= best[0]:
             break
-        distance, _ = prospect.distances(competing)
-        score = _score(distance, weights)
+        apart, _ = prospect.distances(competing)
+        score = _score(apart, weights)
         prospect.score = score[0]
-        if best is None or score > best[0]:
-            best = score, prospect, distance
-    if best is None:
-        raise AssertionError("at least one prospect was computed")
-    _, chosen, distance = best
+        if score > best:
+            chosen, best, distance = prospect, score, apart
     left_out = [c for c, p in zip(choices, looked_at, strict=True) if p is None]
     considered = [p.considered() for p in sorted(prospects, key=lambda p: -(p.score or 0.0))]
     considered += [Considered(c.kind, c.parameters, c.amplitude_V, False, 0.0, None) for c in left_out]
-    return _result(chosen, competing, distance, weights, dt, tuple(considered))
+    x = chosen.excitation
+    names = combinations([r.name for r in competing], 2)
+    pairs = [Separation(two, float(d), float(d**2 / 2)) for two, d in zip(names, distance, strict=True)]
+    first, second = sorted((r.probability for r in competing), reverse=True)[:2]
+    return NextExperiment(
+        kind=x.kind,
+        parameters=dict(x.parameters),
+        amplitude_V=x.amplitude_V,
+        duration_s=float(x.voltage_V.size * dt),
+        dt_s=dt,
+        voltage_V=x.voltage_V,
+        separations=tuple(pairs),
+        expected_log_bayes_factor=best[1],
+        hub_angle_range_rad=chosen.hub,
+        deflection_range_m=chosen.deflection,
+        separates=any(pair.separated for pair in pairs),
+        decided=second < _DECIDED * first,
+        considered=tuple(considered),
+    )
 
 
 def _check(competing: Sequence[CompetingHypothesis]) -> None:
@@ -190,12 +199,10 @@ class _Prospect:
         self, excitation: Excitation, outputs: Sequence[Real], competing: Sequence[CompetingHypothesis]
     ) -> None:
         self.excitation = excitation
-        noise = noise_of(competing[0].rig)
+        noise = FlexibleArm(competing[0].rig).noise
         self._whitened = [np.asarray(y / noise).ravel() for y in outputs]
-        self.hub = tuple(_range([y[:, 0] for y in outputs]))
-        self.deflection = tuple(
-            _range([_deflection(r.rig, y) for r, y in zip(competing, outputs, strict=True)])
-        )
+        self.hub = _range([y[:, 0] for y in outputs])
+        self.deflection = _range(_deflections(competing, outputs))
         self.score: float | None = None
         plain = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
         self.bound = _score(plain, _pair_weights(competing))
@@ -208,11 +215,8 @@ class _Prospect:
 
         def respond(voltage: Real) -> tuple[float, float]:
             outputs[:] = [simulate(r.rig, voltage, r.effects).output for r in competing]
-            angle = max(float(np.max(np.abs(y[:, 0]))) for y in outputs)
-            bend = max(
-                float(np.max(np.abs(_deflection(r.rig, y)))) for r, y in zip(competing, outputs, strict=True)
-            )
-            return angle, bend
+            angle = max(map(abs, _range([y[:, 0] for y in outputs])))
+            return angle, max(map(abs, _range(_deflections(competing, outputs))))
 
         excitation = within(choice, limits, respond)
         return None if excitation is None else cls(excitation, outputs, competing)
@@ -255,38 +259,12 @@ def _tailored(
     return tailored_excitations(lines, voltage.size, competing[0].rig.sampling.dt_s, limits.voltage_V, rng)
 
 
-def _deflection(rig: Rig, output: Real) -> Real:
-    return np.asarray(output[:, 1] - (rig.hub.radius_m + rig.link.length_m) * output[:, 0])
+def _deflections(competing: Sequence[CompetingHypothesis], outputs: Sequence[Real]) -> list[Real]:
+    return [
+        np.asarray(y[:, 1] - (r.rig.hub.radius_m + r.rig.link.length_m) * y[:, 0])
+        for r, y in zip(competing, outputs, strict=True)
+    ]
 
 
 def _range(signals: Sequence[Real]) -> tuple[float, float]:
     return float(min(s.min() for s in signals)), float(max(s.max() for s in signals))
-
-
-def _result(
-    chosen: _Prospect,
-    competing: Sequence[CompetingHypothesis],
-    distance: Real,
-    weights: Real,
-    dt: float,
-    considered: tuple[Considered, ...],
-) -> NextExperiment:
-    x = chosen.excitation
-    names = combinations([r.name for r in competing], 2)
-    pairs = [Separation(two, float(d), float(d**2 / 2)) for two, d in zip(names, distance, strict=True)]
-    first, second = sorted((r.probability for r in competing), reverse=True)[:2]
-    return NextExperiment(
-        kind=x.kind,
-        parameters=dict(x.parameters),
-        amplitude_V=x.amplitude_V,
-        duration_s=float(x.voltage_V.size * dt),
-        dt_s=dt,
-        voltage_V=x.voltage_V,
-        separations=tuple(pairs),
-        expected_log_bayes_factor=_score(distance, weights)[1],
-        hub_angle_range_rad=(chosen.hub[0], chosen.hub[1]),
-        deflection_range_m=(chosen.deflection[0], chosen.deflection[1]),
-        separates=any(pair.separated for pair in pairs),
-        decided=second < _DECIDED * first,
-        considered=considered,
-    )

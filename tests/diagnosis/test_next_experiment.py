@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
 from diagnosis import ResidualModel
-from diagnosis.fit.fit import fit
-from diagnosis.next_experiment.competing import competing_hypotheses, competing_hypothesis
-from diagnosis.next_experiment.discrimination import CompetingHypothesis
-from diagnosis.next_experiment.experiment_choices import Excitation, Limits, excitations
+from diagnosis.evidence.hypotheses import Hypothesis
+from diagnosis.fit.fit import Fit, fit
+from diagnosis.next_experiment.discrimination import (
+    CompetingHypothesis,
+    competing_hypotheses,
+    competing_hypothesis,
+    distances,
+)
+from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
 from plant import prbs, simulate
 from plant.effects import (
@@ -29,8 +34,34 @@ NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
 TOLERANT = RIG.model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05, "motor.resistance_ohm": 0.03}})
 
 
+CASE = made(white(np.random.default_rng(0)))
+
+
 def _competing(*effects, rig=RIG):
+    """With nothing free."""
     return tuple(CompetingHypothesis(1 / len(effects), rig, () if e is None else (e,)) for e in effects)
+
+
+def _candidate(effect, case=CASE):
+    return next(c for c in case.machine.candidates(case.experiments) if c.effect == effect)
+
+
+def _vague(*effects, rig=RIG):
+    """With effect parameters known to a factor e and nominal ones to their tolerances, no record yet."""
+    case, P = replace(CASE, rig=rig), len(rig.tolerances)
+    found = []
+    for effect in effects:
+        candidate = _candidate(effect.id)
+        x = np.array([axis.coordinate(effect.parameters()[axis.parameter]) for axis in candidate.axes])
+        known = np.hstack([np.zeros((x.size, P)), np.eye(x.size)])
+        end = Fit((candidate,), np.zeros(P), (x,), np.zeros(x.size), known, 0.0, True)
+        found.append(competing_hypothesis(case, end, 1 / len(effects)))
+    return tuple(found)
+
+
+def _distance(competing, voltage):
+    whitened = [(simulate(c.rig, voltage, c.effects).output / NOISE).ravel() for c in competing]
+    return distances(competing, voltage, whitened)[0][0]
 
 
 def test_what_differs_only_at_high_voltage_gets_high_voltage():
@@ -60,26 +91,21 @@ def test_identical_hypotheses_are_not_separated():
 
 
 def test_what_free_parameters_absorb_does_not_count():
-    """Two sizes of one effect are one explanation; so are a nominal parameter and an effect that moves it."""
-    sizes = _competing(TipPayload(mass_kg=0.010), TipPayload(mass_kg=0.011))
-    fixed = tuple(
-        CompetingHypothesis(
-            r.probability, r.rig, r.effects, lambda v: np.zeros((2 * v.size, 0)), np.zeros((0, 0))
-        )
-        for r in sizes
+    """Two sizes of one effect are one explanation."""
+    sizes = TipPayload(mass_kg=0.010), TipPayload(mass_kg=0.011)
+    free, held = (
+        next_experiment(kind(*sizes), Limits(1.0)).separations[0].standard_deviations
+        for kind in (_vague, _competing)
     )
-    free, held = next_experiment(sizes, Limits(1.0)), next_experiment(fixed, Limits(1.0))
-    assert held.separations[0].standard_deviations > 10
-    # What a tenth more costs a size known to a factor e, log 1.1 = 0.095, and the curvature of the response.
-    assert free.separations[0].standard_deviations < 0.02 * held.separations[0].standard_deviations
+    assert held > 10
+    # What a tenth more costs sizes known to a factor e, log 1.1 = 0.095, and the curvature of the response.
+    assert free < 0.02 * held
 
 
 def test_tolerances_only_take_separation_away():
     effects = (InputDelay(delay_s=0.006), ActuatorLag(time_constant_s=0.006))
-    choice = [Excitation("prbs", {}, prbs(9, 4, 1.0, 700))]
-    exact = next_experiment(_competing(*effects), Limits(1.0), choices=choice)
-    tolerant = next_experiment(_competing(*effects, rig=TOLERANT), Limits(1.0), choices=choice)
-    d, less = (n.separations[0].standard_deviations for n in (exact, tolerant))
+    voltage = prbs(9, 4, 1.0, 700)
+    d, less = (_distance(_vague(*effects, rig=rig), voltage) for rig in (RIG, TOLERANT))
     assert 0 < less <= d * (1 + 1e-6)
 
 
@@ -101,7 +127,7 @@ def test_chosen_experiment_separates_delay_from_lag_better_than_a_record_when_fi
     truth = InputDelay(delay_s=0.006)
     record = inputs()["prbs_high"]
     chosen = next_experiment(
-        _competing(truth, ActuatorLag(time_constant_s=0.006)),
+        (*_competing(truth), *_vague(ActuatorLag(time_constant_s=0.006))),
         Limits(float(np.max(record))),
         n_samples=record.size,
     )
@@ -111,7 +137,7 @@ def test_chosen_experiment_separates_delay_from_lag_better_than_a_record_when_fi
 
     new, old = mean_gain(chosen.voltage_V), mean_gain(record)
     assert new > 1.5 * old
-    # Promised with sizes known to a factor e, which hardly binds, and to first order in them.
+    # Promised with a lag known to a factor e, which hardly binds, and to first order in it.
     promised = chosen.separations[0].standard_deviations ** 2
     assert promised / 2 < new < 2 * promised
 
@@ -148,49 +174,35 @@ def test_every_pair_is_spoken_of_and_the_best_is_first():
 
 
 def test_records_sharpen_the_separation():
-    """Fitted competing have sizes that both fit the same records, and know them: they part no less."""
+    """Fitted hypotheses have sizes that both fit the same records, and know them: they part no less."""
     delay = InputDelay(delay_s=0.006)
-    rng = np.random.default_rng(3)
-    residuals = white(rng)
+    residuals = white(np.random.default_rng(3))
     shift = {
         k: (simulate(RIG, v, (delay,)).output - simulate(RIG, v).output) / NOISE for k, v in inputs().items()
     }
     case = made({k: residuals[k] + shift[k] for k in residuals})
-    model = ResidualModel(case)
     fits = []
     for name in ("input_delay", "actuator_lag"):
-        candidate = next(c for c in case.machine.candidates(case.experiments) if c.effect == name)
+        candidate = _candidate(name, case)
         start = np.array([candidate.axes[0].coordinate(0.006)])
-        fits.append(fit(model, (candidate,), (start,), np.zeros(0)))
+        fits.append(fit(ResidualModel(case), (candidate,), (start,), np.zeros(0)))
     known = [competing_hypothesis(case, f, 0.5) for f in fits]
-    vague = [CompetingHypothesis(0.5, r.rig, r.effects) for r in known]
-    limits = Limits.of_records(case)
-    choice = [Excitation("prbs", {}, prbs(9, 4, limits.voltage_V / 2, 700))]
-    d, less = (
-        next_experiment(r, limits, choices=choice).separations[0].standard_deviations for r in (known, vague)
-    )
-    assert d > less * (1 - 1e-6)
-    ordered = competing_hypotheses(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], {})
+    vague = [replace(one, precision=np.eye(1)) for one in known]
+    voltage = prbs(9, 4, Limits.of_records(case).voltage_V / 2, 700)
+    assert _distance(known, voltage) > _distance(vague, voltage) * (1 - 1e-6)
+    ordered = competing_hypotheses(case, [Hypothesis(f, -f.cost, -np.inf) for f in fits], {})
     assert [r.name for r in ordered] == ["input_delay", "actuator_lag"]
 
 
 def test_sets_that_name_the_same_cause_do_not_compete():
-    residuals = white(np.random.default_rng(0))
-    case = made(residuals)
-    chosen = {
-        c.effect: c
-        for c in case.machine.candidates(case.experiments)
-        if c.effect in ("input_delay", "actuator_lag")
-    }
-    start = {name: np.array([c.axes[0].coordinate(0.004)]) for name, c in chosen.items()}
-
-    def fitted(*names):
-        model = ResidualModel(case)
-        return fit(model, [chosen[n] for n in names], [start[n] for n in names], np.zeros(0), iterations=1)
-
     sets = {("input_delay",): 0.6, ("actuator_lag", "input_delay"): 0.3, ("actuator_lag",): 0.05, (): 0.05}
-    fits = [fitted("input_delay"), fitted("actuator_lag", "input_delay"), fitted("actuator_lag"), fitted()]
-    competing = competing_hypotheses(case, [SimpleNamespace(fit=f, log_weight=-f.cost) for f in fits], sets)
+    found = []
+    for names, p in sets.items():
+        candidates = [_candidate(name) for name in names]
+        start = [np.array([c.axes[0].coordinate(0.004)]) for c in candidates]
+        end = fit(ResidualModel(CASE), candidates, start, np.zeros(0), iterations=1)
+        found.append(Hypothesis(end, np.log(p), -np.inf))
+    competing = competing_hypotheses(CASE, found, sets)
     assert competing[0].name == "input_delay"
     assert {r.name for r in competing[1:]} == {"actuator_lag", "no effect"}
 
@@ -205,10 +217,8 @@ def test_effort_is_bounded(monkeypatch):
 
     for module in ("next_experiment", "discrimination"):
         monkeypatch.setattr(f"diagnosis.next_experiment.{module}.simulate", counted)
-    competing = _competing(
-        CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), None, rig=TOLERANT
-    )
-    next_experiment(competing, Limits(1.0, 0.3, 0.05))
+    competing = _vague(CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), rig=TOLERANT)
+    next_experiment((*competing, CompetingHypothesis(0.5, TOLERANT)), Limits(1.0, 0.3, 0.05))
     # At most five scalings of 15, and 2 tolerances and one size for every hypothesis.
     assert len(calls) <= 15 * 3 * 5 + 16 * 3 * 3
 
@@ -237,10 +247,6 @@ def test_excitations_fit_their_voltage_and_length():
         (lambda: Limits(1.0, np.nan), "limit hub_angle_rad must be positive"),
         (lambda: next_experiment(_competing(None), Limits(1.0)), "at least two hypotheses; got 1"),
         (lambda: CompetingHypothesis(1.5, RIG), "lies between 0 and 1; got"),
-        (
-            lambda: CompetingHypothesis(0.5, RIG, precision=np.eye(1)),
-            "a hypothesis with directions needs their precision",
-        ),
         (lambda: excitations(1.0, 50, DT, np.random.default_rng(0)), "at least 100 samples; got 50"),
         (
             lambda: next_experiment(_competing(None, CoulombFriction(torque_Nm=0.01)), Limits(1.0, 1e-9)),

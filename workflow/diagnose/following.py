@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.next_experiment.discrimination import CompetingHypothesis, noise_of
+from diagnosis.machine.flexible_arm import FlexibleArm
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
 from plant.effects import LOOK_ALIKES, in_words
@@ -46,7 +47,7 @@ class Following:
         first, second = (
             simulate(one.rig, self.proposal.voltage_V, one.effects).output for one in self.competing[:2]
         )
-        return np.asarray((first - second) / noise_of(self.competing[0].rig))
+        return np.asarray((first - second) / FlexibleArm(self.competing[0].rig).noise)
 
 
 def following(found: Diagnosis) -> Following:
