@@ -1,8 +1,8 @@
 """The machine: rig, beam modes, motor, effects, sensors, excitation signals, simulation."""
 
-from plant.effects import EFFECTS, Effect, parse_effect, parse_effects, without
+from plant.effects import EFFECTS, Effect, parse_effect, parse_effects
 from plant.excitation import bang_bang, crest_factor, doublet, log_chirp, multisine, multisine_lines, prbs
-from plant.modal import LinearArm, linear_arm
+from plant.modal import linear_arm
 from plant.presets import paper_example, paper_example_rig, paper_link
 from plant.rig import Rig, parameter_keys
 from plant.simulate import SampledArm, Trajectory, simulate
@@ -11,7 +11,6 @@ from plant.two_link import two_link_operating_point
 __all__ = [
     "EFFECTS",
     "Effect",
-    "LinearArm",
     "Rig",
     "SampledArm",
     "Trajectory",
@@ -31,5 +30,4 @@ __all__ = [
     "prbs",
     "simulate",
     "two_link_operating_point",
-    "without",
 ]

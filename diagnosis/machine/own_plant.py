@@ -87,7 +87,6 @@ class Change:
 
     id: str
     values: Mapping[str, float]
-    dependence: Dependence
 
     def parameters(self) -> dict[str, float]:
         return dict(self.values)
@@ -144,7 +143,7 @@ class PlantEffect:
         """The effect at these values, the size (the first parameter) with its sign."""
         size = self.parameters[0].name
         signed = {**values, size: sign * values[size]}
-        return Change(self.name, MappingProxyType(signed), self.dependence)
+        return Change(self.name, MappingProxyType(signed))
 
     @property
     def id(self) -> str:

@@ -63,7 +63,6 @@ __all__ = [
     "parse_effect",
     "parse_effects",
     "register",
-    "without",
 ]
 
 
@@ -91,15 +90,6 @@ def parse_effect(entry: Mapping[str, Any]) -> Effect:
 def parse_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:
     """Several effects; see `parse_effect`."""
     return tuple(parse_effect(entry) for entry in entries)
-
-
-def without(effects: Sequence[Effect], kind: type[Effect] | str) -> tuple[Effect, ...]:
-    """The effects that are not of the given class or registry id."""
-    if isinstance(kind, str):
-        if kind not in EFFECTS:
-            raise ValueError(f"unknown effect {kind!r}; known effects: {', '.join(EFFECTS)}")
-        return tuple(effect for effect in effects if type(effect).id != kind)
-    return tuple(effect for effect in effects if not isinstance(effect, kind))
 
 
 def in_words(name: str) -> str:

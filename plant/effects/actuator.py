@@ -18,7 +18,6 @@ class InputDelay(Effect):
     id = "input_delay"
     words = "a delay of the command"
     group = "actuator"
-    neutral = MappingProxyType({"delay_s": 0.0})
 
     delay_s: NotNegative = Field(le=60.0, description="delay of the voltage; every sample of it is stored")
 
@@ -38,7 +37,6 @@ class ActuatorGain(RatioEffect):
     id = "actuator_gain"
     words = "a wrong gain of the actuator"
     group = "actuator"
-    neutral = MappingProxyType({"ratio": 1.0})
     multiplies = "motor.torque_constant_Nm_A"
 
     ratio: Positive = Field(description="acting voltage over commanded voltage")
@@ -54,7 +52,6 @@ class ActuatorDeadZone(Effect):
     id = "actuator_dead_zone"
     words = "a dead zone of the actuator"
     group = "actuator"
-    neutral = MappingProxyType({"width_V": 0.0})
     dependence = "continuous"
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
@@ -97,7 +94,6 @@ class ActuatorLag(Effect):
     id = "actuator_lag"
     words = "a lag of the actuator"
     group = "actuator"
-    neutral = MappingProxyType({"time_constant_s": 0.0})
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic, Scales, log_axis
-from plant.machine import JointPath, Machine, SensorPath, SmoothTorque, VoltagePath
+from plant.machine import Machine, SmoothTorque
 from plant.rig import Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
 
-P = TypeVar("P", VoltagePath, JointPath, SensorPath)
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
@@ -41,7 +41,8 @@ class Effect(BaseModel, ABC):
     group : str
         Where it acts: actuator, joint, link or sensor.
     neutral : mapping or None
-        Parameter values at which the effect vanishes exactly; None if there are none within the bounds.
+        Parameter values at which the effect vanishes exactly, zero for those not named; None if there are
+        none within the bounds.
     dependence : str
         How the outputs depend on the parameters: smooth (differentiable), continuous, or non-smooth.
     environment : bool
@@ -61,7 +62,7 @@ class Effect(BaseModel, ABC):
     id: ClassVar[str]
     words: ClassVar[str]
     group: ClassVar[Group]
-    neutral: ClassVar[Mapping[str, float] | None]
+    neutral: ClassVar[Mapping[str, float] | None] = MappingProxyType({})
     dependence: ClassVar[Dependence] = "smooth"
     environment: ClassVar[bool] = False
     friction: ClassVar[bool] = False
@@ -128,7 +129,12 @@ E = TypeVar("E", bound=Effect)
 
 
 def register(kind: type[E]) -> type[E]:
-    """Class decorator: the effect can be configured and diagnosed by its id (look-alikes: only diagnosed)."""
+    """Class decorator: the effect can be configured and diagnosed by its id (look-alikes: only diagnosed).
+
+    Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own.
+    """
+    if issubclass(kind, RatioEffect) and kind.multiplies is None and kind.modify is RatioEffect.modify:
+        raise TypeError(f"{kind.id} multiplies no stated value: it needs its own modify")
     (LOOK_ALIKES if kind.look_alike_of else EFFECTS)[kind.id] = kind
     return kind
 
@@ -136,13 +142,13 @@ def register(kind: type[E]) -> type[E]:
 class RatioEffect(Effect):
     """A stated value (`multiplies`) times a ratio."""
 
+    neutral = MappingProxyType({"ratio": 1.0})
     largest_ratio: ClassVar[float] = 10.0
 
     ratio: NotNegative
 
     def modify(self, machine: Machine) -> Machine:
-        if self.multiplies is None:
-            raise NotImplementedError(f"{self.id} multiplies no stated value: it needs its own modify")
+        assert self.multiplies is not None  # see `register`
         return with_parameters(machine, {self.multiplies: machine.rig.value(self.multiplies) * self.ratio})
 
     @classmethod
@@ -164,11 +170,11 @@ class RatioEffect(Effect):
 
 
 def with_voltage(machine: Machine, **changes: Any) -> Machine:
-    return replace(machine, voltage=_replaced(machine.voltage, changes))
+    return replace(machine, voltage=replace(machine.voltage, **changes))
 
 
 def with_joint(machine: Machine, **changes: Any) -> Machine:
-    return replace(machine, joint=_replaced(machine.joint, changes))
+    return replace(machine, joint=replace(machine.joint, **changes))
 
 
 def with_torque(machine: Machine, torque: SmoothTorque) -> Machine:
@@ -176,12 +182,8 @@ def with_torque(machine: Machine, torque: SmoothTorque) -> Machine:
 
 
 def with_sensor(machine: Machine, **changes: Any) -> Machine:
-    return replace(machine, sensor=_replaced(machine.sensor, changes))
+    return replace(machine, sensor=replace(machine.sensor, **changes))
 
 
 def with_parameters(machine: Machine, values: Mapping[str, float]) -> Machine:
     return replace(machine, rig=machine.rig.perturbed(values))
-
-
-def _replaced(path: P, changes: Mapping[str, Any]) -> P:
-    return replace(path, **changes)

@@ -42,7 +42,6 @@ class CoulombFriction(Effect):
     words = "dry (Coulomb) friction"
     group = "joint"
     friction = True
-    neutral = MappingProxyType({"torque_Nm": 0.0})
     dependence = "continuous"
 
     torque_Nm: float = Field(ge=0, le=_LARGEST_LEVEL_NM, description="friction level Tc")
@@ -66,9 +65,7 @@ class StribeckFriction(Effect):
     words = "dry friction that falls with speed (Stribeck)"
     group = "joint"
     friction = True
-    neutral = MappingProxyType(
-        {"static_torque_Nm": 0.0, "coulomb_torque_Nm": 0.0, "stribeck_velocity_rad_s": 0.1}
-    )
+    neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
     dependence = "continuous"
 
     static_torque_Nm: float = Field(
@@ -122,7 +119,6 @@ class ViscousFriction(Effect):
     words = "additional viscous friction"
     group = "joint"
     friction = True
-    neutral = MappingProxyType({"coefficient_Nms": 0.0})
 
     coefficient_Nms: NotNegative = Field(description="added to the rig's viscous friction")
 
@@ -148,7 +144,6 @@ class HubInertia(RatioEffect):
     id = "hub_inertia"
     words = "a wrong inertia of the hub"
     group = "joint"
-    neutral = MappingProxyType({"ratio": 1.0})
     multiplies = "hub.inertia_kg_m2"
 
     ratio: Positive = Field(description="true over nominal hub inertia")
@@ -161,7 +156,6 @@ class TorqueRipple(Effect):
     id = "torque_ripple"
     words = "torque ripple over the hub angle"
     group = "joint"
-    neutral = MappingProxyType({"amplitude_Nm": 0.0, "cycles_per_rev": 1.0, "phase_rad": 0.0})
     harmonic = "hub_angle"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")
@@ -188,7 +182,6 @@ class PeriodicDisturbance(Effect):
     words = "a periodic disturbance torque"
     group = "joint"
     environment = True
-    neutral = MappingProxyType({"amplitude_Nm": 0.0, "frequency_Hz": 1.0, "phase_rad": 0.0})
     harmonic = "time"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")
@@ -214,7 +207,6 @@ class HardeningSpring(Effect):
     id = "hardening_spring"
     words = "a hardening spring at the hub (cable, hose)"
     group = "joint"
-    neutral = MappingProxyType({"cubic_Nm_rad3": 0.0})
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
 
@@ -240,7 +232,6 @@ class GroundSpring(Effect):
     words = "a linear spring from hub to ground"
     group = "joint"
     look_alike_of = "gravity"
-    neutral = MappingProxyType({"stiffness_Nm_rad": 0.0})
 
     stiffness_Nm_rad: NotNegative = Field(description="stiffness k")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import MappingProxyType
 
 from pydantic import Field
 
@@ -19,7 +18,6 @@ class TipPayload(Effect):
     id = "tip_payload"
     words = "an additional mass at the tip"
     group = "link"
-    neutral = MappingProxyType({"mass_kg": 0.0})
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
 
@@ -39,7 +37,6 @@ class LinkStiffness(RatioEffect):
     id = "link_stiffness"
     words = "a wrong bending stiffness of the link"
     group = "link"
-    neutral = MappingProxyType({"ratio": 1.0})
     multiplies = "link.youngs_modulus_Pa"
 
     ratio: Positive = Field(description="true over nominal bending stiffness")
@@ -52,7 +49,6 @@ class StructuralDamping(RatioEffect):
     id = "structural_damping"
     words = "wrong damping of the link"
     group = "link"
-    neutral = MappingProxyType({"ratio": 1.0})
     multiplies = "link.kelvin_voigt_s"
     largest_ratio = 50.0
 
@@ -71,7 +67,6 @@ class Gravity(Effect):
     words = "gravity in a tilted plane"
     group = "link"
     environment = True
-    neutral = MappingProxyType({"acceleration_m_s2": 0.0})
 
     acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Self
 
 from pydantic import Field
@@ -20,7 +19,6 @@ class SensorGain(RatioEffect):
     id = "sensor_gain"
     words = "a wrong gain of the tip sensor"
     group = "sensor"
-    neutral = MappingProxyType({"ratio": 1.0})
 
     ratio: Positive = Field(description="measured over true tip position")
 
@@ -35,7 +33,6 @@ class SensorDrift(Effect):
     id = "sensor_drift"
     words = "a drift of the tip sensor"
     group = "sensor"
-    neutral = MappingProxyType({"rate_m_s": 0.0})
 
     rate_m_s: float = Field(description="drift of the tip sensor")
 
@@ -60,7 +57,6 @@ class Quantisation(Effect):
     id = "quantisation"
     words = "coarse quantisation of the tip sensor"
     group = "sensor"
-    neutral = MappingProxyType({"step_m": 0.0})
     dependence = "non-smooth"
 
     # Values on a grid are plain to see: the step is read off them (`diagnosis.machine.quantisation_grid`).
@@ -77,7 +73,6 @@ class SensorLag(Effect):
     id = "sensor_lag"
     words = "a lag of the tip sensor"
     group = "sensor"
-    neutral = MappingProxyType({"time_constant_s": 0.0})
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")
 

@@ -7,8 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs, simulate, without
-from plant.effects import CoulombFriction, InputDelay, TipPayload
+from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs, simulate
+from plant.effects import CoulombFriction, register
+from plant.effects.base import RatioEffect
 from plant.machine import Machine
 
 RIG = paper_link()
@@ -98,7 +99,10 @@ class TestContract:
             assert name in ("joint_compliance", "base_compliance", "backlash")
             return
         np.testing.assert_allclose(
-            _output(parse_effect({"name": name, **neutral})), nominal, rtol=0, atol=1e-12
+            _output(parse_effect({"name": name, **dict.fromkeys(EXAMPLES[name], 0.0), **neutral})),
+            nominal,
+            rtol=0,
+            atol=1e-12,
         )
 
     def test_the_outputs_depend_on_every_parameter_as_claimed(self, name):
@@ -197,15 +201,6 @@ def test_a_parametric_effect_is_the_rig_with_that_parameter():
         np.testing.assert_allclose(_output(_example(name)), simulate(rig, VOLTAGE).output, rtol=0, atol=1e-12)
 
 
-def test_without_takes_an_effect_out():
-    effects = (CoulombFriction(torque_Nm=0.1), InputDelay(delay_s=0.01), TipPayload(mass_kg=0.1))
-    assert without(effects, "input_delay") == (effects[0], effects[2])
-    assert without(effects, CoulombFriction) == effects[1:]
-    assert without(effects, "gravity") == effects
-    with pytest.raises(ValueError, match=r"unknown effect 'gravitation'; known effects: input_delay, "):
-        without(effects, "gravitation")
-
-
 @pytest.mark.parametrize(
     ("entry", "complaint"),
     [
@@ -246,7 +241,17 @@ def test_the_same_effect_twice_is_refused():
         simulate(RIG, VOLTAGE, ["coulomb_friction"])
 
 
-def test_play_at_rest_costs_no_more_than_play_in_motion():
+def test_a_ratio_that_multiplies_nothing_is_refused_when_it_is_registered():
+    with pytest.raises(TypeError, match="nothing multiplies no stated value"):
+
+        @register
+        class Nothing(RatioEffect):
+            id = "nothing"
+
+    assert "nothing" not in EFFECTS
+
+
+def test_backlash_at_rest_costs_no_more_than_backlash_in_motion():
     """Contacts at rest must not be followed in the smallest steps (a hundred times as many)."""
     rig = paper_link()
     moving = prbs(8, 6, 2.0, 1200)
