@@ -33,7 +33,7 @@ def true_modes_Hz(source: SimulatedSource) -> list[float]:
     rig = rig_of(source)
     added = sum(float(str(e["coefficient_Nms"])) for e in source.effects if e["name"] == "viscous_friction")
     hub = rig.hub.model_copy(update={"viscous_friction_Nms": rig.hub.viscous_friction_Nms + added})
-    poles = linear_arm(rig.model_copy(update={"hub": hub})).poles_rad_s()
+    poles = linear_arm(rig.model_copy(update={"hub": hub})).poles()
     swinging = np.sort(np.abs(poles[(poles.imag > 0) & (-poles.real < 0.6 * np.abs(poles))])) / (2 * np.pi)
     return [float(hertz) for hertz in swinging if hertz < EXCITED_HZ]
 

@@ -8,9 +8,14 @@ means "as nominal".
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar, cast
+
+import numpy as np
+import numpy.typing as npt
 
 from plant.rig import Rig
+
+Signal = TypeVar("Signal", float, npt.NDArray[np.float64])
 
 
 @dataclass(frozen=True)
@@ -23,11 +28,11 @@ class VoltagePath:
     limit_V: float = float("inf")
     lag_s: float = 0.0
 
-    def static(self, voltage_V: float) -> float:
+    def static(self, voltage_V: Signal) -> Signal:
         """The memoryless part: gain, dead zone, saturation."""
         value = self.gain * voltage_V
-        size = min(max(abs(value) - self.dead_zone_V, 0.0), self.limit_V)
-        return size if value >= 0 else -size
+        size = np.minimum(np.maximum(np.abs(value) - self.dead_zone_V, 0.0), self.limit_V)
+        return cast(Signal, np.copysign(size, value))
 
 
 @dataclass(frozen=True)

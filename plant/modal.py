@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
 
 from plant.beam import BeamModes, clamped_free_modes
 from plant.machine import Machine
@@ -55,8 +54,8 @@ class Equations:
         Absolute angle of the link root.
     tip : (N,)
         Tip position (r + L) * root angle + w(L).
-    play : (N,) or None
-        Motor side minus hub, where there is backlash.
+    backlash : (N,) or None
+        Motor side minus hub, where there is a gap between them.
     modes : BeamModes
     first_mode : int
         Index of the first modal coordinate; the last one is the last coordinate.
@@ -71,7 +70,7 @@ class Equations:
     encoder: Real
     root: Real
     tip: Real
-    play: Real | None
+    backlash: Real | None
     modes: BeamModes
     first_mode: int
 
@@ -177,7 +176,7 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         encoder=hub - base,
         root=root,
         tip=(rig.hub.radius_m + rig.link.length_m) * root + modes.tip @ deflection,
-        play=motor - hub if joint.backlash_gap_rad is not None else None,
+        backlash=motor - hub if joint.backlash_gap_rad is not None else None,
         modes=modes,
         first_mode=first,
     )
@@ -198,83 +197,23 @@ def static_moment_kg_m(rig: Rig) -> float:
     return rig.link.mass_per_length_kg_m * length * (r + length / 2) + rig.payload.mass_kg * (r + length)
 
 
-@dataclass(frozen=True, eq=False)
-class LinearArm:
-    """The nominal arm as a continuous-time linear state space without feedthrough.
+def linear_arm(rig: Rig, n_modes: int | None = None) -> control.StateSpace:
+    """The nominal arm as a continuous-time python-control model without feedthrough.
 
-    Attributes
-    ----------
-    A : (2N, 2N)
-        State (theta, q_1..q_M, their rates), N = 1 + M.
-    B : (2N, 3)
-        Inputs voltage_V, hub_torque_Nm (on the hub, from ground), tip_force_N (transverse).
-    C : (2, 2N)
-        Outputs hub_angle_rad, tip_m = (r + L) theta + w(L).
-    dt_s : float
-        Sampling period of the rig.
+    States (theta, q_1..q_M, their rates); inputs voltage_V, hub_torque_Nm (on the hub, from ground) and
+    tip_force_N (transverse); outputs hub_angle_rad and tip_m = (r + L) theta + w(L). n_modes None takes
+    `default_n_modes`.
     """
+    import control  # here, because it brings a plotting library with it
 
-    A: Real
-    B: Real
-    C: Real
-    dt_s: float
-    input_names = INPUT_NAMES
-    output_names = OUTPUT_NAMES
-
-    def __post_init__(self) -> None:
-        for name in ("A", "B", "C"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        n = self.A.shape[0]
-        if self.A.shape != (n, n) or self.B.shape != (n, 3) or self.C.shape != (2, n):
-            raise ValueError(
-                f"need A (N, N), B (N, 3), C (2, N); got {self.A.shape}, {self.B.shape}, {self.C.shape}"
-            )
-
-    def poles_rad_s(self) -> npt.NDArray[np.complex128]:
-        return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
-
-    def frequency_response(self, omega_rad_s: Real) -> npt.NDArray[np.complex128]:
-        """omega (F,) [rad/s] -> response (F, 2, 3) of the continuous-time arm."""
-        s = 1j * np.asarray(omega_rad_s, dtype=np.float64)
-        resolvent = s[:, None, None] * np.eye(self.A.shape[0]) - self.A
-        return np.asarray(self.C @ np.linalg.solve(resolvent, self.B[None].astype(np.complex128)))
-
-    def to_control(self, dt_s: float | None = None) -> control.StateSpace:
-        """The arm in python-control: continuous, or with held inputs sampled at dt_s."""
-        import control  # here, because it brings a plotting library with it
-
-        a, b = self.A, self.B
-        if dt_s is not None:
-            if not 0 < dt_s < np.inf:
-                raise ValueError(f"dt_s must be positive; got {dt_s}")
-            n, m = b.shape
-            block = np.zeros((n + m, n + m))
-            block[:n, :n], block[:n, n:] = a, b
-            block = expm(block * dt_s)
-            a, b = block[:n, :n], block[:n, n:]
-        return control.ss(
-            a,
-            b,
-            self.C,
-            np.zeros((2, 3)),
-            0 if dt_s is None else dt_s,
-            inputs=list(INPUT_NAMES),
-            outputs=list(OUTPUT_NAMES),
-            name="arm",
-        )
-
-
-def linear_arm(rig: Rig, n_modes: int | None = None) -> LinearArm:
-    """The nominal linear model of a rig; n_modes None takes `default_n_modes`."""
     equations = equations_of_motion(Machine(rig), default_n_modes(rig) if n_modes is None else n_modes)
-    gain = rig.motor.torque_per_volt_Nm_V
-    return LinearArm(
-        A=equations.state_matrix(),
-        B=np.column_stack(
-            [equations.input_column(d) for d in (gain * equations.shaft, equations.hub, equations.tip)]
-        ),
-        C=np.array([equations.position_row(equations.encoder), equations.position_row(equations.tip)]),
-        dt_s=rig.sampling.dt_s,
+    drive = rig.motor.torque_per_volt_Nm_V * equations.shaft
+    return control.ss(
+        equations.state_matrix(),
+        np.column_stack([equations.input_column(d) for d in (drive, equations.hub, equations.tip)]),
+        np.array([equations.position_row(equations.encoder), equations.position_row(equations.tip)]),
+        np.zeros((2, 3)),
+        inputs=list(INPUT_NAMES),
+        outputs=list(OUTPUT_NAMES),
+        name="arm",
     )

@@ -14,6 +14,7 @@ switching or smooth forces there is one exact step a sample.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -47,62 +48,36 @@ _GROWTH_PER_STEP = 0.3
 _SMALLEST_PART = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Arrays of `plant.kernel.run` under its names, the initial state, and the whole samples of delay."""
-
-    substeps: Integer
-    step: Real
-    reach: Real
-    output_rows: Real
-    element: Real
-    element_rows: Real
-    element_rate: Real
-    channel_kind: Integer
-    channel: Real
-    channel_rows: Real
-    static_moment: Real
-    geometric_stiffness: Real
-    initial_state: Real
-    delay_samples: int
-
-    def advance(self, inputs: Real, observed: Real, state: PlanState) -> None:
-        """Run the compiled stepper over inputs (T, 4), filling observed (T, 3) and changing the state."""
-        run(
-            inputs,
-            observed,
-            state.x,
-            state.reference,
-            state.mode,
-            self.substeps,
-            self.step,
-            self.reach,
-            self.output_rows,
-            self.element,
-            self.element_rows,
-            self.element_rate,
-            self.channel_kind,
-            self.channel,
-            self.channel_rows,
-            self.static_moment,
-            self.geometric_stiffness,
-        )
-
-    def at_rest(self) -> PlanState:
-        """The state at time zero: at rest, every friction element stuck, every contact open."""
-        n_elements = self.element.shape[0]
-        return PlanState(
-            self.initial_state.copy(), np.zeros(n_elements), np.zeros(n_elements, dtype=np.int64)
-        )
-
-
-@dataclass(eq=False)
-class PlanState:
-    """What the stepper changes in place: state, slider positions, slip and contact signs."""
+class PlanState(NamedTuple):
+    """What the stepper changes in place: state (N,), slider positions (E,), slip and contact signs (E,)."""
 
     x: Real
     reference: Real
     mode: Integer
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The last arguments of `plant.kernel.run`, from `substeps` on, and what is needed beside them.
+
+    parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (3, N).
+    """
+
+    arguments: tuple[Any, ...]
+    output_rows: Real
+    initial_state: Real
+    n_elements: int
+    parts: int
+    delay_samples: int
+
+    def advance(self, inputs: Real, observed: Real, state: PlanState) -> None:
+        """Run the compiled stepper over inputs (T, 4), filling observed (T, 3) and changing the state."""
+        run(inputs, observed, *state, *self.arguments)
+
+    def at_rest(self) -> PlanState:
+        """The state at time zero: at rest, every friction element stuck, every contact open."""
+        n = self.n_elements
+        return PlanState(self.initial_state.copy(), np.zeros(n), np.zeros(n, dtype=np.int64))
 
 
 def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: float) -> Plan:
@@ -136,23 +111,21 @@ def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: flo
     for q, a in enumerate(state_matrices):
         for e in range(n_elements):
             rate[q, e] = element_rows[e, 1] @ np.hstack([a, held_columns, force_columns])
-    static_moment, geometric_stiffness = builder.gravity()
-    return Plan(
-        substeps=np.array(substeps, dtype=np.int64),
-        step=step,
-        reach=reach,
-        output_rows=builder.outputs(),
-        element=element,
-        element_rows=element_rows,
-        element_rate=rate,
-        channel_kind=kinds,
-        channel=channel,
-        channel_rows=np.ascontiguousarray(channel_rows.T),
-        static_moment=static_moment,
-        geometric_stiffness=geometric_stiffness,
-        initial_state=builder.initial_state(),
-        delay_samples=whole,
+    output_rows = builder.outputs()
+    arguments = (
+        np.array(substeps, dtype=np.int64),
+        step,
+        reach,
+        output_rows,
+        element,
+        element_rows,
+        rate,
+        kinds,
+        channel,
+        np.ascontiguousarray(channel_rows.T),
+        *builder.gravity(),
     )
+    return Plan(arguments, output_rows, builder.initial_state(), n_elements, len(substeps), whole)
 
 
 def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
@@ -235,8 +208,8 @@ class _Builder:
     def _element_columns(self) -> Real:
         """One column per element: friction drives the shaft, contact the hub against the motor side."""
         columns = [self._column(self.equations.shaft) for _ in self._friction()]
-        if self.equations.play is not None:
-            columns.append(-self._column(self.equations.play))
+        if self.equations.backlash is not None:
+            columns.append(-self._column(self.equations.backlash))
         return np.column_stack(columns) if columns else np.zeros((self.n, 0))
 
     def _friction(self) -> list[tuple[float, float, float, float]]:
@@ -257,12 +230,12 @@ class _Builder:
         parameters: list[tuple[float, ...]] = [(FRICTION, *f, 0.0) for f in self._friction()]
         directions = [eq.shaft] * len(parameters)
         gap = self.machine.joint.backlash_gap_rad
-        if gap is not None and eq.play is not None:
+        if gap is not None and eq.backlash is not None:
             inertia = self.machine.rig.hub.inertia_kg_m2
             stiffness = 0.21 * inertia * (2 * np.pi * 180) ** 2
             damping = 0.8 * np.sqrt(MOTOR_SIDE_SHARE * inertia * stiffness)
             parameters.append((CONTACT, gap / 2, stiffness, damping, 0.0, 0.0))
-            directions.append(eq.play)
+            directions.append(eq.backlash)
         rows = np.array([[self._position(d), self._speed(d)] for d in directions])
         return np.array(parameters).reshape(-1, 6), rows.reshape(-1, 2, self.n)
 

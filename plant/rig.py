@@ -10,6 +10,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -196,9 +197,14 @@ class Rig(BaseModel):
         )
 
 
+@cache
 def parameter_keys() -> tuple[str, ...]:
     """Dotted keys of all parameters of a Rig, in file order."""
-    return _PARAMETER_KEYS
+    return tuple(
+        f"{section}.{key}"
+        for section, field in Rig.model_fields.items()
+        for key in getattr(field.annotation, "model_fields", ())
+    )
 
 
 def one_line(error: ValidationError) -> str:
@@ -210,7 +216,7 @@ def one_line(error: ValidationError) -> str:
     if kind == "missing":
         text = f"{key}: missing, expected a value"
     elif kind == "extra_forbidden":
-        close = get_close_matches(key, (*_PARAMETER_KEYS, *Rig.model_fields), n=1, cutoff=0.7)
+        close = get_close_matches(key, (*parameter_keys(), *Rig.model_fields), n=1, cutoff=0.7)
         text = f"{key}: unknown key" + (f" (did you mean {close[0]}?)" if close else "")
     elif kind == "value_error":
         text = f"{key}: {message}" if key else message
@@ -218,17 +224,3 @@ def one_line(error: ValidationError) -> str:
         expected = message.removeprefix("Input should be ")
         text = f"{key}: expected {expected}, got {first['input']!r}"
     return text
-
-
-_PARAMETER_KEYS: tuple[str, ...] = tuple(
-    f"{section}.{name}"
-    for section, model in (
-        ("link", Link),
-        ("hub", Hub),
-        ("motor", Motor),
-        ("payload", Payload),
-        ("sensors", Sensors),
-        ("sampling", Sampling),
-    )
-    for name in model.model_fields
-)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
@@ -56,13 +56,6 @@ class Trajectory:
     def output(self) -> Real:
         """(T, 2): hub_angle_rad, tip_m as measured."""
         return np.column_stack([self.hub_angle_rad, self.tip_m])
-
-    def to_arrays(self) -> dict[str, npt.NDArray[np.float64]]:
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
-
-    @classmethod
-    def from_arrays(cls, mapping: Mapping[str, npt.NDArray[np.float64]]) -> Trajectory:
-        return cls(**{entry.name: np.asarray(mapping[entry.name]) for entry in fields(cls)})
 
 
 def simulate(
@@ -135,10 +128,10 @@ class Simulator:
         voltage = _signal("voltage_V", voltage_V, None)
         n_samples = voltage.size
         acting = np.zeros(plan.delay_samples + 1 + n_samples)
-        acting[plan.delay_samples + 1 :] = _static(machine, voltage)
+        acting[plan.delay_samples + 1 :] = machine.voltage.static(voltage)
         inputs = np.zeros((n_samples, 4))
         late, early = acting[:n_samples], acting[1 : n_samples + 1]
-        inputs[:, 0], inputs[:, 1] = (late, early) if plan.substeps.size == 2 else (early, early)
+        inputs[:, 0], inputs[:, 1] = (late if plan.parts == 2 else early), early
         if hub_torque_Nm is not None:
             inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
         if tip_force_N is not None:
@@ -158,7 +151,7 @@ class Simulator:
         )
 
 
-class SampledArm:
+class SampledArm(Simulator):
     """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
 
     The same compiled stepper and the same numbers as `simulate`. It is the one object of this package with
@@ -177,23 +170,18 @@ class SampledArm:
         n_modes: int | None = None,
         substep_s: float = SUBSTEP_S,
     ) -> None:
-        prepared = Simulator(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
-        self._machine, self._dt_s, self._plan = prepared.machine, prepared.dt_s, prepared.plan
+        super().__init__(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
         self._rng = rng
         self._inputs = np.zeros((1, 4))
         self._unused = np.empty((1, 3))
-        self._rows = self._plan.output_rows
+        self._rows = self.plan.output_rows
         self.reset()
-
-    @property
-    def dt_s(self) -> float:
-        return self._dt_s
 
     def reset(self) -> None:
         """Back to rest at time zero. The noise generator goes on; it is not rewound."""
-        self._state = self._plan.at_rest()
+        self._state = self.plan.at_rest()
         self._sample = 0
-        self._pending: deque[float] = deque([0.0] * (self._plan.delay_samples + 1))
+        self._pending: deque[float] = deque([0.0] * (self.plan.delay_samples + 1))
         self._measurement: Real | None = None
 
     @property
@@ -206,9 +194,9 @@ class SampledArm:
         if self._measurement is None:
             hub, _, tip = (self._rows @ self._state.x).tolist()
             hub_noise, tip_noise = (0.0, 0.0) if self._rng is None else self._rng.standard_normal(2).tolist()
-            sensors = self._machine.rig.sensors
-            time = self._sample * self._dt_s
-            reading = _tip_reading(self._machine.sensor, tip, time, sensors.tip_noise_m * tip_noise)
+            sensors = self.machine.rig.sensors
+            time = self._sample * self.dt_s
+            reading = _tip_reading(self.machine.sensor, tip, time, sensors.tip_noise_m * tip_noise)
             self._measurement = np.array([hub + sensors.hub_angle_noise_rad * hub_noise, reading])
         return self._measurement.copy()
 
@@ -220,24 +208,14 @@ class SampledArm:
             )
         if self._rng is not None:
             self.measure()  # every instant takes its noise, looked at or not
-        self._pending.append(self._machine.voltage.static(float(voltage_V)))
+        self._pending.append(self.machine.voltage.static(float(voltage_V)))
         late = self._pending.popleft()
         row = self._inputs[0]
-        row[0], row[1] = (
-            (late, self._pending[0])
-            if self._plan.substeps.size == 2
-            else (self._pending[0], self._pending[0])
-        )
+        row[0], row[1] = late if self.plan.parts == 2 else self._pending[0], self._pending[0]
         row[2], row[3] = hub_torque_Nm, tip_force_N
-        self._plan.advance(self._inputs, self._unused, self._state)
+        self.plan.advance(self._inputs, self._unused, self._state)
         self._sample += 1
         self._measurement = None
-
-
-def _static(machine: Machine, voltage: Real) -> Real:
-    path = machine.voltage
-    value = path.gain * voltage
-    return np.asarray(np.copysign(np.clip(np.abs(value) - path.dead_zone_V, 0.0, path.limit_V), value))
 
 
 def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int) -> Real:

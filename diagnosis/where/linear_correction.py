@@ -60,7 +60,7 @@ def _clear(residuals: Mapping[str, Real], names: list[str]) -> bool:
 
 def _poles(case: Case) -> Poles:
     dt = case.rig.sampling.dt_s
-    z = np.exp(linear_arm(case.rig).poles_rad_s() * dt)
+    z = np.exp(linear_arm(case.rig).poles() * dt)
     # The integrator of the hub enters as summed input: a pole inside the circle cannot stand for it.
     inside = z[np.abs(z) < 1 - 1e-7]
     real = inside.real[np.abs(inside.imag) < 1e-12]

@@ -43,7 +43,7 @@ def test_an_identified_model_with_integrator_and_its_posterior_are_an_uncertain_
 def test_the_arm_without_effects_answers_like_its_linear_model_and_saturates_with_a_limit():
     rig = paper_link()
     arm = SampledArm(rig)
-    model = linear_arm(rig).to_control()
+    model = linear_arm(rig)
     hub = control.c2d(
         control.ss(model.A, np.asarray(model.B)[:, :1], np.asarray(model.C)[:1], 0), arm.dt_s, "zoh"
     )

@@ -28,7 +28,7 @@ def test_the_example_is_the_arm_it_says():
     # The transfer function is written by hand from the equations; the arm's state space knows nothing of it.
     omega = np.geomspace(0.5, 100, 30)
     arm = linear_arm(paper_example_rig(), n_modes=1)
-    np.testing.assert_allclose(arm.frequency_response(omega)[:, 1, 1], paper_example()(1j * omega), rtol=1e-8)
+    np.testing.assert_allclose(arm(1j * omega)[1, 1], paper_example()(1j * omega), rtol=1e-8)
     # The rigid-body gain is that of the turning arm, (L / I) / s^2.
     rig = paper_example_rig()
     inertia = rig.hub.inertia_kg_m2 + rig.link.mass_per_length_kg_m / 3

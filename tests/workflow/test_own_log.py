@@ -32,7 +32,7 @@ def test_readme_walkthrough_from_csv_files_to_a_certified_controller(flexlink, t
     assert (tmp_path / "hub.html").is_file()
     assert read_model(tmp_path / "hub.mat").model.output_name == "hub_angle_rad"
     # First mode of the arm behind the logs with its hub free, from the physical model alone.
-    poles = linear_arm(paper_link()).poles_rad_s()
+    poles = linear_arm(paper_link()).poles()
     flexible = min(abs(pole) for pole in poles if pole.imag > 10) / (2 * np.pi)
     modes = [mode["frequency_Hz"] for mode in json.loads(told.out)["numbers"]["modes"]]
     assert min(abs(frequency - flexible) for frequency in modes) < 0.02 * flexible

@@ -31,7 +31,7 @@ def test_truth_is_that_of_the_linear_arm_with_its_viscous_friction():
     )
     rig = rig_of(source)
     hub = rig.hub.model_copy(update={"viscous_friction_Nms": rig.hub.viscous_friction_Nms + added})
-    poles = linear_arm(rig.model_copy(update={"hub": hub})).poles_rad_s()
+    poles = linear_arm(rig.model_copy(update={"hub": hub})).poles()
     expected = np.sort(np.abs(poles[(poles.imag > 0) & (-poles.real < 0.6 * np.abs(poles))])) / (2 * np.pi)
     modes = truth.truth_of(source).modes["tip_m"]
     assert len(modes) >= 2

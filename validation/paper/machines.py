@@ -142,11 +142,11 @@ class LinkExperiment:
     @cached_property
     def system(self) -> Any:
         """The arm without dry friction, voltage held over a sample."""
-        return linear_arm(self.rig).to_control(DT_S)
+        return linear_arm(self.rig).sample(DT_S)
 
     @property
     def mode(self) -> tuple[float, float]:
-        poles = linear_arm(self.rig).poles_rad_s()
+        poles = linear_arm(self.rig).poles()
         pairs = poles[poles.imag > 0]
         pole = complex(pairs[np.argmin(np.abs(pairs))])
         return abs(pole), -pole.real / abs(pole)

@@ -58,7 +58,7 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
     The lowest flexible modes of the nominal rig are marked.
     """
     dt_s = found.case.rig.sampling.dt_s
-    poles = linear_arm(found.case.rig).poles_rad_s()
+    poles = linear_arm(found.case.rig).poles()
     modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
     with style.house_style():
         figure = style.new_figure(3.7)
