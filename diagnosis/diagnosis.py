@@ -368,16 +368,18 @@ def _named(
         entries.append(
             NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
         )
-    answer = weighed.answer
-    order = {name: k for k, name in enumerate(together)}
-    entries.sort(key=lambda e: (order.get(e.name, len(order)), -e.presence, -e.probability))
-    others = [
+    entries += [
         NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
         for name in ("none", "unknown")
     ]
-    others.sort(key=lambda e: -e.probability)
-    first = [e for e in others if e.name == answer]
-    return (*first, *entries, *(e for e in others if e.name != answer))
+    order = {weighed.answer: -1, **{name: k for k, name in enumerate(together)}}
+    last_ones = {"none", "unknown"} - {weighed.answer}
+    return tuple(
+        sorted(
+            entries,
+            key=lambda e: (e.name in last_ones, order.get(e.name, len(order)), -e.presence, -e.probability),
+        )
+    )
 
 
 def _intervals(

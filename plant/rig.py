@@ -17,16 +17,16 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-_STRICT = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
-class Link(BaseModel):
-    """A uniform Euler-Bernoulli link of rectangular cross section; it bends about I = b h^3 / 12."""
+class _Checked(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    model_config = _STRICT
+
+class Link(_Checked):
+    """A uniform Euler-Bernoulli link of rectangular cross section; it bends about I = b h^3 / 12."""
 
     length_m: Positive = Field(description="free length, from the clamp to the tip")
     width_m: Positive = Field(description="side b of the cross section, along the bending axis")
@@ -44,20 +44,16 @@ class Link(BaseModel):
         return self.youngs_modulus_Pa * self.width_m * self.thickness_m**3 / 12.0
 
 
-class Hub(BaseModel):
+class Hub(_Checked):
     """The rigid body between motor and link."""
-
-    model_config = _STRICT
 
     inertia_kg_m2: Positive = Field(description="about the hub axis, reflected motor inertia included")
     radius_m: NotNegative = Field(description="distance from the hub axis to the clamp")
     viscous_friction_Nms: NotNegative = Field(description="linear friction of motor and gear, at the hub")
 
 
-class Motor(BaseModel):
+class Motor(_Checked):
     """A voltage-driven direct-current motor without inductance, behind a rigid gear."""
-
-    model_config = _STRICT
 
     torque_constant_Nm_A: Positive = Field(description="torque constant, motor side")
     back_emf_Vs_rad: NotNegative = Field(description="back-EMF constant, motor side")
@@ -75,39 +71,31 @@ class Motor(BaseModel):
         return self.torque_per_volt_Nm_V * self.gear_ratio * self.back_emf_Vs_rad
 
 
-class Payload(BaseModel):
+class Payload(_Checked):
     """A point mass at the tip, without rotary inertia."""
-
-    model_config = _STRICT
 
     mass_kg: NotNegative = Field(description="point mass at the tip")
 
 
-class Sensors(BaseModel):
+class Sensors(_Checked):
     """White Gaussian measurement noise of the two outputs."""
-
-    model_config = _STRICT
 
     hub_angle_noise_rad: NotNegative = Field(description="standard deviation of the hub angle noise")
     tip_noise_m: NotNegative = Field(description="standard deviation of the tip position noise")
 
 
-class Sampling(BaseModel):
+class Sampling(_Checked):
     """Sampling of inputs (held) and outputs."""
-
-    model_config = _STRICT
 
     dt_s: Positive = Field(description="sampling period; the voltage is held over it")
 
 
-class Rig(BaseModel):
+class Rig(_Checked):
     """Nominal parameters of the arm; immutable and checked when built.
 
     `tolerances` holds relative standard deviations of nominal values under dotted keys such as
     "hub.inertia_kg_m2"; a parameter that is not listed is exact.
     """
-
-    model_config = _STRICT
 
     link: Link
     hub: Hub

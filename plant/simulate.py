@@ -111,9 +111,10 @@ class Simulator:
         substep_s: float = SUBSTEP_S,
     ) -> None:
         self.machine = make_machine(rig, effects)
-        self.dt_s = _sampling_period(rig, dt_s)
-        substep = _positive("substep_s", substep_s)
-        self.plan = make_plan(self.machine, self.dt_s, _mode_count(n_modes), substep)
+        self.dt_s = rig.sampling.dt_s if dt_s is None else _positive("dt_s", dt_s)
+        if n_modes is not None and not n_modes >= 1:
+            raise ValueError(f"n_modes must be at least 1; got {n_modes}")
+        self.plan = make_plan(self.machine, self.dt_s, n_modes, _positive("substep_s", substep_s))
 
     def run(
         self,
@@ -234,20 +235,10 @@ def _tip_reading(sensor: SensorPath, tip: F, time: F, noise: F) -> F:
     return reading
 
 
-def _sampling_period(rig: Rig, dt_s: float | None) -> float:
-    return rig.sampling.dt_s if dt_s is None else _positive("dt_s", dt_s)
-
-
 def _positive(name: str, value: float) -> float:
     if not 0 < value < np.inf:
         raise ValueError(f"{name} must be positive and finite; got {value}")
     return float(value)
-
-
-def _mode_count(n_modes: int | None) -> int | None:
-    if n_modes is not None and not n_modes >= 1:
-        raise ValueError(f"n_modes must be at least 1; got {n_modes}")
-    return n_modes
 
 
 def _signal(name: str, values: npt.ArrayLike, n_samples: int | None) -> Real:

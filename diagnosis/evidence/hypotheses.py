@@ -21,11 +21,11 @@ from plant.effects import EFFECTS
 # Solver disagreement in noise deviations (half-normal scale); 0.2 between two solvers of backlash.
 DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
-_PRIOR_NONE, _PRIOR_UNKNOWN = 0.25, 0.1
+_PRIOR_NONE, PRIOR_UNKNOWN = 0.25, 0.1
 _PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
 _UNKNOWN = ("unknown",)
 # An unknown cause beside a set of effects, relative to that set alone.
-_UNKNOWN_BESIDE = float(np.log(_PRIOR_UNKNOWN / _PRIOR_NONE))
+_UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_NONE))
 # Where contacts switch, what two correct solvers disagree about is not white: further effects beside a
 # non-smooth one can follow some of it, so they have to gain more (in log weight) to be believed.
 BESIDE_NON_SMOOTH = 20.0
@@ -101,11 +101,6 @@ def log_prior(names: Sequence[str], n: int = len(EFFECTS)) -> float:
     count = len(names)
     sets = np.prod([(n - i) / (i + 1) for i in range(count)])
     return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
-
-
-def log_prior_unknown() -> float:
-    """log prior probability of a cause that is not listed, alone."""
-    return float(np.log(_PRIOR_UNKNOWN))
 
 
 def disagreement_gain(fit: Fit, left: Discrepancy) -> float:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, log_prior, log_prior_unknown
+from diagnosis.evidence.hypotheses import PRIOR_UNKNOWN, STILL_POSSIBLE, Hypothesis, log_prior
 from diagnosis.evidence.search import weighed
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.residual import ResidualModel
@@ -36,7 +36,7 @@ def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fi
     for kind in LOOK_ALIKES.values():
         name = str(kind.look_alike_of)
         # As probable as a set with the effect would be, times what an unknown cause is beside a listed one.
-        unlisted = log_prior_unknown() + float(np.log(_SHARE)) - log_prior((name,))
+        unlisted = float(np.log(PRIOR_UNKNOWN) + np.log(_SHARE)) - log_prior((name,))
         for h in hypotheses:
             if name in h.names and h.largest_weight > best - STILL_POSSIBLE:
                 other = weighed(model, _with(model, h.fit, name, kind), base)

@@ -24,10 +24,6 @@ class FlexibleArm:
     rig: Rig
 
     @property
-    def output_names(self) -> tuple[str, ...]:
-        return ("hub_angle_rad", "tip_m")
-
-    @property
     def noise(self) -> Real:
         sensors = self.rig.sensors
         return np.array([sensors.hub_angle_noise_rad, sensors.tip_noise_m])

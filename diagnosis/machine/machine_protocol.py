@@ -65,10 +65,6 @@ class Machine(StatedValues, Protocol):
     """A machine that can be simulated, as its makers know it."""
 
     @property
-    def output_names(self) -> tuple[str, ...]:
-        """(Y,) names with units."""
-
-    @property
     def noise(self) -> Real:
         """(Y,) noise standard deviations in the outputs' units."""
 

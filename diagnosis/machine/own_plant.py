@@ -14,7 +14,8 @@ or effects that merely resemble it win.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from types import MappingProxyType
 from typing import Any, Literal
@@ -193,7 +194,6 @@ class Plant:
     effects: tuple[PlantEffect, ...]
     model_error: float = 0.0
     correlation_samples: float = 1.0
-    _weighing: Weighing = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         noise = readonly(self.noise)
@@ -221,12 +221,11 @@ class Plant:
                 raise ValueError(f"plant: effect {name} is listed twice")
         if not names:
             raise ValueError("plant: lists no effect that may be missing")
-        weighing = Weighing(tuple(names), float(self.model_error), float(self.correlation_samples))
-        object.__setattr__(self, "_weighing", weighing)
 
-    @property
+    @cached_property
     def weighing(self) -> Weighing:
-        return self._weighing
+        names = tuple(effect.name for effect in self.effects)
+        return Weighing(names, float(self.model_error), float(self.correlation_samples))
 
     @property
     def description(self) -> Plant:

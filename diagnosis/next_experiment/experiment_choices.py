@@ -18,27 +18,26 @@ Parameters = Mapping[str, float | int | str]
 
 @dataclass(frozen=True)
 class Limits:
-    """What an experiment may ask of the machine; None is no limit.
+    """What an experiment may ask of the machine.
 
     Attributes
     ----------
     voltage_V : float
         Largest commanded voltage.
-    hub_angle_rad : float or None
+    hub_angle_rad : float
         Largest deviation of the hub angle from the start.
-    deflection_m : float or None
+    deflection_m : float
         Largest deflection of the tip, tip_m - (r + L) hub_angle.
     """
 
     voltage_V: float
-    hub_angle_rad: float | None = None
-    deflection_m: float | None = None
+    hub_angle_rad: float = np.inf
+    deflection_m: float = np.inf
 
     def __post_init__(self) -> None:
         for name in ("voltage_V", "hub_angle_rad", "deflection_m"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"limit {name} must be positive and finite; got {value}")
+            if not getattr(self, name) > 0:
+                raise ValueError(f"limit {name} must be positive; got {getattr(self, name)}")
 
     @classmethod
     def of_records(cls, case: Case) -> Limits:
@@ -125,10 +124,7 @@ def within(
         excitation = excitation.scaled(limits.voltage_V / excitation.amplitude_V)
     for _ in range(5):
         angle, deflection = respond(excitation.voltage_V)
-        excess = max(
-            angle / limits.hub_angle_rad if limits.hub_angle_rad is not None else 0.0,
-            deflection / limits.deflection_m if limits.deflection_m is not None else 0.0,
-        )
+        excess = max(angle / limits.hub_angle_rad, deflection / limits.deflection_m)
         if not np.isfinite(excess):
             return None
         if excess <= 1:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from scipy.signal import fftconvolve
 from scipy.stats import chi2
 
 from diagnosis.machine.case import Case
@@ -80,35 +80,34 @@ def missing_functions(
             explained, rank, values, errors = _solve(gram, moment)
             p_value = float(chi2.sf(explained, rank))
             share = float((explained - rank) / gap) if gap > 0 else 0.0
-            by_chance = 0.0
+            by_chance, beyond = 0.0, False
             if p_value < level / tests and share >= _LEAST_SHARE:
-                shares = []
-                for _ in range(_SHIFTS):
+                shares = np.zeros(_SHIFTS)
+                for k in range(_SHIFTS):
                     moved_on = {
                         name: np.roll(f, _shift(f.shape[0], rng), axis=0)
                         for name, f in basis.functions.items()
                     }
                     again = _solve(*_normal_equations(route, moved_on, residuals, torque, case.noise))
-                    shares.append((again[0] - again[1]) / gap)
+                    shares[k] = (again[0] - again[1]) / gap
                 by_chance = float(np.quantile(shares, 0.95))
-                p_value = max(p_value, (1 + np.count_nonzero(np.array(shares) >= share)) / (_SHIFTS + 1))
-                beyond = share > max(shares)
-            else:
-                beyond = False
-            curve = EquivalentCurve(
-                route,
-                axis,
-                _VARIABLES[axis][1],
-                value_unit,
-                tuple(float(v) for v in basis.nodes),
-                tuple(float(v) for v in values),
-                tuple(float(v) for v in errors),
-                share,
-                by_chance,
-                float(p_value),
-                bool(beyond),
+                p_value = max(p_value, (1 + np.count_nonzero(shares >= share)) / (_SHIFTS + 1))
+                beyond = bool(share > np.max(shares))
+            found.append(
+                EquivalentCurve(
+                    route,
+                    axis,
+                    _VARIABLES[axis][1],
+                    value_unit,
+                    tuple(float(v) for v in basis.nodes),
+                    tuple(float(v) for v in values),
+                    tuple(float(v) for v in errors),
+                    share,
+                    by_chance,
+                    float(p_value),
+                    beyond,
+                )
             )
-            found.append(curve)
     return tuple(found)
 
 
@@ -167,9 +166,7 @@ def _normal_equations(
         e = residuals[name]
         if route == "hub_torque":
             T = f.shape[0]
-            n = next_fast_len(2 * T - 1, real=True)
-            spectrum = rfft(f.T, n)[None] * rfft(torque[:T].T, n)[:, None]
-            columns = irfft(spectrum, n)[:, :, :T]  # (2, K, T)
+            columns = fftconvolve(f.T[None], torque[:T].T[:, None], axes=-1)[:, :, :T]  # (2, K, T)
             for s in range(columns.shape[0]):
                 gram += columns[s] @ columns[s].T
                 moment += columns[s] @ e[:, s]

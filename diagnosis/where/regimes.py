@@ -118,7 +118,7 @@ def regime_axes(moved: Mapping[str, Motion], bins: int = 5) -> tuple[RegimeAxis,
             ((-fastest, -still), (still, fastest)),
             {name: np.where(v > still, 1, np.where(v < -still, 0, -1)) for name, v in speed.items()},
         ),
-        _quantiles("speed_size", "rad/s", of("speed_rad_s", True), bins, "at {}"),
+        _quantiles("speed_size", "rad/s", of("speed_rad_s", True), bins),
         RegimeAxis(
             "reversal",
             "",
@@ -126,9 +126,9 @@ def regime_axes(moved: Mapping[str, Motion], bins: int = 5) -> tuple[RegimeAxis,
             ((0.0, 1.0), (1.0, 2.0)),
             {name: moved[name].near_reversal.astype(np.int64) for name in names},
         ),
-        _quantiles("angle", "rad", of("angle_rad"), bins, "at {}"),
-        _quantiles("deflection", "m", of("deflection_m"), bins, "at {}"),
-        _quantiles("command_size", "V", of("command_V", True), bins, "at {}"),
+        _quantiles("angle", "rad", of("angle_rad"), bins),
+        _quantiles("deflection", "m", of("deflection_m"), bins),
+        _quantiles("command_size", "V", of("command_V", True), bins),
         _stretches(of("time_s"), bins + 1),
     ]
     return tuple(axis for axis in axes if axis is not None and _enough(axis))
@@ -141,17 +141,13 @@ def _enough(axis: RegimeAxis) -> bool:
     return len(axis.titles) >= 2 and bool(np.all(counts >= _LEAST_SAMPLES))
 
 
-def quantile_labels(
-    values: Mapping[str, Real], bins: int
-) -> tuple[tuple[tuple[float, float], ...], dict[str, Integer]] | None:
-    """Bins of about equal count over all experiments, ((low, high), ...) and labels; None if all are equal.
+def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int) -> RegimeAxis | None:
+    """Bins of about equal count over all experiments; None if all values are equal.
 
     Many equal values (a binary voltage) make fewer bins, none of them with less than half the mean count.
     """
     everything = np.concatenate(list(values.values()))
     span = float(np.ptp(everything))
-    if span <= 0:
-        return None
     inner: list[float] = []
     last = float(np.min(everything))
     for q in np.linspace(0, 1, bins + 1)[1:-1]:
@@ -165,18 +161,9 @@ def quantile_labels(
             last = cut
     if not inner:
         return None
-    edges = (float(np.min(everything)), *inner, float(np.max(everything)))
+    edges = tuple(pairwise((float(np.min(everything)), *inner, float(np.max(everything)))))
     labels = {name: np.searchsorted(inner, v, side="right") for name, v in values.items()}
-    return tuple(pairwise(edges)), labels
-
-
-def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int, title: str) -> RegimeAxis | None:
-    cut = quantile_labels(values, bins)
-    if cut is None:
-        return None
-    edges, labels = cut
-    titles = tuple(title.format(f"{low:.3g} to {high:.3g} {unit}") for low, high in edges)
-    return RegimeAxis(name, unit, titles, edges, labels)
+    return RegimeAxis(name, unit, tuple(f"at {a:.3g} to {b:.3g} {unit}" for a, b in edges), edges, labels)
 
 
 def _stretches(time: Mapping[str, Real], bins: int) -> RegimeAxis:

@@ -44,9 +44,6 @@ class Energy:
     def p_value(self) -> float:
         return float(chi2.sf(self.squares, self.count))
 
-    def __add__(self, other: Energy) -> Energy:
-        return Energy(self.squares + other.squares, self.count + other.count)
-
 
 def total(parts: Sequence[Energy]) -> Energy:
     return Energy(sum(p.squares for p in parts), sum(p.count for p in parts))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import product
+from itertools import permutations, product
+from operator import itemgetter
 
 import numpy as np
 from scipy.stats import chi2
 from scipy.stats import t as student
 
+from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import SENSORS, AmplitudeFinding, CommonFinding, DriftFinding, Growth, Interval
@@ -58,23 +60,6 @@ def drift_findings(case: Case, residuals: Mapping[str, Real], level: float) -> t
     return tuple(found)
 
 
-def amplitude_pair(case: Case) -> tuple[Experiment, Experiment] | None:
-    """Weakest and strongest open-loop experiment of one kind, if they differ enough."""
-    best: tuple[float, Experiment, Experiment] | None = None
-    for low in case.experiments:
-        for high in case.experiments:
-            if low.closed_loop or high.closed_loop or low.kind != high.kind or _rms(low) == 0:
-                continue
-            ratio = _rms(high) / _rms(low)
-            if ratio >= _LEAST_RATIO and (best is None or ratio > best[0]):
-                best = ratio, low, high
-    return None if best is None else best[1:]
-
-
-def _rms(experiment: Experiment) -> float:
-    return float(np.sqrt(np.mean(experiment.voltage_V**2)))
-
-
 def amplitude_finding(
     case: Case, residuals: Mapping[str, Real], level: float, rng: np.random.Generator
 ) -> AmplitudeFinding | None:
@@ -84,10 +69,14 @@ def amplitude_finding(
     differently, so a quarter is added on either side before anything but proportion is claimed. None without
     two such experiments or when either of them shows no gap beyond noise.
     """
-    pair = amplitude_pair(case)
-    if pair is None:
+    pairs = [
+        (pooled_rms(high.voltage_V) / pooled_rms(low.voltage_V), low, high)
+        for low, high in permutations(case.experiments, 2)
+        if not (low.closed_loop or high.closed_loop) and low.kind == high.kind and np.any(low.voltage_V)
+    ]
+    ratio, *pair = max(pairs, key=itemgetter(0), default=(0.0,))
+    if ratio < _LEAST_RATIO:
         return None
-    ratio = _rms(pair[1]) / _rms(pair[0])
     gaps, draws = [], []
     for experiment in pair:
         energy = np.sum(np.square(residuals[experiment.name]), axis=1)
