@@ -67,8 +67,9 @@ def basis_state_space(poles: Poles) -> LosslessCascade:
     """Lossless cascade whose states are the basis functions (replaces inverting E in (24)).
 
     Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B
-    = [sg, 0], C = [-beta sg, sb sg], D = gamma; each block is driven by the all-pass output of the one
-    before.
+    = [sg, 0], C = [-beta sg, sb sg], D = gamma, with gamma = |x|^2 and beta = 2 Re x / (1 + gamma) of the
+    pole x (29), sg = sqrt(1 - gamma^2), sb = sqrt(1 - beta^2); each block is driven by the all-pass output
+    of the one before, real poles first.
     """
     n = poles.order
     A, B = np.zeros((n, n)), np.zeros((n, 1))

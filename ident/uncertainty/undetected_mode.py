@@ -278,7 +278,12 @@ def pair_mixture(
     log_rest: float,
     prior_odds: float,
 ) -> PairMixture:
-    """Weights of the pairs against everything else.
+    """Probabilities of the pairs against everything else, and the moments of those worth keeping.
+
+    Pair j at scale a has the posterior weight prior_odds prior_j prior_a L_ja, everything else exp(log_rest);
+    mean and covariance are averaged over the scales by the law of total covariance. A pair is visible where
+    the order selection would have kept it, nu ln(J0/J1) > 4 ln nu with nu = degrees_of_freedom, and the pairs
+    together are likelier than the rest.
 
     log_rest is the log of prior times likelihood summed over all hypotheses without a missed mode, their
     prior probabilities adding up to 1; prior_odds those of one missed mode against none. The weight of pairs

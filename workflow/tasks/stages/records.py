@@ -34,7 +34,11 @@ def settings(config: RunConfig) -> Mapping[str, Any]:
 
 
 def make_records(stage: StageInput) -> RecordsResult:
-    """All records of the configuration, in its order."""
+    """All records of the configuration, in its order, simulated or read.
+
+    Raises InputError: a file or an excitation that is none, sampling times that differ, or a record to
+    identify from whose input stands still.
+    """
     source = stage.config.source
     if isinstance(source, SimulatedSource):
         made = []
