@@ -40,9 +40,11 @@ def plot(result: object) -> Figure:
 
 @plot.register(Record)
 def _record(record: Record) -> Figure:
-    from workflow.figures.records import ShownRecord, draw_records
+    from workflow.figures.records import draw_records
+    from workflow.tasks.results import RunRecord
 
-    return draw_records([ShownRecord(record, "estimation")], record.input_names, record.output_names)
+    shown = RunRecord(record, "estimation", None, "")
+    return draw_records([shown], record.input_names, record.output_names)
 
 
 @plot.register(Simulation)
@@ -60,8 +62,7 @@ def _simulation(simulation: Simulation) -> Figure:
 def _poles(found: Identification) -> Figure:
     from workflow.figures.poles import draw_poles
 
-    model = found.model
-    return draw_poles(model.dt_s, identified=model.poles.values, integrators=model.integrators)
+    return draw_poles(found.model)
 
 
 @plot.register(GobfModel)
@@ -83,8 +84,7 @@ def _response(uncertainty: ResponsePosterior) -> Figure:
 def _bode(response: FrequencyUncertainty, input_name: str = "u", output_name: str = "y") -> Figure:
     from workflow.figures.bode import draw_bode
 
-    name = f"{input_name} to {output_name}"
-    return draw_bode(response, name=name, input_label=(input_name, ""), output_label=(output_name, ""))
+    return draw_bode(response, f"{input_name} to {output_name}", "as logged")
 
 
 @plot.register(Certificate)
@@ -100,10 +100,12 @@ def _synthesis(result: SynthesisResult) -> Figure:
 
 @plot.register(LoopRun)
 def _run(run: LoopRun) -> Figure:
-    from workflow.figures.closed_loop import LoopScene, LoopTraces, draw_closed_loop
+    from workflow.figures.closed_loop import draw_closed_loop
+    from workflow.tasks.results import LoopRuns
 
-    scene = LoopScene(run.time_s, run.reference, None, output=("output", ""), command=("command", ""))
-    return draw_closed_loop(scene, LoopTraces(run.measured, run.command), None)
+    runs = LoopRuns(run.measured[None], run.command[None], None, run.limited[None])
+    labels = {"output": ("output", ""), "command": ("command", "")}
+    return draw_closed_loop(run.time_s, run.reference, runs, labels)
 
 
 @plot.register(Diagnosis)

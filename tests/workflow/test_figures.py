@@ -4,207 +4,68 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from control_design.analysis.stability import closed_loop_poles
-from ident.checks.residual_tests import independence_test, whiteness_test
-from ident.checks.validation import fit_on_fresh_data
-from ident.search.error_surface import error_surface
 from ident.uncertainty import FrequencyUncertainty
 from tests.workflow import report_examples as example
 from workflow.figures import style
 from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees
-from workflow.figures.bode import EmpiricalResponse, draw_bode
-from workflow.figures.closed_loop import (
-    ConditionTraces,
-    LoopScene,
-    LoopTraces,
-    MeasuredPeak,
-    PredictedSensitivity,
-    draw_closed_loop,
-    draw_conditions,
-    draw_measured_sensitivity,
-)
-from workflow.figures.error_surface import draw_error_surface, searched_pairs
-from workflow.figures.nyquist import draw_nyquist, uncertain_loop
-from workflow.figures.order import draw_order
-from workflow.figures.overview import StepView, draw_overview
+from workflow.figures.bode import draw_bode
+from workflow.figures.closed_loop import draw_closed_loop
+from workflow.figures.nyquist import uncertain_loop
 from workflow.figures.poles import draw_poles
-from workflow.figures.records import ShownRecord, draw_records
+from workflow.figures.records import draw_records
 from workflow.figures.repeats import draw_repeat_scatter
-from workflow.figures.residuals import draw_residual_tests
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
-from workflow.figures.style import ratio_unit
-from workflow.figures.validation import draw_validation
-from workflow.tasks.results import LoopRuns
+from workflow.figures.subjects import RunView
+from workflow.report import rendering
+from workflow.tasks.results import LoopCheck, LoopRuns, RunRecord, RunResults
+from workflow.tasks.summary import summarise
 
 OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))
-HOSTILE = "a_$very$_<b>long</b>\nname & 漢 of a column that goes on and on and on"
+HOSTILE = "a_$very$_<b>long</b> name & 漢 of a column that goes on and on and on"
+
+
+@cache
+def pictures(name: str = "hub", unit: str = "V") -> Mapping[str, Figure]:
+    """All pictures of a run's page, every name of the user's like `name`; and one with such a unit."""
+    settings = example.config(
+        outputs=(f"{name}_rad", f"{name} m"),
+        labels=(name, f"{name} tip"),
+        records=(name, f"{name} 2", f"{name} fresh"),
+        input_name=f"{name} u",
+    )
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        run = RunResults(example.build_run(Path(folder) / "run", settings))
+        patch.setattr(rendering, "render", lambda figure: figure)
+        patch.setattr(rendering, "embedded", lambda *_: Markup("<svg/>"))
+        view = RunView(settings, run, "", run.run.manifest())
+        page = rendering.render_page("report.html.j2", title="", run=view, summary=summarise(run, settings))
+    asked = settings.specification
+    curves = sensitivity_curves(example.plant(), example.controller(), asked, OMEGA, input_unit=unit)
+    units = draw_sensitivities(curves, level=0.95)
+    return {stem: drawn for stem, drawn in page.pictures.items() if "-2-" not in stem} | {"units": units}
 
 
 def frequency() -> FrequencyUncertainty:
     return example.posterior(example.model()).at(OMEGA)
 
 
-def records_figure(name: str = "prbs") -> Figure:
-    models = [example.model(), example.model("tip_m")]
-    roles = ("estimation", "estimation", "validation", "repeat")
-    shown = [ShownRecord(example.record(models, f"{name} {i}", i), role) for i, role in enumerate(roles, 1)]
-    return draw_records(shown, [example.INPUT], ["hub_angle_rad", "tip_m"])
+def bode_figure(title: str = "hub") -> Figure:
+    return draw_bode(frequency(), title, "rad / V", model=example.model())
 
 
-def bode_figure(name: str = "hub") -> Figure:
-    found = frequency()
-    seen = EmpiricalResponse(OMEGA[::2], found.centre[::2] * 1.1)
-    return draw_bode(
-        found,
-        name=name,
-        input_label=(name, "V"),
-        output_label=(name, "rad"),
-        model=example.model(),
-        empirical=seen,
-    )
-
-
-def poles_figure(name: str = "hub") -> Figure:
-    loop = closed_loop_poles(example.controller(), example.plant())
-    poles = example.model().poles.values
-    return draw_poles(example.DT_S, identified=poles, integrators=1, closed_loop=loop, name=name)
-
-
-def error_surface_figure(name: str = "hub") -> Figure:
-    of = example.model()
-    used = [example.record([of], "prbs", 1)]
-    found = example.identification(of, used)
-    surface = error_surface(used, of, found.structure, n_points=16)
-    return draw_error_surface(surface, searched_pairs(found.search.stages, 14.0), name=name)
-
-
-def nyquist_figure(name: str = "hub") -> Figure:
-    loop = uncertain_loop(frequency(), example.controller().response(OMEGA))
-    return draw_nyquist(loop, level=0.95, modulus_margin=0.5, name=name)
-
-
-def overview_figure(name: str = "hub") -> Figure:
-    loop = uncertain_loop(frequency(), example.controller().response(OMEGA))
-    time = np.linspace(0.0, 2.0, 400)
-    rise = 1 - np.exp(-5 * time)
-    step = StepView(time, np.ones(400), rise, np.stack([rise, 1.05 * rise]), "simulated arm", (name, "rad"))
-    return draw_overview(
-        frequency(), example.model(), loop, step, gain_unit=ratio_unit("rad", name), modulus_margin=0.5
-    )
-
-
-def sensitivity_figure(name: str = "V") -> Figure:
-    asked = example.config().specification
-    curves = sensitivity_curves(
-        example.plant(),
-        example.controller(),
-        asked,
-        OMEGA,
-        input_unit=name,
-        output_unit="rad",
-        performance_unit="m",
-    )
-    return draw_sensitivities(curves, level=0.95, marks=[(14.0, "mode 1")])
-
-
-def loop_scene(name: str = "hub") -> tuple[LoopScene, LoopTraces, LoopTraces]:
-    loop = example.loop_check(example.config(), 3)
-    scene = LoopScene(
-        loop.time_s,
-        loop.reference,
-        loop.disturbance,
-        (name, "rad"),
-        ("voltage_V", "V"),
-        (name, "m"),
-        24.0,
-    )
-
-    def traces(runs: LoopRuns) -> LoopTraces:
-        return LoopTraces(runs.output, runs.command, runs.performance)
-
-    return scene, traces(loop.predicted_runs), traces(loop.achieved_runs)
-
-
-def closed_loop_figure(name: str = "hub") -> Figure:
-    scene, predicted, achieved = loop_scene(name)
-    return draw_closed_loop(scene, predicted, achieved, machine="simulated arm", spread=achieved)
-
-
-def measured_sensitivity_figure(name: str = "") -> Figure:
-    """No name of the user's stands in it."""
-    check = example.loop_check(example.config(), 3).sensitivity
-    omega, size = check.measured[0].omega_rad_s, check.measured[0].magnitude
-    measured = [
-        MeasuredPeak(f"arm {k}", row.omega_rad_s, row.magnitude, row.std)
-        for k, row in enumerate(check.measured)
-    ]
-    return draw_measured_sensitivity(PredictedSensitivity(omega, size, 1.05 * size), measured, level=0.95)
-
-
-def conditions_figure(name: str = "hub") -> Figure:
-    loop = example.loop_check(example.config(), 3)
-    rows = [
-        ConditionTraces(
-            f"condition {k}",  # our own words; only the output's name is the user's
-            "words",
-            *(getattr(loop.conditions[k], field) for field in ("reference", "predicted", "achieved")),
-        )
-        for k in (0, 1, 0, 1, 0)
-    ]
-    return draw_conditions(loop.time_s[:400], rows, (name, "rad"), machine="simulated arm")
-
-
-def validation_figure(name: str = "fresh") -> Figure:
-    of = example.model()
-    fresh = example.record([of], name, 3)
-    return draw_validation(fresh, fit_on_fresh_data(of, fresh), kept_as="validation", noise_std=0.05)
-
-
-def residuals_figure(name: str = "hub") -> Figure:
-    of = example.model()
-    used = example.record([of], "prbs", 3)
-    residual = used.output[:, 0] - of.simulate(used.input[:, 0])
-    return draw_residual_tests(
-        whiteness_test([residual]), independence_test([used.input[:, 0]], [residual]), name=name
-    )
-
-
-def repeats_figure(name: str = "hub") -> Figure:
-    return draw_repeat_scatter(example.scatter_rows(), name=name)
-
-
-def order_figure(name: str = "hub") -> Figure:
-    steps = example.identification(
-        example.model(), [example.record([example.model()], "prbs", 1)]
-    ).order_table
-    found = frequency()
-    seen = EmpiricalResponse(OMEGA, found.centre)
-    return draw_order(steps, (1, 2), example.stabilisation_plot(), name=name, response=seen)
-
-
-FAMILIES: list[Callable[..., Figure]] = [
-    records_figure,
-    bode_figure,
-    poles_figure,
-    error_surface_figure,
-    nyquist_figure,
-    overview_figure,
-    sensitivity_figure,
-    closed_loop_figure,
-    measured_sensitivity_figure,
-    conditions_figure,
-    validation_figure,
-    residuals_figure,
-    repeats_figure,
-    order_figure,
-]
+def poles_figure() -> Figure:
+    return draw_poles(example.model(), "hub")
 
 
 def panels(figure: Figure) -> list:
@@ -212,9 +73,12 @@ def panels(figure: Figure) -> list:
     return [axes for axes in figure.axes if axes.get_visible() and not hasattr(axes, "_colorbar")]
 
 
-@pytest.mark.parametrize("draw", FAMILIES)
-def test_figure_has_titles_units_and_a_legend(draw):
-    figure = draw()
+def test_figures_have_titles_units_and_a_legend():
+    for figure in pictures().values():
+        has_titles_units_and_a_legend(figure)
+
+
+def has_titles_units_and_a_legend(figure: Figure) -> None:
     assert any(axes.get_title(loc="left") for axes in panels(figure))
     labels = [label for axes in panels(figure) for label in (axes.get_xlabel(), axes.get_ylabel()) if label]
     assert labels
@@ -234,10 +98,13 @@ def same_row(one, other) -> bool:
     return one.get_subplotspec().rowspan == other.get_subplotspec().rowspan
 
 
-@pytest.mark.parametrize("name", ["hub", HOSTILE], ids=["plain", "hostile"])
-@pytest.mark.parametrize("draw", FAMILIES)
-def test_nothing_is_cut_off_and_nothing_overlaps(draw, name):
-    figure = draw(name)
+@pytest.mark.parametrize("names", [(), (HOSTILE, HOSTILE)], ids=["plain", "hostile"])
+def test_nothing_is_cut_off_and_nothing_overlaps(names):
+    for figure in pictures(*names).values():
+        is_whole(figure)
+
+
+def is_whole(figure: Figure) -> None:
     with style.house_style():
         figure.draw_without_rendering()
         renderer = figure.canvas.get_renderer()
@@ -266,7 +133,7 @@ def test_nothing_is_cut_off_and_nothing_overlaps(draw, name):
         assert not legend.overlaps(axes.get_window_extent(renderer)), "the legend hides a panel"
 
 
-@pytest.mark.parametrize("draw", [bode_figure, nyquist_figure])
+@pytest.mark.parametrize("draw", [bode_figure, poles_figure])
 def test_same_bytes_twice_and_no_date(draw):
     first, second = style.render(draw()), style.render(draw())
     assert first == second
@@ -281,14 +148,14 @@ def test_global_settings_are_left_alone():
 
 def test_a_picture_too_large_for_svg_becomes_png(monkeypatch):
     monkeypatch.setattr(style, "SVG_LIMIT_BYTES", 1000)
-    picture = style.render(residuals_figure())
+    picture = style.render(poles_figure())
     assert picture.kind == "png"
     assert picture.content.startswith(b"\x89PNG")
-    assert picture == style.render(residuals_figure())
+    assert picture == style.render(poles_figure())
 
 
 def test_svg_is_inlined_with_ids_of_its_own_and_without_names_in_comments():
-    svg = style.render(residuals_figure("x --> <script>")).content
+    svg = style.render(bode_figure("x --> <script>")).content
     text = style.inline_svg(svg, "one-", "a label")
     assert text.startswith("<svg ")
     assert text.rstrip().endswith("</svg>")
@@ -302,7 +169,7 @@ def test_svg_is_inlined_with_ids_of_its_own_and_without_names_in_comments():
 
 
 def test_hostile_text_is_drawn_as_it_is():
-    text = style.plain(HOSTILE)
+    text = style.plain(HOSTILE.replace(" ", "\n", 1))
     assert "\n" not in text
     assert "$very$" in text  # no formula: the house style parses none
     assert "漢" not in text  # not in the font: a box, no warning
@@ -410,51 +277,55 @@ def test_sensitivity_curves_bound_every_member():
     assert not gps.exact
 
 
+LABELS = {"output": ("hub", "rad"), "performance": ("tip", "m"), "command": ("voltage", "V")}
+
+
+def loop_figure(loop: LoopCheck, others: LoopRuns) -> Figure:
+    return draw_closed_loop(
+        loop.time_s,
+        loop.reference,
+        loop.predicted_runs,
+        LABELS,
+        others=others,
+        machine="arm",
+        command_limit=24.0,
+    )
+
+
 def test_a_run_that_leaves_the_scene_does_not_flatten_the_others():
-    scene, predicted, achieved = loop_scene()
-    wild = LoopTraces(achieved.output * 1e6, achieved.command * 1e6, achieved.performance * 1e6)
-    figure = draw_closed_loop(scene, predicted, wild, machine="machine")
-    low, high = figure.axes[0].get_ylim()
-    assert high - low < 10 * np.ptp(predicted.output)
+    loop = example.loop_check(example.config(), 3)
+    runs = loop.achieved_runs
+    wild = LoopRuns(runs.output * 1e6, runs.command * 1e6, runs.performance * 1e6, runs.limited)
+    low, high = loop_figure(loop, wild).axes[0].get_ylim()
+    assert high - low < 10 * np.ptp(loop.predicted_runs.output)
 
 
 def test_saturation_far_away_is_said_in_words():
-    scene, predicted, achieved = loop_scene()
-    figure = draw_closed_loop(scene, predicted, achieved, machine="machine")
+    loop = example.loop_check(example.config(), 3)
+    figure = loop_figure(loop, loop.achieved_runs)
     words = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert any("saturation at ±24 V" in word for word in words)
 
 
 def test_loop_without_disturbance_or_performance():
-    scene, predicted, _ = loop_scene()
-    bare = LoopScene(scene.time_s, scene.reference, None, scene.output, scene.command)
-    figure = draw_closed_loop(bare, LoopTraces(predicted.output, predicted.command), None)
-    assert len(figure.axes) == 2
+    loop = example.loop_check(example.config(), 3)
+    labels = {kind: LABELS[kind] for kind in ("output", "command")}
+    assert len(draw_closed_loop(loop.time_s, loop.reference, loop.predicted_runs, labels).axes) == 2
 
 
-def test_wrong_surface_and_missing_records_are_refused():
-    of = example.model()
-    used = [example.record([of], "prbs", 1)]
-    raw = error_surface(used, of, example.identification(of, used).structure, coordinates="raw", n_points=5)
-    with pytest.raises(ValueError, match="omega_rad_s and zeta"):
-        draw_error_surface(raw, np.zeros((0, 2)), name="hub")
+def test_missing_records_are_refused():
+    used = RunRecord(example.record([example.model()], "prbs", 1), "estimation", None, "")
     with pytest.raises(ValueError, match="no record"):
         draw_records([], ["u"], ["y"])
     with pytest.raises(ValueError, match="no output column 'wrong'; there is"):
-        draw_records([ShownRecord(used[0], "estimation")], [example.INPUT], ["hub_angle_rad", "wrong"])
+        draw_records([used], [example.INPUT], ["hub_angle_rad", "wrong"])
     with pytest.raises(ValueError, match="no band"):
         draw_repeat_scatter([], name="hub")
 
 
 def test_stabilisation_marks_say_what_the_record_says():
     plot = example.stabilisation_plot()
-    figure = draw_order(
-        example.identification(example.model(), [example.record([example.model()], "prbs", 1)]).order_table,
-        (1, 2),
-        plot,
-        name="hub",
-    )
-    _, right = figure.axes
+    _, right = pictures()["order-1-hub"].axes
     marks = {
         line.get_label(): len(line.get_xdata())
         for line in right.lines
@@ -464,5 +335,3 @@ def test_stabilisation_marks_say_what_the_record_says():
     assert marks["stays, but the data would not miss it"] == int(np.count_nonzero(plot.stable & ~plot.needed))
     columns = [line.get_xdata()[0] for line in right.lines if line.get_label().startswith("_")]
     np.testing.assert_allclose(columns, [mode.omega_rad_s for mode in plot.columns()])
-    with pytest.raises(ValueError, match="no structure"):
-        draw_order([], (1, 2), plot, name="hub")

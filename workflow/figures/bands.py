@@ -31,14 +31,6 @@ class ResponseBand:
     phase_high_deg: Real
 
 
-@dataclass(frozen=True, eq=False)
-class EmpiricalResponse:
-    """A response taken from the records without a model: omega_rad_s (K,), response (K,)."""
-
-    omega_rad_s: Real
-    response: Complex
-
-
 def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
     """Band of a response; frequency 0 is left out, it has no place on a log axis."""
     keep = uncertainty.omega_rad_s > 0
@@ -88,6 +80,13 @@ def outline(time_s: Real, signal: Real, bins: int = 700) -> tuple[Real, Real]:
     both = np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), [0, signal.size - 1]])
     index = np.unique(np.minimum(both, signal.size - 1))
     return time_s[index], signal[index]
+
+
+def liveliest(signal: Real, length: int) -> slice:
+    """The `length` samples in which a signal moves most."""
+    energy = np.concatenate([[0.0], np.cumsum((signal - signal.mean()) ** 2)])
+    start = int(np.argmax(energy[length:] - energy[:-length]))
+    return slice(start, start + length)
 
 
 def envelope(time_s: Real, signals: Real, bins: int = 250) -> tuple[Real, Real, Real]:

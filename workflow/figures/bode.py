@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
@@ -9,91 +11,89 @@ from matplotlib.ticker import MultipleLocator
 from ident.basis.model import GobfModel
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
-from workflow.figures.bands import Complex, EmpiricalResponse, Real, degrees_near, response_band
+from workflow.figures.bands import Complex, Real, degrees_near, response_band
 from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
+from workflow.text.formats import share
+
+_DOTS: dict[str, Any] = {
+    "color": style.MEASURED,
+    "ls": "none",
+    "marker": ".",
+    "ms": 4.0,
+    "alpha": 0.55,
+    "mew": 0,
+}
+_NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2))}
 
 
 @drawing("bode")
 def draw_channel(channel: ChannelView, name: str) -> Figure:
     """Identified response of a channel, its nominal model, and what the records say without one."""
-    model = channel.found.model
+    found, spread = channel.found, channel.spread
+    signals = f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}"
     return draw_bode(
-        channel.spread.frequency,
-        name=name,
-        input_label=(model.input_name, channel.units[0]),
-        output_label=(model.output_name, channel.units[1]),
-        model=channel.spread.nominal,
-        empirical=channel.empirical,
+        spread.frequency,
+        f"{style.plain(name, 26)}: {signals}",
+        style.ratio_unit(channel.units[1], channel.units[0]),
+        model=spread.nominal,
+        empirical=spread.empirical,
     )
 
 
+@style.house_style()
 def draw_bode(
     uncertainty: FrequencyUncertainty,
+    title: str,
+    unit: str,
     *,
-    name: str,
-    input_label: tuple[str, str],
-    output_label: tuple[str, str],
     model: GobfModel | None = None,
-    empirical: EmpiricalResponse | None = None,
+    empirical: FrequencyUncertainty | None = None,
 ) -> Figure:
-    """Gain, phase and relative size of the ellipses over frequency.
+    """Gain [unit], phase and relative size of the ellipses over frequency; `empirical` as dots.
 
-    input_label and output_label are (name, unit). The band is the range of gain and phase over each
-    frequency's ellipse, not over all of them jointly.
+    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly.
     """
     band = response_band(uncertainty)
-    percent = f"{100 * uncertainty.level:.4g} %"
-    with style.house_style():
-        figure = style.new_figure(7.0)
-        gain, phase, size = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
-        omega = band.omega_rad_s
-        floor = _gain_floor(band.gain, None if empirical is None else np.abs(empirical.response))
-        if empirical is not None:
-            inside = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
-            at, response = _thinned(empirical.omega_rad_s[inside], empirical.response[inside])
-            dots = {"color": style.MEASURED, "ls": "none", "marker": ".", "ms": 4.0, "alpha": 0.55, "mew": 0}
-            label = "straight from the records, no model"
-            gain.plot(at, np.maximum(np.abs(response), floor), **dots, label=label)
-            target = np.interp(at, omega, band.phase_deg)
-            phase.plot(at, degrees_near(response, target), **dots)
-        gain.fill_between(
-            omega, np.maximum(band.gain_low, floor), band.gain_high, **style.BAND, label=f"{percent} ellipses"
-        )
-        phase.fill_between(omega, band.phase_low_deg, band.phase_high_deg, **style.BAND)
-        gain.plot(omega, band.gain, **style.MODEL_LINE, label="identified response (centre)")
-        phase.plot(omega, band.phase_deg, **style.MODEL_LINE)
-        if model is not None:
-            at = omega if not model.integrators else omega[omega > 0]
-            response = model.frequency_response(at)
-            dashed = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2))}
-            gain.plot(at, np.abs(response), **dashed, label="nominal model")
-            phase.plot(at, degrees_near(response, np.interp(at, omega, band.phase_deg)), **dashed)
-        gain.set_yscale("log")
-        gain.set_xscale("log")
-        gain.set_ylim(bottom=floor)
-        signals = f"{style.plain(input_label[0], 26)} to {style.plain(output_label[0], 26)}"
-        gain.set_title(f"{style.plain(name, 26)}: {signals}")
-        gain.set_ylabel(f"gain [{style.plain(style.ratio_unit(output_label[1], input_label[1]), 24)}]")
-        phase.set_ylabel("phase [deg]")
-        span = np.ptp(band.phase_deg)
-        phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
-        low, high = style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15)
-        phase.set_ylim(low, high)
-        relative = 100 * uncertainty.ellipse().semi_major[uncertainty.omega_rad_s > 0] / band.gain
-        size.fill_between(omega, np.full_like(relative, 1e-12), relative, **style.BAND)
-        size.plot(omega, relative, color=style.UNCERTAIN, lw=1.3)
-        size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
-        size.set_yscale("log")
-        finite = relative[np.isfinite(relative) & (relative > 0)]
-        if finite.size:
-            size.set_ylim(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max())))
-        size.set_ylabel("ellipse / gain [%]")
-        size.set_xlabel("frequency [rad/s]")
-        gain.set_xlim(omega[0], omega[-1])
-        style.hertz_axis(gain)
-        figure.align_ylabels()
-        style.finish(figure, (gain, size), columns=5)
+    omega = band.omega_rad_s
+    figure = style.new_figure(7.0)
+    gain, phase, size = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
+    floor = _gain_floor(band.gain, np.abs(empirical.centre) if empirical else np.empty(0))
+    if empirical is not None:
+        inside = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
+        at, response = _thinned(empirical.omega_rad_s[inside], empirical.centre[inside])
+        label = "straight from the records, no model"
+        gain.plot(at, np.maximum(np.abs(response), floor), **_DOTS, label=label)
+        phase.plot(at, degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS)
+    label = f"{share(uncertainty.level)} ellipses"
+    gain.fill_between(omega, np.maximum(band.gain_low, floor), band.gain_high, **style.BAND, label=label)
+    phase.fill_between(omega, band.phase_low_deg, band.phase_high_deg, **style.BAND)
+    gain.plot(omega, band.gain, **style.MODEL_LINE, label="identified response (centre)")
+    phase.plot(omega, band.phase_deg, **style.MODEL_LINE)
+    if model is not None:
+        response = model.frequency_response(omega)
+        gain.plot(omega, np.abs(response), **_NOMINAL, label="nominal model")
+        phase.plot(omega, degrees_near(response, band.phase_deg), **_NOMINAL)
+    gain.set(xscale="log", yscale="log", ylabel=f"gain [{style.plain(unit, 24)}]")
+    gain.set_ylim(bottom=floor)
+    gain.set_title(title)
+    phase.set_ylabel("phase [deg]")
+    span = np.ptp(band.phase_deg)
+    phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
+    phase.set_ylim(*style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
+    relative = 100 * uncertainty.ellipse().semi_major[uncertainty.omega_rad_s > 0] / band.gain
+    size.fill_between(omega, np.full_like(relative, 1e-12), relative, **style.BAND)
+    size.plot(omega, relative, color=style.UNCERTAIN, lw=1.3)
+    size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
+    size.set_yscale("log")
+    finite = relative[np.isfinite(relative) & (relative > 0)]
+    if finite.size:
+        size.set_ylim(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max())))
+    size.set(xlabel="frequency [rad/s]", ylabel="ellipse / gain [%]")
+    gain.set_xlim(omega[0], omega[-1])
+    style.hertz_axis(gain)
+    figure.align_ylabels()
+    style.finish(figure, (gain, size), columns=5)
     return figure
 
 
@@ -106,11 +106,8 @@ def _thinned(omega_rad_s: Real, response: Complex, most: int = 450) -> tuple[Rea
     return omega_rad_s[index], response[index]
 
 
-def _gain_floor(gain: Real, empirical: Real | None) -> float:
+def _gain_floor(gain: Real, empirical: Real) -> float:
     """Bottom of the gain axis: below the response, above the noise of an empirical response at a notch."""
     smallest = float(gain[gain > 0].min())
-    if empirical is not None and empirical.size:
-        positive = empirical[empirical > 0]
-        if positive.size:
-            smallest = min(smallest, float(np.percentile(positive, 2)))
-    return smallest / 3
+    positive = empirical[empirical > 0]
+    return min(smallest, float(np.percentile(positive, 2)) if positive.size else smallest) / 3

@@ -31,16 +31,15 @@ def draw_probabilities(found: Diagnosis) -> Figure:
         names.append(f"all {len(ranked) - len(shown)} others together")
         percent.append(max(0.0, 100 - sum(percent)))
         colours.append(gap_style.PALE)
-    with style.house_style():
-        figure = style.new_figure(1.0 + 0.34 * len(names))
-        axes = figure.subplots()
-        bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
-        labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
-        axes.bar_label(bars, labels, padding=4, fontsize=9)
-        axes.invert_yaxis()
-        axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel="probability [%]")
-        axes.set_title("Which cause, given the records")
-        axes.grid(visible=False, axis="y")
+    figure = style.new_figure(1.0 + 0.34 * len(names))
+    axes = figure.subplots()
+    bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
+    labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
+    axes.bar_label(bars, labels, padding=4, fontsize=9)
+    axes.invert_yaxis()
+    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel="probability [%]")
+    axes.set_title("Which cause, given the records")
+    axes.grid(visible=False, axis="y")
     return figure
 
 
@@ -48,32 +47,31 @@ def draw_probabilities(found: Diagnosis) -> Figure:
 def draw_waterfall(found: Diagnosis) -> Figure:
     """Pooled root mean square of (measured - model)/noise: held-out records together, every record alone."""
     gaps, rows, floor = found.gaps, found.gap_by_experiment, found.noise_floor
-    with style.house_style():
-        figure = style.new_figure(max(3.4, 1.8 + 0.3 * len(rows)))
-        left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
-        bars = left.bar(
-            np.arange(len(gaps)),
-            list(gaps.values()),
-            color=[gap_style.MODELS[model]["color"] for model in gaps],
-            width=0.6,
-            tick_label=[gap_style.WORDS[model].replace(" ", "\n") for model in gaps],
-        )
-        left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
-        left.axhline(floor, **gap_style.FLOOR, zorder=1)
-        left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
-        left.set(ylabel="residual over noise, RMS [1]", title="Held-out experiments together")
-        left.grid(visible=False, axis="x")
-        for model in gaps:
-            marker, offset = _LOOKS[model]
-            at = np.arange(len(rows)) + offset
-            right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
-        right.axvline(floor, **gap_style.FLOOR)
-        largest = max(max(entry.values()) for entry in rows.values())
-        right.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(largest, 2 * floor)))
-        right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
-        right.set(ylim=(len(rows) - 0.5, -0.5), xlabel="residual over noise, RMS [1]")
-        right.set_title("Every experiment alone")
-        style.finish(figure, (right, left))
+    figure = style.new_figure(max(3.4, 1.8 + 0.3 * len(rows)))
+    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
+    bars = left.bar(
+        np.arange(len(gaps)),
+        list(gaps.values()),
+        color=[gap_style.MODELS[model]["color"] for model in gaps],
+        width=0.6,
+        tick_label=[gap_style.WORDS[model].replace(" ", "\n") for model in gaps],
+    )
+    left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
+    left.axhline(floor, **gap_style.FLOOR, zorder=1)
+    left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
+    left.set(ylabel="residual over noise, RMS [1]", title="Held-out experiments together")
+    left.grid(visible=False, axis="x")
+    for model in gaps:
+        marker, offset = _LOOKS[model]
+        at = np.arange(len(rows)) + offset
+        right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
+    right.axvline(floor, **gap_style.FLOOR)
+    largest = max(max(entry.values()) for entry in rows.values())
+    right.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(largest, 2 * floor)))
+    right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
+    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel="residual over noise, RMS [1]")
+    right.set_title("Every experiment alone")
+    style.finish(figure, (right, left))
     return figure
 
 
@@ -87,19 +85,18 @@ def draw_case_gaps(
 ) -> Figure:
     """One line per case: RMS over noise (C,) with the nominal parameters, and with the effects added."""
     at, floor = np.arange(len(names)), float(np.median(floors))
-    with style.house_style():
-        figure = style.new_figure(1.5 + 0.32 * len(names))
-        axes = figure.subplots()
-        axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
-        for model, values in (("stated", before), ("repaired", after)):
-            axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
-        axes.axvline(floor, **gap_style.FLOOR, zorder=0)
-        axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
-        labels = [f"{style.plain(n, 34)}: {style.plain(a, 44)}" for n, a in zip(names, answers, strict=True)]
-        axes.set_yticks(at, labels)
-        axes.set(ylim=(len(names) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
-        axes.set_title("How far each gap shrinks")
-        style.finish(figure, axes)
+    figure = style.new_figure(1.5 + 0.32 * len(names))
+    axes = figure.subplots()
+    axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
+    for model, values in (("stated", before), ("repaired", after)):
+        axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
+    axes.axvline(floor, **gap_style.FLOOR, zorder=0)
+    axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
+    labels = [f"{style.plain(n, 34)}: {style.plain(a, 44)}" for n, a in zip(names, answers, strict=True)]
+    axes.set_yticks(at, labels)
+    axes.set(ylim=(len(names) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
+    axes.set_title("How far each gap shrinks")
+    style.finish(figure, axes)
     return figure
 
 

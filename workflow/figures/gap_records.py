@@ -26,28 +26,27 @@ _MODES = 3
 def draw_residual_traces(found: Diagnosis) -> Figure:
     """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise."""
     case, models = found.case, dict.fromkeys(("stated", found.models[-1]))
-    with style.house_style():
-        figure = style.new_figure(0.9 + 1.25 * len(case.experiments))
-        grid = figure.subplots(len(case.experiments), 2, sharex="row", squeeze=False)
-        for row, experiment in zip(grid, case.experiments, strict=True):
-            residuals = {model: found.residuals[model][experiment.name] for model in models}
-            time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
-            role = " (held out)" if experiment.role == "held_out" else ""
-            for column, axes in enumerate(row):
-                axes.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
-                for model, e in residuals.items():
-                    look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
-                    axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])
-                largest = max(float(np.max(np.abs(e[:, column]))) for e in residuals.values())
-                reach = max(4.0, 1.05 * largest)
-                axes.set_ylim(-reach, reach)
-                axes.margins(x=0.01)
-                title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.SENSOR_WORDS[column]}"
-                axes.set_title(title, fontsize=9, fontweight="normal")
-            row[0].set_ylabel("residual\nover noise [1]", fontsize=8.5)
-        for axes in grid[-1]:
-            axes.set_xlabel("time [s]")
-        style.finish(figure, grid.ravel(), columns=3)
+    figure = style.new_figure(0.9 + 1.25 * len(case.experiments))
+    grid = figure.subplots(len(case.experiments), 2, sharex="row", squeeze=False)
+    for row, experiment in zip(grid, case.experiments, strict=True):
+        residuals = {model: found.residuals[model][experiment.name] for model in models}
+        time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
+        role = " (held out)" if experiment.role == "held_out" else ""
+        for column, axes in enumerate(row):
+            axes.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
+            for model, e in residuals.items():
+                look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
+                axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])
+            largest = max(float(np.max(np.abs(e[:, column]))) for e in residuals.values())
+            reach = max(4.0, 1.05 * largest)
+            axes.set_ylim(-reach, reach)
+            axes.margins(x=0.01)
+            title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.SENSOR_WORDS[column]}"
+            axes.set_title(title, fontsize=9, fontweight="normal")
+        row[0].set_ylabel("residual\nover noise [1]", fontsize=8.5)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+    style.finish(figure, grid.ravel(), columns=3)
     return figure
 
 
@@ -60,24 +59,22 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
     dt_s = found.case.rig.sampling.dt_s
     poles = linear_arm(found.case.rig).poles()
     modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
-    with style.house_style():
-        figure = style.new_figure(3.7)
-        panels = figure.subplots(1, 2, sharey=True)
-        for column, axes in enumerate(panels):
-            for model in found.models:
-                frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)
-                axes.loglog(frequency, power, **gap_style.MODELS[model], label=gap_style.WORDS[model])
-            axes.axhline(1.0, **gap_style.FLOOR)
-            for number, mode in enumerate(modes_Hz[:_MODES], 1):
-                if mode < 0.5 / dt_s:
-                    axes.axvline(mode, color="#999999", lw=0.8, ls=":")
-                    style.tag_below(axes, mode, f"mode {number}")
-            low, high = axes.get_ylim()
-            axes.set_ylim(min(low, 0.1), max(high, 10.0))
-            axes.set_xlabel("frequency [Hz]")
-            axes.set_title(f"Residual of the {gap_style.SENSOR_WORDS[column]}")
-        panels[0].set_ylabel("power over that of the noise [1]")
-        style.finish(figure, panels)
+    figure = style.new_figure(3.7)
+    panels = figure.subplots(1, 2, sharey=True)
+    for column, axes in enumerate(panels):
+        for model in found.models:
+            frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)
+            axes.loglog(frequency, power, **gap_style.MODELS[model], label=gap_style.WORDS[model])
+        axes.axhline(1.0, **gap_style.FLOOR)
+        for number, mode in enumerate(modes_Hz[:_MODES], 1):
+            if mode < 0.5 / dt_s:
+                style.tag_below(axes, mode, f"mode {number}")
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.1), max(high, 10.0))
+        axes.set_xlabel("frequency [Hz]")
+        axes.set_title(f"Residual of the {gap_style.SENSOR_WORDS[column]}")
+    panels[0].set_ylabel("power over that of the noise [1]")
+    style.finish(figure, panels)
     return figure
 
 

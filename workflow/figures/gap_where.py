@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from diagnosis.where.findings import SENSORS, RegimeBin, Where
@@ -13,7 +10,7 @@ from workflow.figures import gap_style, style
 from workflow.figures.registry import drawing
 
 _LOOKS = dict(zip(SENSORS, zip(gap_style.SENSOR_WORDS, gap_style.SENSOR_COLOURS, strict=True), strict=True))
-_COLUMNS, _MOST_REGIMES = 3, 6
+_MOST_REGIMES = 6
 _FEW_BINS = 2
 _SMALLEST = 0.05  # noise deviations; less is drawn there
 _WHISKER = {"color": "#444444", "lw": 1.0}
@@ -37,37 +34,36 @@ def draw_bands_and_experiments(where: Where) -> Figure:
     deviations; less is drawn at its edge.
     """
     experiments = where.experiments
-    with style.house_style():
-        figure = style.new_figure(max(3.7, 1.7 + 0.36 * len(experiments)))
-        left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
-        for sensor, shift in zip(SENSORS, (0.97, 1.03), strict=True):
-            name, colour = _LOOKS[sensor]
-            for band in (band for band in where.bands if band.sensor == sensor):
-                middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
-                left.plot(
-                    [band.low_Hz, band.high_Hz],
-                    [max(band.gap.gap_rms, _SMALLEST)] * 2,
-                    color=colour,
-                    alpha=1.0 if band.gap.found else 0.35,
-                    lw=4.0,
-                    solid_capstyle="butt",
-                )
-                left.plot([middle, middle], np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
-            left.plot([], [], color=colour, lw=4.0, label=name)
-        left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="gap over noise, RMS [1]")
-        left.set_ylim(bottom=_SMALLEST)
-        left.set_title("By frequency")
-        for row, entry in enumerate(experiments):
-            for sensor, part, offset in zip(SENSORS, entry.sensors, (-0.15, 0.15), strict=True):
-                pale = 1.0 if part.found else 0.35
-                right.barh(row + offset, part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
-                right.plot(part.interval, [row + offset] * 2, **_WHISKER)
-        right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-        right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel="gap over noise, RMS [1]")
-        right.set_title("By experiment and sensor")
-        right.grid(visible=False, axis="y")
-        left.plot([], [], **_WHISKER, label="95 % interval")
-        style.finish(figure, (left, right))
+    figure = style.new_figure(max(3.7, 1.7 + 0.36 * len(experiments)))
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+    for sensor, shift in zip(SENSORS, (0.97, 1.03), strict=True):
+        name, colour = _LOOKS[sensor]
+        for band in (band for band in where.bands if band.sensor == sensor):
+            middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
+            left.plot(
+                [band.low_Hz, band.high_Hz],
+                [max(band.gap.gap_rms, _SMALLEST)] * 2,
+                color=colour,
+                alpha=1.0 if band.gap.found else 0.35,
+                lw=4.0,
+                solid_capstyle="butt",
+            )
+            left.plot([middle, middle], np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
+        left.plot([], [], color=colour, lw=4.0, label=name)
+    left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="gap over noise, RMS [1]")
+    left.set_ylim(bottom=_SMALLEST)
+    left.set_title("By frequency")
+    for row, entry in enumerate(experiments):
+        for sensor, part, offset in zip(SENSORS, entry.sensors, (-0.15, 0.15), strict=True):
+            pale = 1.0 if part.found else 0.35
+            right.barh(row + offset, part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
+            right.plot(part.interval, [row + offset] * 2, **_WHISKER)
+    right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
+    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel="gap over noise, RMS [1]")
+    right.set_title("By experiment and sensor")
+    right.grid(visible=False, axis="y")
+    left.plot([], [], **_WHISKER, label="95 % interval")
+    style.finish(figure, (left, right))
     return figure
 
 
@@ -77,23 +73,22 @@ def draw_regimes(where: Where) -> Figure | None:
     findings = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
     if not findings:
         return None
-    with style.house_style():
-        figure, panels = _panels(len(findings))
-        for axes, finding in zip(panels, findings, strict=True):
-            at, count = np.arange(len(finding.bins)), len(finding.bins)
-            low, high = np.array([one.interval for one in finding.bins]).T
-            chance = "95 % of what chance gives"
-            axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label=chance)
-            name, colour = _LOOKS[finding.sensor]
-            axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
-            axes.set_xticks(at, [_bin_words(one, count) for one in finding.bins], fontsize=8)
-            axes.axhline(1.0, **gap_style.FLOOR)
-            axes.set_ylim(bottom=0)
-            axes.grid(visible=False, axis="x")
-            axes.set_xlabel(_with_unit(_REGIMES[finding.axis], finding.unit))
-            axes.set_ylabel("residual energy\nover that of the noise [1]")
-            axes.set_title(name, fontsize=9.5, fontweight="normal")
-        style.finish(figure, panels)
+    figure, panels = style.small_multiples(len(findings), min(3, max(2, len(findings))), 2.6, 0.9)
+    for axes, finding in zip(panels, findings, strict=True):
+        at, count = np.arange(len(finding.bins)), len(finding.bins)
+        low, high = np.array([one.interval for one in finding.bins]).T
+        chance = "95 % of what chance gives"
+        axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label=chance)
+        name, colour = _LOOKS[finding.sensor]
+        axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
+        axes.set_xticks(at, [_bin_words(one, count) for one in finding.bins], fontsize=8)
+        axes.axhline(1.0, **gap_style.FLOOR)
+        axes.set_ylim(bottom=0)
+        axes.grid(visible=False, axis="x")
+        axes.set_xlabel(_with_unit(_REGIMES[finding.axis], finding.unit))
+        axes.set_ylabel("residual energy\nover that of the noise [1]")
+        axes.set_title(name, fontsize=9.5, fontweight="normal")
+    style.finish(figure, panels)
     return figure
 
 
@@ -103,18 +98,17 @@ def draw_curves(where: Where) -> Figure | None:
     curves = [curve for curve in where.curves if curve.found]
     if not curves:
         return None
-    with style.house_style():
-        figure, panels = _panels(len(curves))
-        for axes, curve in zip(panels, curves, strict=True):
-            at, value = np.array(curve.centres), np.array(curve.values)
-            error = 2 * np.array(curve.standard_errors)
-            axes.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
-            axes.plot(at, value, "o-", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
-            axes.axhline(0, color="#555555", lw=0.8)
-            axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
-            axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
-            axes.set_title(f"{100 * curve.share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
-        style.finish(figure, panels)
+    figure, panels = style.small_multiples(len(curves), min(3, max(2, len(curves))), 2.6, 0.9)
+    for axes, curve in zip(panels, curves, strict=True):
+        at, value = np.array(curve.centres), np.array(curve.values)
+        error = 2 * np.array(curve.standard_errors)
+        axes.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
+        axes.plot(at, value, "o-", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
+        axes.axhline(0, color="#555555", lw=0.8)
+        axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
+        axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
+        axes.set_title(f"{100 * curve.share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
+    style.finish(figure, panels)
     return figure
 
 
@@ -125,14 +119,3 @@ def _bin_words(one: RegimeBin, count: int) -> str:
 
 def _with_unit(words: str, unit: str) -> str:
     return f"{words} [{unit}]" if unit else words
-
-
-def _panels(count: int) -> tuple[Figure, Sequence[Axes]]:
-    """So many panels in rows; a single one does not fill the page."""
-    columns = min(_COLUMNS, max(2, count))
-    rows = -(-count // columns)
-    figure = style.new_figure(0.9 + 2.6 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in grid[count:]:
-        axes.set_axis_off()
-    return figure, list(grid[:count])

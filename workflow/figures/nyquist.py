@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +17,7 @@ from workflow.figures import style
 from workflow.figures.bands import Complex, Real
 from workflow.figures.registry import drawing
 from workflow.figures.subjects import RunView
+from workflow.text.formats import share
 
 _MOST_ELLIPSES = 220
 
@@ -59,54 +61,36 @@ def loop_of(run: RunView) -> UncertainLoop:
     frequency, plant = run.control.spread.frequency, run.plant
     if isinstance(plant.uncertainty, ResponsePosterior):
         frequency = plant.uncertainty.at(run.loop_grid, plant.level)
-    response = run.synthesis_or_raise.controller.response(frequency.omega_rad_s)
-    return uncertain_loop(frequency, response)
+    return uncertain_loop(frequency, run.controller.response(frequency.omega_rad_s))
 
 
 @drawing("nyquist")
-def draw_run(run: RunView) -> Figure:
-    """The loop of a run."""
-    margin = run.config.specification.modulus_margin
-    return draw_nyquist(loop_of(run), level=run.level, modulus_margin=margin, name=run.control.name)
-
-
-def draw_nyquist(
-    loop: UncertainLoop, *, level: float, modulus_margin: float | None = None, name: str = ""
-) -> Figure:
-    """Whole curve (as far as it fits) and the surroundings of -1. `modulus_margin` is the radius asked
-    for."""
-    with style.house_style():
-        figure = style.new_figure(6.0)
-        whole, near = figure.subplots(1, 2)
-        reach = _reach(np.abs(loop.centre))
-        _draw_loop(whole, loop, (-reach, reach), (-reach, reach), level)
-        _mark_forbidden(whole, modulus_margin)
-        draw_around_minus_one(near, loop, level=level, modulus_margin=modulus_margin)
-        whole.set_title(f"Loop K G{': ' + style.plain(name, 34) if name else ''}")
-        if np.abs(loop.centre).max() > reach:
-            slow = np.abs(loop.centre) > reach
-            whole.text(
-                0.02,
-                0.02,
-                f"beyond the frame below {loop.omega_rad_s[slow].max():.3g} rad/s"
-                if slow[0] and not slow[-1]
-                else "partly beyond the frame",
-                transform=whole.transAxes,
-                fontsize=8.5,
-                color="#555555",
-                bbox={"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1},
-            )
-        style.finish(figure, (near, whole), columns=5)
+def draw_nyquist(run: RunView) -> Figure:
+    """Whole curve of a run's loop (as far as it fits) and the surroundings of -1."""
+    loop, margin = loop_of(run), run.config.specification.modulus_margin
+    figure = style.new_figure(6.0)
+    whole, near = figure.subplots(1, 2)
+    size = np.abs(loop.centre)
+    reach = _reach(size)
+    _draw_loop(whole, loop, (-reach, reach), (-reach, reach), run.level)
+    _mark_forbidden(whole, margin)
+    draw_around_minus_one(near, loop, level=run.level, modulus_margin=margin)
+    whole.set_title(f"Loop K G: {style.plain(run.control.name, 34)}")
+    slow = size > reach
+    if slow.any():
+        below = f"beyond the frame below {loop.omega_rad_s[slow].max():.3g} rad/s"
+        words = below if slow[0] and not slow[-1] else "partly beyond the frame"
+        box = {"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1}
+        whole.text(0.02, 0.02, words, transform=whole.transAxes, fontsize=8.5, color="#555555", bbox=box)
+    style.finish(figure, (near, whole), columns=5)
     return figure
 
 
-def draw_around_minus_one(
-    axes: Axes, loop: UncertainLoop, *, level: float, modulus_margin: float | None
-) -> None:
+def draw_around_minus_one(axes: Axes, loop: UncertainLoop, *, level: float, modulus_margin: float) -> None:
     """The surroundings of -1 on given axes: ellipses, the disc to keep out of, the nearest point."""
     nearest = loop.nearest
     closest = loop.distance[nearest]
-    side = float(np.clip(1.35 * max(closest, modulus_margin or 0.0, 0.35), 0.5, 1.3))
+    side = float(np.clip(1.35 * max(closest, modulus_margin, 0.35), 0.5, 1.3))
     _draw_loop(axes, loop, (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side), level)
     _mark_forbidden(axes, modulus_margin)
     touch = _nearest_point(loop.outline[nearest])
@@ -116,11 +100,10 @@ def draw_around_minus_one(
     axes.set_title("Around -1")
 
 
-def _mark_forbidden(axes: Axes, modulus_margin: float | None) -> None:
-    if modulus_margin is not None:
-        disc = Circle((-1, 0), modulus_margin, fill=False, label="specification: keep out of here")
-        disc.set(edgecolor=style.LIMIT, linewidth=1.3, linestyle=style.LIMIT_LINE["ls"])
-        axes.add_patch(disc)
+def _mark_forbidden(axes: Axes, modulus_margin: float) -> None:
+    disc = Circle((-1, 0), modulus_margin, fill=False, label="specification: keep out of here")
+    disc.set(edgecolor=style.LIMIT, linewidth=1.3, linestyle=style.LIMIT_LINE["ls"])
+    axes.add_patch(disc)
     axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
 
 
@@ -134,61 +117,38 @@ def _reach(size: Real) -> float:
 def _draw_loop(
     axes: Axes, loop: UncertainLoop, real: tuple[float, float], imag: tuple[float, float], level: float
 ) -> None:
+    edges = loop.outline
     inside = (
-        (loop.outline.real.max(axis=1) > real[0])
-        & (loop.outline.real.min(axis=1) < real[1])
-        & (loop.outline.imag.max(axis=1) > imag[0])
-        & (loop.outline.imag.min(axis=1) < imag[1])
+        (edges.real.max(axis=1) > real[0])
+        & (edges.real.min(axis=1) < real[1])
+        & (edges.imag.max(axis=1) > imag[0])
+        & (edges.imag.min(axis=1) < imag[1])
     )
     index = np.flatnonzero(inside)
     if index.size > _MOST_ELLIPSES:
         index = index[np.linspace(0, index.size - 1, _MOST_ELLIPSES).round().astype(int)]
     index = np.union1d(index, [loop.nearest])
-    polygons = np.stack([loop.outline[index].real, loop.outline[index].imag], axis=-1)
-    dense = polygons.shape[0] * polygons.shape[1] > 6000
-    axes.add_collection(
-        PolyCollection(
-            list(polygons),
-            facecolors=style.UNCERTAIN,
-            edgecolors=style.MODEL,
-            linewidths=0.4,
-            alpha=0.2,
-            label=f"{100 * level:.4g} % ellipses",
-            rasterized=dense,
-        )
-    )
-    axes.plot(
-        loop.centre.real,
-        loop.centre.imag,
-        **style.PREDICTED_LINE,
-        label="loop at the centres",
-    )
+    polygons = np.stack([edges[index].real, edges[index].imag], axis=-1)
+    look: Any = {"facecolors": style.UNCERTAIN, "edgecolors": style.MODEL, "linewidths": 0.4, "alpha": 0.2}
+    label, dense = f"{share(level)} ellipses", polygons.shape[0] * polygons.shape[1] > 6000
+    axes.add_collection(PolyCollection(list(polygons), **look, label=label, rasterized=dense))
+    axes.plot(loop.centre.real, loop.centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
     _arrow(axes, loop.centre, real, imag)
     axes.axhline(0, color="#999999", lw=0.7)
     axes.axvline(0, color="#999999", lw=0.7)
-    axes.set_xlim(*real)
-    axes.set_ylim(*imag)
-    axes.set_aspect("equal")
-    axes.set_xlabel("real part of K G [1]")
-    axes.set_ylabel("imaginary part of K G [1]")
+    axes.set(xlim=real, ylim=imag, aspect="equal")
+    axes.set(xlabel="real part of K G [1]", ylabel="imaginary part of K G [1]")
 
 
 def _arrow(axes: Axes, centre: Complex, real: tuple[float, float], imag: tuple[float, float]) -> None:
     """Direction of rising frequency, half-way along the longest visible run."""
-    seen = (
-        (centre.real > real[0]) & (centre.real < real[1]) & (centre.imag > imag[0]) & (centre.imag < imag[1])
-    )
+    x, y = centre.real, centre.imag
+    seen = (x > real[0]) & (x < real[1]) & (y > imag[0]) & (y < imag[1])
     steps = np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0)
-    if not steps.sum() > 0:
-        return
-    k = int(np.searchsorted(np.cumsum(steps), 0.35 * steps.sum()))
-    k = min(k, centre.size - 2)
-    axes.annotate(
-        "",
-        xy=(centre[k + 1].real, centre[k + 1].imag),
-        xytext=(centre[k].real, centre[k].imag),
-        arrowprops={"arrowstyle": "-|>", "color": style.PREDICTED, "lw": 1.4, "mutation_scale": 14},
-    )
+    if steps.sum() > 0:
+        k = min(int(np.searchsorted(np.cumsum(steps), 0.35 * steps.sum())), centre.size - 2)
+        look = {"arrowstyle": "-|>", "color": style.PREDICTED, "lw": 1.4, "mutation_scale": 14}
+        axes.annotate("", xy=(x[k + 1], y[k + 1]), xytext=(x[k], y[k]), arrowprops=look)
 
 
 def _nearest_point(boundary: Complex) -> complex:

@@ -11,8 +11,8 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from ident.search.order_selection import OrderStep
 from ident.stabilisation import Stabilisation
+from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
-from workflow.figures.bands import EmpiricalResponse
 from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
 
@@ -22,73 +22,46 @@ _LINEAR = 10.0
 
 
 @drawing("order")
-def draw_channel(channel: ChannelView) -> Figure | None:
-    """Of a channel; nothing where no other structure was tried."""
+def draw_order(channel: ChannelView) -> Figure | None:
+    """Left: criterion of every structure tried, above the best. Right: pole pairs of fits with 0, 1, 2 ...
+
+    The response straight from the records stands faintly behind the right panel: modes belong on its peaks.
+    Nothing where no other structure was tried.
+    """
     plot, steps = channel.found.stabilisation, channel.found.order_table
     if plot is None or not steps:
         return None
-    chosen = plot.n_real, plot.chosen
-    return draw_order(steps, chosen, plot, name=channel.name, response=channel.empirical)
-
-
-def draw_order(
-    steps: Sequence[OrderStep],
-    chosen: tuple[int, int],
-    plot: Stabilisation,
-    *,
-    name: str,
-    response: EmpiricalResponse | None = None,
-) -> Figure:
-    """Left: criterion of every structure tried, above the best. Right: pole pairs of fits with 0, 1, 2 ...
-
-    chosen = (real poles, pole pairs) of the model. `response` is drawn faintly behind the right panel: modes
-    belong on its peaks. Raises ValueError without a structure.
-    """
-    if not steps:
-        raise ValueError("there is no structure to draw")
-    with style.house_style():
-        figure = style.new_figure(4.6)
-        left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.7])
-        _criterion(left, steps, chosen)
-        left.set_title(f"Criterion: {style.plain(name, 16)}")
-        _stabilisation(right, plot, response)
-        style.finish(figure, (left, right), columns=4)
+    figure = style.new_figure(4.6)
+    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.7])
+    _criterion(left, steps, (plot.n_real, plot.chosen))
+    left.set_title(f"Criterion: {style.plain(channel.name, 16)}")
+    _stabilisation(right, plot, channel.spread.empirical)
+    style.finish(figure, (left, right), columns=4)
     return figure
 
 
 def _criterion(axes: Axes, steps: Sequence[OrderStep], chosen: tuple[int, int]) -> None:
-    best = min(step.criterion for step in steps)
     order = np.array([step.order for step in steps])
-    above = np.array([step.criterion - best for step in steps])
+    above = np.array([step.criterion for step in steps])
+    above -= above.min()
     axes.plot(
         order, above, ls="none", marker="o", ms=5, mfc="white", mec=style.MODEL, label="structure tried"
     )
     lowest = np.unique(order)
-    envelope = [above[order == n].min() for n in lowest]
-    axes.plot(lowest, envelope, color=style.MODEL, lw=1.0)
+    axes.plot(lowest, [above[order == n].min() for n in lowest], color=style.MODEL, lw=1.0)
     mine = [k for k, step in enumerate(steps) if (step.n_real, step.n_pairs) == chosen]
     if mine:
-        axes.plot(
-            order[mine],
-            above[mine],
-            ls="none",
-            marker="*",
-            ms=14,
-            mfc=style.HIGHLIGHT,
-            mec="black",
-            mew=0.7,
-            label=f"the model: {chosen[0]} real, {chosen[1]} pairs",
-        )
+        label = f"the model: {chosen[0]} real, {chosen[1]} pairs"
+        axes.plot(order[mine], above[mine], **style.STAR | {"ms": 14, "mew": 0.7}, label=label)
     axes.set_yscale("symlog", linthresh=_LINEAR)
     axes.set_ylim(-0.15 * _LINEAR, max(2.5 * above.max(), 1.5 * _LINEAR))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlim(order.min() - 0.6, order.max() + 0.6)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("searched poles [1]")
-    axes.set_ylabel("criterion above the best [1]")
+    axes.set(xlabel="searched poles [1]", ylabel="criterion above the best [1]")
 
 
-def _stabilisation(axes: Axes, plot: Stabilisation, response: EmpiricalResponse | None) -> None:
+def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertainty | None) -> None:
     omega, count = plot.omega_rad_s, plot.n_pairs
     stable, same = plot.stable, plot.previous >= 0
     axes.set_xscale("log")
@@ -114,24 +87,22 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: EmpiricalResponse 
     if response is None and omega.size:
         axes.set_xlim(omega.min() / 1.5, omega.max() * 1.5)
     axes.set_title("Stabilisation: which modes stay")
-    axes.set_xlabel("frequency of the pair [rad/s]")
-    axes.set_ylabel("pole pairs in the fit [1]")
+    axes.set(xlabel="frequency of the pair [rad/s]", ylabel="pole pairs in the fit [1]")
 
 
-def _faint(axes: Axes, response: EmpiricalResponse) -> None:
+def _faint(axes: Axes, response: FrequencyUncertainty) -> None:
     """The gain behind the marks, on a log scale of its own that nobody has to read."""
-    gain = np.abs(response.response)
-    seen = gain > 0
-    log = np.log(gain[seen])
+    gain = np.abs(response.centre)
+    omega, log = response.omega_rad_s[gain > 0], np.log(gain[gain > 0])
     low, high = np.percentile(log, 1), log.max()
-    share = np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0)
+    height = np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0)
     axes.plot(
-        response.omega_rad_s[seen],
-        0.03 + 0.94 * share,
+        omega,
+        0.03 + 0.94 * height,
         transform=axes.get_xaxis_transform(),
         color=style.MEASURED,
         lw=0.8,
         alpha=0.4,
         label="gain straight from the records (own log scale)",
     )
-    axes.set_xlim(response.omega_rad_s[seen][0], response.omega_rad_s[seen][-1])
+    axes.set_xlim(omega[0], omega[-1])

@@ -10,6 +10,8 @@ from typing import TypeVar
 
 from matplotlib.figure import Figure
 
+from workflow.figures.style import house_style
+
 Drawing = Callable[..., Figure | None]
 D = TypeVar("D", bound=Drawing)
 
@@ -17,13 +19,17 @@ _DRAWINGS: dict[str, Drawing] = {}
 
 
 def drawing(name: str) -> Callable[[D], D]:
-    """Give a drawing its name on the pages. It takes typed results; None means there is nothing to draw."""
+    """Give a drawing its name on the pages, and the house style.
+
+    It takes typed results; None means there is nothing to draw.
+    """
 
     def register(draw: D) -> D:
         if name in _DRAWINGS:
             raise ValueError(f"two drawings are called {name!r}")
-        _DRAWINGS[name] = draw
-        return draw
+        styled: D = house_style()(draw)
+        _DRAWINGS[name] = styled
+        return styled
 
     return register
 

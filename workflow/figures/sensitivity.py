@@ -17,6 +17,7 @@ from workflow.figures import style
 from workflow.figures.bands import Real
 from workflow.figures.registry import drawing
 from workflow.figures.subjects import RunView
+from workflow.text.formats import share
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,44 +54,36 @@ def sensitivity_curves(
     |S|, which is an upper bound because the two ellipses are not independent.
     """
     omega = np.asarray(omega_rad_s, dtype=np.float64)
-    ellipses = plant.at(omega)
+    ellipses, performance = plant.at(omega), plant.performance_at(omega)
     gain = controller.response(omega)
-    distance = np.maximum(distance_to_minus_one(gain, ellipses), 1e-300)
-    worst_s = 1 / distance
-    centre_s = 1 / np.abs(1 + gain * ellipses.centre)
-    complementary = specification.magnitude(plant, omega, LoopFunction.COMPLEMENTARY)
-    tracking = specification.magnitude(plant, omega, LoopFunction.SENSITIVITY)
-    effort = specification.magnitude(plant, omega, LoopFunction.EFFORT)
-    performance = plant.performance_at(omega)
-    worst_gs_own = largest_disturbance_gain(gain, ellipses)
-    if performance is None:
-        centre_gs, worst_gs, exact = np.abs(ellipses.centre) * centre_s, worst_gs_own, True
-    else:
-        centre_gs, worst_gs, exact = (
-            np.abs(performance.centre) * centre_s,
-            performance.farthest() * worst_s,
-            False,
-        )
-    damping = specification.magnitude(plant, omega, LoopFunction.DISTURBANCE)
-    centre_t = np.abs(gain * ellipses.centre) * centre_s
+    nominal = 1 / np.abs(1 + gain * ellipses.centre)
+    worst = 1 / np.maximum(distance_to_minus_one(gain, ellipses), 1e-300)
+    worst_gs = largest_disturbance_gain(gain, ellipses)
 
-    def ceiling(weight: Real) -> Real:
-        return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), np.nan)
+    def curve(
+        function: LoopFunction, symbol: str, meaning: str, unit: str, centre: Real, high: Real
+    ) -> SensitivityCurve:
+        weight = specification.magnitude(plant, omega, function)
+        limit = np.divide(1.0, weight, out=np.full_like(weight, np.nan), where=weight > 0)
+        exact = function is not LoopFunction.DISTURBANCE or performance is None
+        return SensitivityCurve(symbol, meaning, unit, omega, centre, high, limit, exact)
 
+    size = np.abs(gain)
     effort_unit = style.ratio_unit(input_unit, output_unit)
     disturbance_unit = style.ratio_unit(performance_unit or output_unit, input_unit)
-    centre_ks, worst_ks = np.abs(gain) * centre_s, np.abs(gain) * worst_s
-    worst_t = np.abs(gain) * worst_gs_own
-    symbol, where = ("|G S|", "output") if performance is None else ("|Gp S|", "performance output")
-    to_error, to_output = "reference or disturbance to error", "reference to output"
-    to_command, from_input = "measurement noise to command", f"input to {where}"
+    if performance is None:
+        symbol, where = "|G S|", "output"
+        disturbance = np.abs(ellipses.centre) * nominal, worst_gs
+    else:
+        symbol, where = "|Gp S|", "performance output"
+        disturbance = np.abs(performance.centre) * nominal, performance.farthest() * worst
+    to_error, to_command = "reference or disturbance to error", "measurement noise to command"
+    through = np.abs(gain * ellipses.centre) * nominal, size * worst_gs
     return (
-        SensitivityCurve("|S|", to_error, "1", omega, centre_s, worst_s, ceiling(tracking)),
-        SensitivityCurve("|K S|", to_command, effort_unit, omega, centre_ks, worst_ks, ceiling(effort)),
-        SensitivityCurve("|T|", to_output, "1", omega, centre_t, worst_t, ceiling(complementary)),
-        SensitivityCurve(
-            symbol, from_input, disturbance_unit, omega, centre_gs, worst_gs, ceiling(damping), exact
-        ),
+        curve(LoopFunction.SENSITIVITY, "|S|", to_error, "1", nominal, worst),
+        curve(LoopFunction.EFFORT, "|K S|", to_command, effort_unit, size * nominal, size * worst),
+        curve(LoopFunction.COMPLEMENTARY, "|T|", "reference to output", "1", *through),
+        curve(LoopFunction.DISTURBANCE, symbol, f"input to {where}", disturbance_unit, *disturbance),
     )
 
 
@@ -98,7 +91,7 @@ def curves_of(run: RunView, omega_rad_s: Real | None = None) -> tuple[Sensitivit
     """The curves of a run, at frequencies (F,) of one's own or at those that show its loop."""
     return sensitivity_curves(
         run.plant,
-        run.synthesis_or_raise.controller,
+        run.controller,
         run.config.specification,
         run.loop_grid if omega_rad_s is None else omega_rad_s,
         input_unit=run.input_unit,
@@ -115,56 +108,39 @@ def draw_run(run: RunView) -> Figure:
     return draw_sensitivities(curves_of(run), level=run.level, marks=marks)
 
 
+@style.house_style()
 def draw_sensitivities(
     curves: Sequence[SensitivityCurve], *, level: float, marks: Sequence[tuple[float, str]] = ()
 ) -> Figure:
     """One panel per closed-loop gain; `marks` are frequencies [rad/s] with a word, e.g. the first mode."""
-    with style.house_style():
-        rows = -(-len(curves) // 2)
-        figure = style.new_figure(2.7 * rows + 0.8)
-        grid = figure.subplots(rows, 2, squeeze=False, sharex=True)
-        for axes in grid.ravel()[len(curves) :]:
-            axes.set_visible(False)
-        for axes, curve in zip(grid.ravel(), curves, strict=False):
-            finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
-            axes.fill_between(curve.omega_rad_s, curve.nominal, finite, **style.BAND)
-            axes.plot(
-                curve.omega_rad_s,
-                finite,
-                color=style.UNCERTAIN,
-                lw=1.2,
-                label=f"over the {100 * level:.4g} % ellipses",
-            )
-            axes.plot(
-                curve.omega_rad_s, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)"
-            )
-            if np.any(np.isfinite(curve.limit)):
-                axes.plot(
-                    curve.omega_rad_s, curve.limit, **style.LIMIT_LINE, label="specification: stay below"
-                )
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            note = "" if curve.exact else " (band: upper bound)"
-            axes.set_title(f"{curve.symbol}: {curve.meaning}{note}", fontsize=9.5)
-            axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
-            axes.set_ylim(*_range(curve))
-            axes.set_xlim(curve.omega_rad_s[0], curve.omega_rad_s[-1])
-            for omega, word in marks:
-                if curve.omega_rad_s[0] < omega < curve.omega_rad_s[-1]:
-                    axes.axvline(omega, color="#888888", lw=0.8, ls=":")
-                    style.tag_below(axes, omega, word)
-        for axes in grid[-1]:
-            axes.set_xlabel("frequency [rad/s]")
-        figure.align_ylabels()
-        style.finish(figure, grid.ravel()[: len(curves)], columns=4)
+    figure, panels = style.small_multiples(len(curves), 2, 2.7, 0.8, sharex=True)
+    for axes, curve in zip(panels, curves, strict=True):
+        omega = curve.omega_rad_s
+        finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
+        axes.fill_between(omega, curve.nominal, finite, **style.BAND)
+        axes.plot(omega, finite, color=style.UNCERTAIN, lw=1.2, label=f"over the {share(level)} ellipses")
+        axes.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)")
+        if np.any(np.isfinite(curve.limit)):
+            axes.plot(omega, curve.limit, **style.LIMIT_LINE, label="specification: stay below")
+        axes.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=_range(curve))
+        note = "" if curve.exact else " (band: upper bound)"
+        axes.set_title(f"{curve.symbol}: {curve.meaning}{note}", fontsize=9.5)
+        axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
+        for at, word in marks:
+            if omega[0] < at < omega[-1]:
+                style.tag_below(axes, at, word)
+    for axes in panels[-2:]:
+        axes.set_xlabel("frequency [rad/s]")
+    figure.align_ylabels()
+    style.finish(figure, panels, columns=4)
     return figure
 
 
 def _range(curve: SensitivityCurve) -> tuple[float, float]:
     """At most six decades below the top, so that an integrator does not flatten everything else."""
-    parts = [curve.nominal, curve.worst, curve.limit[np.isfinite(curve.limit)]]
-    values = np.concatenate([part[np.isfinite(part) & (part > 0) & (part < 1e200)] for part in parts])
+    values = np.concatenate([curve.nominal, curve.worst, curve.limit])
+    values = values[np.isfinite(values) & (values > 0) & (values < 1e200)]
     if not values.size:
         return 0.1, 10.0
-    top = 2.0 * min(values.max(), 300 * max(float(np.median(curve.nominal)), float(curve.nominal.max())))
+    top = 2.0 * min(values.max(), 300 * float(curve.nominal.max()))
     return max(float(values.min()) / 1.5, top * 1e-6), float(top)

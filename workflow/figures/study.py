@@ -10,20 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from workflow.figures import style
 from workflow.figures.registry import drawing
-from workflow.figures.style import (
-    LIMIT,
-    PREDICTED,
-    WIDTH_IN,
-    finish,
-    house_style,
-    new_figure,
-    pad_limits,
-    plain,
-)
-
-_DOMINATED = "#a8adb4"
-_PER_ROW = 2
 
 
 @dataclass(frozen=True)
@@ -52,74 +40,62 @@ class Panel:
     missing: int = 0
 
 
+_DOT: dict[str, Any] = {"ls": "none", "zorder": 3, "marker": "o", "ms": 6}
+_HOLLOW = _DOT | {"mfc": "none", "mec": style.LIMIT, "mew": 1.2}
+_DOMINATED = _DOT | {"color": "#a8adb4", "mew": 0}
+_FRONT = _DOT | {"color": style.PREDICTED, "marker": "D", "ms": 7, "mew": 0}
+
+
 @drawing("pareto")
 def draw_pareto(panels: Sequence[Panel]) -> Figure:
     """Certified points filled (those on the front coloured and numbered), others hollow."""
-    rows = -(-len(panels) // _PER_ROW)
-    columns = min(len(panels), _PER_ROW)
-    with house_style():
-        figure = new_figure(4.3 * rows + 0.4, WIDTH_IN)
-        grid = figure.subplots(rows, columns, squeeze=False)
-        axes = list(grid.flat)
-        for one, panel in zip(axes, panels, strict=False):
-            _draw(one, panel)
-        for one in axes[len(panels) :]:
-            one.set_visible(False)
-        finish(figure, axes[: len(panels)])
+    figure, places = style.small_multiples(len(panels), min(len(panels), 2), 4.3, 0.4)
+    for axes, panel in zip(places, panels, strict=True):
+        _draw(axes, panel)
+    style.finish(figure, places)
     return figure
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
-    axes.set_xlabel(f"{plain(panel.x_label, 40)} ({panel.x_better} is better)")
-    axes.set_ylabel(f"{plain(panel.y_label, 40)} ({panel.y_better} is better)")
-    axes.set_title(plain(f"{panel.y_label} against {panel.x_label}", 70))
+    axes.set_xlabel(f"{style.plain(panel.x_label, 40)} ({panel.x_better} is better)")
+    axes.set_ylabel(f"{style.plain(panel.y_label, 40)} ({panel.y_better} is better)")
+    axes.set_title(style.plain(f"{panel.y_label} against {panel.x_label}", 70))
     if panel.missing:
-        axes.annotate(
-            f"{panel.missing} not drawn: no number here",
-            (0.99, 0.01),
-            xycoords="axes fraction",
-            ha="right",
-            fontsize=8,
-            color="#666666",
-        )
-    if not panel.marks:
-        return
-    hollow = [mark for mark in panel.marks if not mark.good]
-    behind = [mark for mark in panel.marks if mark.good and not mark.front]
+        words = f"{panel.missing} not drawn: no number here"
+        axes.annotate(words, (0.99, 0.01), xycoords="axes fraction", ha="right", fontsize=8, color="#666666")
     front = sorted((mark for mark in panel.marks if mark.front), key=lambda mark: (mark.x, mark.y))
-    styles: tuple[tuple[Sequence[Mark], str, dict[str, Any]], ...] = (
-        (hollow, "not certified", {"mfc": "none", "mec": LIMIT, "mew": 1.2, "marker": "o", "ms": 6}),
-        (behind, "certified, dominated", {"color": _DOMINATED, "marker": "o", "ms": 6, "mew": 0}),
-        (front, "certified, on the front", {"color": PREDICTED, "marker": "D", "ms": 7, "mew": 0}),
-    )
-    for marks, label, style in styles:
+    for marks, label, look in (
+        ([mark for mark in panel.marks if not mark.good], "not certified", _HOLLOW),
+        ([mark for mark in panel.marks if mark.good and not mark.front], "certified, dominated", _DOMINATED),
+        (front, "certified, on the front", _FRONT),
+    ):
         if marks:
-            axes.plot([m.x for m in marks], [m.y for m in marks], ls="none", label=label, zorder=3, **style)
+            axes.plot([m.x for m in marks], [m.y for m in marks], label=label, **look)
     if len(front) > 1:
-        axes.plot([m.x for m in front], [m.y for m in front], color=PREDICTED, lw=0.9, ls=":", zorder=2)
-    xs, ys = np.array([m.x for m in panel.marks]), np.array([m.y for m in panel.marks])
-    axes.set_xlim(*pad_limits(float(xs.min()), float(xs.max()), 0.1))
-    axes.set_ylim(*pad_limits(float(ys.min()), float(ys.max()), 0.1))
-    _number(axes, front)
+        xs, ys = [mark.x for mark in front], [mark.y for mark in front]
+        axes.plot(xs, ys, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
+    if panel.marks:
+        points = np.array([(mark.x, mark.y) for mark in panel.marks])
+        low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        axes.set_xlim(*style.pad_limits(low[0], high[0], 0.1))
+        axes.set_ylim(*style.pad_limits(low[1], high[1], 0.1))
+        _number(axes, front)
 
 
 def _number(axes: Axes, front: Sequence[Mark]) -> None:
     """Numbers as in the table, those of points in one place together."""
-    low, high = axes.get_xlim()
-    bottom, top = axes.get_ylim()
-    places: dict[tuple[int, int], list[Mark]] = {}
+    places: dict[tuple[int, ...], list[Mark]] = {}
     for mark in front:
         # A fiftieth of the axes: closer together, two labels would lie on one another.
-        place = (round(50 * (mark.x - low) / (high - low)), round(50 * (mark.y - bottom) / (top - bottom)))
-        places.setdefault(place, []).append(mark)
+        share = axes.transLimits.transform((mark.x, mark.y))
+        places.setdefault(tuple(np.rint(50 * share).astype(int).tolist()), []).append(mark)
     for marks in places.values():
-        numbers = ", ".join(str(mark.number) for mark in sorted(marks, key=lambda mark: mark.number))
         axes.annotate(
-            plain(numbers, 18),
+            style.plain(", ".join(str(number) for number in sorted(mark.number for mark in marks)), 18),
             (marks[0].x, marks[0].y),
             xytext=(6, 5),
             textcoords="offset points",
             fontsize=8.5,
-            color=PREDICTED,
+            color=style.PREDICTED,
             zorder=4,
         )

@@ -6,9 +6,10 @@ meaning has a line style of its own as well, so a grey print still reads.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -38,7 +39,10 @@ PREDICTED_LINE: dict[str, Any] = {"color": PREDICTED, "lw": 1.5}
 ACHIEVED_LINE: dict[str, Any] = {"color": ACHIEVED, "lw": 1.1}
 REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "lw": 1.0, "ls": (0, (4, 2))}
 LIMIT_LINE: dict[str, Any] = {"color": LIMIT, "lw": 1.3, "ls": (0, (6, 2, 1.5, 2))}
+REFERENCE_STEPS: dict[str, Any] = REFERENCE_LINE | {"drawstyle": "steps-post"}
 BAND: dict[str, Any] = {"color": UNCERTAIN, "alpha": 0.42, "lw": 0}
+ACHIEVED_BAND: dict[str, Any] = {"color": ACHIEVED, "alpha": 0.22, "lw": 0}
+STAR: dict[str, Any] = {"ls": "none", "marker": "*", "mfc": HIGHLIGHT, "mec": "black"}
 
 WIDTH_IN = 10.0  # 100 px per inch at the width of the page
 SVG_LIMIT_BYTES = 400_000
@@ -88,8 +92,9 @@ class Picture:
     content: bytes
 
 
-def house_style() -> Any:
-    """Context in which figures are built and rendered; global matplotlib settings come back afterwards."""
+def house_style() -> contextlib._GeneratorContextManager[None]:
+    """Context in which figures are built and rendered, or decorator; global matplotlib settings come back
+    afterwards."""
     return mpl.rc_context(_RC)
 
 
@@ -98,6 +103,18 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def small_multiples(
+    count: int, columns: int, row_in: float, rest_in: float, **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """So many panels in rows of `columns`, each row `row_in` high; a place left over stays empty."""
+    rows = -(-count // columns)
+    figure = new_figure(row_in * rows + rest_in)
+    panels = figure.subplots(rows, columns, squeeze=False, **options).ravel()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure, list(panels[:count])
 
 
 def render(figure: Figure) -> Picture:
@@ -151,7 +168,7 @@ def plain(text: object, longest: int = 60) -> str:
 
 def two_lines(name: object, unit: str) -> str:
     """Axis label `name`, `[unit]`; a unit nobody stated is said to be as logged, never guessed."""
-    return f"{plain(name, 20)}\n[{plain(unit, 16) if unit else 'as logged'}]"
+    return f"{plain(name, 18)}\n[{plain(unit, 16) if unit else 'as logged'}]"
 
 
 def ratio_unit(output_unit: str, input_unit: str) -> str:
@@ -187,13 +204,16 @@ def finish(figure: Figure, axes: Axes | Iterable[Axes], columns: int = 4) -> Non
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+def _number(value: float, _: int) -> str:
+    return f"{value:g}"
+
+
 def _power_of_ten(value: float, _: int) -> str:
     if not value > 0:
         return ""
     if 0.999e-3 <= value <= 1.001e3:
         return f"{value:g}"
-    exponent = round(np.log10(value))
-    return f"10{str(exponent).translate(_SUPERSCRIPT)}"
+    return f"10{str(round(np.log10(value))).translate(_SUPERSCRIPT)}"
 
 
 def plain_log_labels(figure: Figure) -> None:
@@ -211,16 +231,13 @@ def plain_log_labels(figure: Figure) -> None:
             if few:
                 subs = LogLocator(base=10, subs=(1.0, 2.0, 5.0))
                 axis.set_major_locator(subs if high / low >= 5 else MaxNLocator(5))
-            axis.set_major_formatter(FuncFormatter(_plain_number if few else _power_of_ten))
+            axis.set_major_formatter(FuncFormatter(_number if few else _power_of_ten))
             axis.set_minor_formatter(NullFormatter())
 
 
-def _plain_number(value: float, _: int) -> str:
-    return f"{value:g}"
-
-
 def tag_below(axes: Axes, x: float, text: str) -> None:
-    """A small word at the bottom of a vertical line at data position x, inside the axes."""
+    """A dotted vertical line at data position x, with a small word at its foot, inside the axes."""
+    axes.axvline(x, color="#888888", lw=0.8, ls=":")
     axes.annotate(
         plain(text, 20),
         (x, 0.02),
@@ -232,24 +249,14 @@ def tag_below(axes: Axes, x: float, text: str) -> None:
     )
 
 
-def _to_hertz(omega: Any) -> Any:
-    return omega / (2 * np.pi)
-
-
-def _to_rad_s(frequency: Any) -> Any:
-    return frequency * (2 * np.pi)
-
-
-def hertz_axis(axes: Axes, label: bool = True) -> None:
+def hertz_axis(axes: Axes) -> None:
     """A second frequency axis on top, in Hz, for axes whose x is in rad/s."""
-    top = axes.secondary_xaxis("top", functions=(_to_hertz, _to_rad_s))
+    turn: Any = 2 * np.pi
+    top = axes.secondary_xaxis("top", functions=(lambda omega: omega / turn, lambda hertz: hertz * turn))
     top.xaxis.set_major_formatter(FuncFormatter(_power_of_ten))
     top.xaxis.set_minor_formatter(NullFormatter())
     top.tick_params(labelsize=8.5, colors="#666666")
-    if label:
-        top.set_xlabel("frequency [Hz]", fontsize=8.5, color="#666666")
-    else:
-        top.set_xticklabels([])
+    top.set_xlabel("frequency [Hz]", fontsize=8.5, color="#666666")
 
 
 def inline_svg(svg: bytes, prefix: str, label: str) -> str:
@@ -285,9 +292,3 @@ def pad_limits(low: float, high: float, share: float = 0.06) -> tuple[float, flo
     if not span > 0:
         span = abs(high) or 1.0
     return low - share * span, high + share * span
-
-
-def shown(names: Sequence[str], longest: int = 6) -> str:
-    """A short list of names for a title."""
-    rest = f" and {len(names) - longest} more" if len(names) > longest else ""
-    return ", ".join(plain(name, 28) for name in names[:longest]) + rest

@@ -15,13 +15,15 @@ import numpy as np
 
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.stability import closed_loop_poles
+from control_design.controllers.controller import Controller
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
 from workflow.config.run_config import Channel, RunConfig
-from workflow.figures.bands import Complex, EmpiricalResponse, Real
+from workflow.figures.bands import Complex, Real
+from workflow.figures.style import ratio_unit
 from workflow.tasks.conditioning import as_fitted
 from workflow.tasks.joint_coverage import joint_numbers
 from workflow.tasks.log_identification import LogIdentification
@@ -71,23 +73,18 @@ class ChannelView:
     def shown_pair(self) -> int | None:
         """Index of the pole pair whose error surface is shown: the slowest lightly damped one, else the
         slowest."""
-        model = self.found.model
-        if model.poles.pairs.size == 0:
-            return None
-        omega, zeta = model.poles.omega_rad_s(model.dt_s), model.poles.zeta()
-        light = np.flatnonzero((zeta < LIGHT) & (zeta > 5e-4))
-        candidates = light if light.size else np.arange(omega.size)
-        return int(candidates[np.argmin(omega[candidates])])
+        omega, zeta = self._omega_rad_s, self.found.model.poles.zeta()
+        light = (zeta < LIGHT) & (zeta > 5e-4)
+        slowest = np.argsort(np.where(light | ~light.any(), omega, np.inf))
+        return int(slowest[0]) if slowest.size else None
 
     @property
     def shown_omega_rad_s(self) -> float | None:
-        model, pair = self.found.model, self.shown_pair
-        return None if pair is None else float(model.poles.omega_rad_s(model.dt_s)[pair])
+        return None if self.shown_pair is None else float(self._omega_rad_s[self.shown_pair])
 
     @property
-    def empirical(self) -> EmpiricalResponse | None:
-        found = self.spread.empirical
-        return None if found is None else EmpiricalResponse(found.omega_rad_s, found.centre)
+    def _omega_rad_s(self) -> Real:
+        return self.found.model.poles.omega_rad_s(self.found.model.dt_s)
 
     @property
     def unconfirmed_rad_s(self) -> list[float]:
@@ -123,20 +120,16 @@ class ChannelView:
     @property
     def unseen(self) -> list[tuple[str, float, str]]:
         """Name, fit [%] and role of the records that the fit has not seen, validation first."""
-        fits = [(fit.name, fit.fit_percent) for fit in self.found.fresh]
-        rows = [
-            (name, fit, str(role)) for (name, fit), role in zip(fits, self.found.fresh_roles, strict=True)
-        ]
+        pairs = zip(self.found.fresh, self.found.fresh_roles, strict=True)
+        rows = [(fit.name, fit.fit_percent, str(role)) for fit, role in pairs]
         return sorted(rows, key=lambda row: row[2] != "validation")
 
 
 def log_channel(result: LogIdentification) -> ChannelView:
     """The channel of `flexlink identify`."""
     first = result.measured[0]
-    units = [names[0] if names else "" for names in (first.input_units, first.output_units)]
-    return ChannelView(
-        result.about, result.spread, result.options, result.fresh_records, (units[0], units[1])
-    )
+    units = "".join(first.input_units[:1]), "".join(first.output_units[:1])
+    return ChannelView(result.about, result.spread, result.options, result.fresh_records, units)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,30 +143,22 @@ class RunView:
 
     @cached_property
     def channels(self) -> tuple[ChannelView, ...]:
+        return tuple(self._channel(index) for index in range(len(self.config.channels)))
+
+    def _channel(self, index: int) -> ChannelView:
+        channel, found = self.config.channels[index], self.results.identify.channels[index]
         by_name = {item.name: item.record for item in self.results.records.records}
-        views = []
-        for index, (channel, found, spread) in enumerate(
-            zip(
-                self.config.channels,
-                self.results.identify.channels,
-                self.results.uncertainty.channels,
-                strict=True,
-            )
-        ):
-            slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
-            with_loop = index == self.config.control_index and self.results.design.has_controller
-            views.append(
-                ChannelView(
-                    found,
-                    spread,
-                    channel.identification,
-                    tuple(_as_fitted(by_name[fit.name], channel) for fit in found.fresh),
-                    (self.unit(found.model.input_name), self.unit(found.model.output_name)),
-                    f"{index + 1}{'-' + slug if slug else ''}",
-                    closed_loop_poles(self.synthesis_or_raise.controller, self.plant) if with_loop else None,
-                )
-            )
-        return tuple(views)
+        slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
+        with_loop = index == self.config.control_index and self.results.design.has_controller
+        return ChannelView(
+            found,
+            self.results.uncertainty.channels[index],
+            channel.identification,
+            tuple(_as_fitted(by_name[fit.name], channel) for fit in found.fresh),
+            (self.unit(found.model.input_name), self.unit(found.model.output_name)),
+            f"{index + 1}-{slug}".strip("-"),
+            closed_loop_poles(self.controller, self.plant) if with_loop else None,
+        )
 
     @property
     def control(self) -> ChannelView:
@@ -209,10 +194,11 @@ class RunView:
         return self.results.design.synthesis
 
     @property
-    def synthesis_or_raise(self) -> SynthesisResult:
+    def controller(self) -> Controller:
+        """Raises ValueError where there is none."""
         if self.synthesis is None:
             raise ValueError("the run has no design")
-        return self.synthesis
+        return self.synthesis.controller
 
     @property
     def certificate(self) -> Certificate | None:
@@ -250,9 +236,14 @@ class RunView:
         return joint_numbers(self.results.certify.sampled)
 
     @property
-    def requirements(self) -> list[tuple[str, Any, str]]:
-        """Name, value and meaning of what the specification asks for."""
+    def requirements(self) -> list[tuple[str, Any, str, str]]:
+        """Name, value, unit and meaning of what the specification asks for."""
         asked = self.config.specification
+        units = {
+            "effort_limit": ratio_unit(self.input_unit, self.output_unit),
+            "input_limit": self.input_unit,
+            "rate_limit": ratio_unit(self.input_unit, "s"),
+        }
         rows = []
         for name, field in type(asked).model_fields.items():
             value = getattr(asked, name)
@@ -260,7 +251,8 @@ class RunView:
                 continue
             if name == "low_frequency_rejection" and (asked.bandwidth_rad_s is None or asked.integrator):
                 continue
-            rows.append((name, value, field.description or ""))
+            unit = units.get(name, next((unit for end, unit in _ENDINGS if name.endswith(end)), ""))
+            rows.append((name, value, unit, field.description or ""))
         return rows
 
     @property
@@ -297,10 +289,9 @@ class RunView:
         omega = omega[omega > 0]
         if self.plant.own_grid is not None:
             return omega
-        controller = self.synthesis_or_raise.controller
-        poles = [closed_loop_poles(controller, self.plant)]
-        if controller.order:
-            poles.append(np.linalg.eigvals(controller.A).astype(np.complex128))
+        poles = [closed_loop_poles(self.controller, self.plant)]
+        if self.controller.order:
+            poles.append(np.linalg.eigvals(self.controller.A).astype(np.complex128))
         modes = [
             Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4))
             for mode in modes_of(np.concatenate(poles), self.plant.dt_s)
@@ -316,6 +307,7 @@ class RunView:
 
 
 _NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
+_ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))
 
 
 def _as_fitted(record: Record, channel: Channel) -> Record:
