@@ -39,7 +39,7 @@ _VARIABLES: dict[str, tuple[Callable[[Motion], Real], str]] = {
     "time": (lambda m: m.time_s, "s"),
 }
 _ROUTES = (
-    ("hub_torque", ("speed", "angle", "command", "deflection", "time"), "Nm"),
+    ("hub_torque", ("speed", "angle", "command", "deflection", "time"), "N m"),
     ("hub_angle", ("angle", "speed", "time"), "rad"),
     ("tip", ("position", "speed", "time"), "m"),
 )

@@ -88,7 +88,9 @@ OTHERWISE = {
     "DELAY": [{"other_delay": 1}],
     "RELATIVE_DEGREE": [{"imposed": False}],
     "WHITENESS": [{"passed": True}, {"probability": 0.0}],
-    "INDEPENDENCE": [{"passed": True, "precedes_input": False}],
+    "INDEPENDENCE": [
+        {"passed": True, "precedes_input": False, "probability": p} for p in (0.48, 0.9961, 1.0)
+    ],
     "NOT_WHITE": [{"independent": False}, {"noise_order": 8}, {"noise_order": 8, "independent": False}],
     "CHI_SQUARE": [{"chi_square": 100.0}, {"chi_square": 400.0}],
     "INVALIDATION": [{"invalidated": True}, {"outside": 2}],
