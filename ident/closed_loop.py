@@ -10,6 +10,7 @@ import numpy as np
 from ident.basis.options import IdentOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
+from ident.data.ellipses import factor_matrices
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.finding import Finding, FindingKind, finding
@@ -167,8 +168,7 @@ def indirect(
         raise ValueError(
             f"at omega = {at:.6g} rad/s the closed loop tells nothing about the plant: a - g T may be zero"
         )
-    slope = reference_gain / rest**2
-    turn = np.stack([np.stack([slope.real, -slope.imag], -1), np.stack([slope.imag, slope.real], -1)], -2)
+    turn = factor_matrices(reference_gain / rest**2)
     return replace(
         closed_loop,
         centre=closed_loop.centre / rest,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
 import numpy as np
 
 Value = float | bool | int | str
+
+# Level of the tests of what is stated as known.
+TEST_LEVEL = 0.99
 
 
 class FindingKind(Enum):
@@ -73,6 +76,39 @@ class Finding:
 def finding(kind: FindingKind, **values: Value | np.generic) -> Finding:
     """Numbers of numpy become plain ones."""
     return Finding(kind, {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()})
+
+
+@dataclass(frozen=True)
+class PriorTest:
+    """Verdict of the data on one prior.
+
+    statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
+    above it the prior is refused; a cancelled integrator is refused the other way round
+    (`ident.checks.integrators_prior`). imposed says whether the model keeps to the prior; details are what
+    the advice needs beside these.
+    """
+
+    kind: FindingKind
+    prior: str
+    refused: bool
+    imposed: bool
+    statistic: float
+    limit: float
+    degrees_of_freedom: int
+    details: Mapping[str, Value] = field(default_factory=dict)
+
+    @property
+    def finding(self) -> Finding:
+        return finding(
+            self.kind,
+            prior=self.prior,
+            refused=self.refused,
+            imposed=self.imposed,
+            statistic=self.statistic,
+            limit=self.limit,
+            level=TEST_LEVEL,
+            **self.details,
+        )
 
 
 def distinct(found: Sequence[Finding]) -> tuple[Finding, ...]:

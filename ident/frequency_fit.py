@@ -228,7 +228,7 @@ def _pole_deviations(
     data: FrfRegression, poles: Poles, fixed: Poles, scale: float
 ) -> tuple[RealArray, RealArray, RealArray]:
     """Standard deviations of decay (R,) [1/s], omega (P,) [rad/s] and zeta (P,) from the Kaufman Jacobian."""
-    n_real, n_pairs = fixed.real.size, fixed.pairs.size
+    n_real, n_pairs = fixed.counts
     decay = np.zeros(poles.real.size)
     omega, zeta = np.zeros(poles.pairs.size), np.zeros(poles.pairs.size)
     normal, _ = pole_system(data.linearise(*poles.writable()), poles, fixed)

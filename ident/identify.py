@@ -19,7 +19,6 @@ from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance
 from ident.checks.plausible_modes import implausible_pairs
 from ident.checks.prior_tests import (
     Fitted,
-    PriorTest,
     best_under_relative_degree,
     delay_test,
     direct_term_test,
@@ -30,7 +29,7 @@ from ident.checks.prior_tests import (
 from ident.coloured_noise import identify_in_noise
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.finding import Finding
+from ident.finding import Finding, PriorTest
 from ident.fit.least_squares import LinearFit, Regression, fit
 from ident.fit.refinement import Bounds, Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
@@ -362,7 +361,7 @@ def description(
         "noise_std": float(np.sqrt(linear.rss / (data.n_samples - unknowns))),
         "tangent_optimality": optimality,
         "order_table": outcome.selection.table(outcome.best),
-        "n_fixed": (search.fixed.real.size, search.fixed.pairs.size),
+        "n_fixed": search.fixed.counts,
         "search": SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
     }
 

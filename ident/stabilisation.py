@@ -135,7 +135,7 @@ def stabilisation(
         structure = replace(structure, estimate_initial_state=True)
     data = prepare(part, structure)
     search = PoleSearch(data, options)
-    fixed_real, fixed_pairs = search.fixed.real.size, search.fixed.pairs.size
+    fixed_real, fixed_pairs = search.fixed.counts
     n_real = found.model.poles.real.size - fixed_real
     chosen = found.model.poles.pairs.size - fixed_pairs
     most = min(chosen + _BEYOND_CHOSEN, _MOST_PAIRS) if max_pairs is None else max_pairs

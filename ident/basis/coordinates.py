@@ -97,8 +97,8 @@ class SearchSpace:
             first = np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
         else:
             first = np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
-        low = np.repeat(self.low[:2], [poles.real.size, poles.pairs.size])
-        high = np.repeat(self.high[:2], [poles.real.size, poles.pairs.size])
+        low = np.repeat(self.low[:2], poles.counts)
+        high = np.repeat(self.high[:2], poles.counts)
         return np.asarray(np.clip((first - low) / (high - low), 0, 1))
 
     def coordinates(self, units: RealArray) -> RealArray:

@@ -87,6 +87,11 @@ class Poles:
         return int(self.real.size + 2 * self.pairs.size)
 
     @property
+    def counts(self) -> tuple[int, int]:
+        """Numbers of real poles and of pairs."""
+        return self.real.size, self.pairs.size
+
+    @property
     def values(self) -> ComplexArray:
         """All poles (B,): the real ones, then p, conj(p) for each pair."""
         both = np.column_stack([self.pairs, self.pairs.conj()]).ravel()
@@ -109,9 +114,11 @@ class Poles:
         """These poles but the pair (or those) at `index`."""
         return Poles(self.real, np.delete(self.pairs, index))
 
-    def doubled(self) -> Poles:
-        """Every pole twice, neighbours equal: the poles of the tangent space Phi2 (design 4.2)."""
-        return Poles(np.repeat(self.real, 2), np.repeat(self.pairs, 2))
+    def doubled(self, n_fixed: tuple[int, int] = (0, 0)) -> Poles:
+        """Every pole twice, neighbours equal: the poles of the tangent space Phi2 (design 4.2); the first of
+        each type, which are fixed, once."""
+        kept = zip((self.real, self.pairs), n_fixed, strict=True)
+        return Poles(*(np.concatenate([part[:n], np.repeat(part[n:], 2)]) for part, n in kept))
 
     def appended(self, other: Poles) -> Poles:
         """These poles and then the other's, real before pairs."""
@@ -133,3 +140,6 @@ class Poles:
         """
         with np.errstate(divide="ignore"):
             return np.asarray(-np.log(np.abs(self.real)) / dt_s, dtype=np.float64)
+
+
+NO_POLES = Poles()

@@ -124,7 +124,7 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[Fin
     Where the residual is coloured, what counts for a pole is the noise around its own frequency.
     """
     poles, dt_s = model.poles, model.dt_s
-    n_real, n_pairs = fixed.real.size, fixed.pairs.size
+    n_real, n_pairs = fixed.counts
     here = data.linearise(*poles.writable())
     normal, _ = pole_system(here, poles, fixed)
     if normal.size == 0 or not data.n_samples > data.n_parameters(poles.order):

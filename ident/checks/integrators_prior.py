@@ -9,9 +9,9 @@ import numpy as np
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
-from ident.checks.prior_tests import ROUGH, Fitted, PriorTest, judged, limit, statistic
+from ident.checks.prior_tests import ROUGH, Fitted, judged, limit, statistic
 from ident.data.record import Record
-from ident.finding import FindingKind
+from ident.finding import FindingKind, PriorTest
 from ident.fit.least_squares import Regression
 from ident.fit.regression import prepare
 from ident.search.order_selection import OrderSelection

@@ -12,8 +12,8 @@ was left to the data (`relative_degree = "auto"`) is imposed only as far as the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, Value, finding
+from ident.finding import TEST_LEVEL, FindingKind, PriorTest, Value
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import Refined
 from ident.fit.regression import prepare
@@ -31,42 +31,8 @@ from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import PoleSearch
 
-TEST_LEVEL = 0.99
 # Descents that only compare starts stop when this fraction of J is left to gain.
 ROUGH = 1e-4
-
-
-@dataclass(frozen=True)
-class PriorTest:
-    """Verdict of the data on one prior.
-
-    statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
-    above it the prior is refused; a cancelled integrator is refused the other way round
-    (`ident.checks.integrators_prior`). imposed says whether the model keeps to the prior; details are what
-    the advice needs beside these.
-    """
-
-    kind: FindingKind
-    prior: str
-    refused: bool
-    imposed: bool
-    statistic: float
-    limit: float
-    degrees_of_freedom: int
-    details: Mapping[str, Value] = field(default_factory=dict)
-
-    @property
-    def finding(self) -> Finding:
-        return finding(
-            self.kind,
-            prior=self.prior,
-            refused=self.refused,
-            imposed=self.imposed,
-            statistic=self.statistic,
-            limit=self.limit,
-            level=TEST_LEVEL,
-            **self.details,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +194,7 @@ def best_under_relative_degree(free: Fitted, relative_degree: int) -> Refined:
     starts = [poles]
     for minimum in sorted(search.minima, key=lambda item: item.rss):
         other = minimum.poles
-        if (other.real.size, other.pairs.size) != (poles.real.size, poles.pairs.size):
+        if other.counts != poles.counts:
             continue
         if all(_distance(other, start) > 0.15 for start in starts):
             starts.append(other)

@@ -72,6 +72,12 @@ def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexA
     return s1, s2, np.exp(1j * angle)
 
 
+def factor_matrices(factor: ComplexArray) -> RealArray:
+    """(F,2,2) that do to (Re, Im) what multiplication by a complex factor (F,) does."""
+    re, im = factor.real, factor.imag
+    return np.stack([np.stack([re, -im], -1), np.stack([im, re], -1)], -2)
+
+
 def spread_covariance(spread: ComplexArray) -> RealArray:
     """Covariances (F,2,2) of (Re, Im) of spread (F,K) times K independent numbers of unit variance."""
     re, im = spread.real, spread.imag

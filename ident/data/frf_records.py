@@ -9,7 +9,7 @@ from typing import Literal, Self
 import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray, lock
-from ident.data.ellipses import hotelling_widening
+from ident.data.ellipses import factor_matrices, hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
 from ident.data.record_files import read_table
 
@@ -169,9 +169,7 @@ def _pooled(
     """Sums over m neighbours on either side of scatter relative to the centre, turned back to each centre."""
     if np.any(centre == 0):
         raise ValueError("pooling uses relative scatter, but a mean response is exactly zero")
-    rotation = np.stack(
-        [np.stack([centre.real, -centre.imag], -1), np.stack([centre.imag, centre.real], -1)], -2
-    )
+    rotation = factor_matrices(centre)
     inverse = np.linalg.inv(rotation)
     relative = inverse @ scatter @ inverse.transpose(0, 2, 1)
     totals, degrees = np.empty_like(relative), np.empty_like(freedom)

@@ -8,7 +8,7 @@ together play the part of the samples in the time domain (design 4.2): thin QR, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -188,9 +188,8 @@ def prepare_response(
         )
     across = 1 / np.maximum(s2, _THINNEST * s1)
     weight = np.stack([1 / s1, np.where(real_only, 0.0, across)])
-    z = np.exp(1j * omega * response.dt_s)
     frame = FrfRegression(
-        z=z,
+        z=np.exp(1j * omega * response.dt_s),
         common=front_response(omega, response.dt_s, integrators, delay_samples),
         turn=turn,
         weight=weight,
@@ -198,8 +197,7 @@ def prepare_response(
         feedthrough=feedthrough,
         dt_s=response.dt_s,
     )
-    y = frame.whiten(response.centre[:, np.newaxis])[:, 0]
-    return FrfRegression(z, frame.common, turn, weight, y, feedthrough, response.dt_s)
+    return replace(frame, y=frame.whiten(response.centre[:, np.newaxis])[:, 0])
 
 
 @dataclass(frozen=True, eq=False)

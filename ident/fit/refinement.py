@@ -19,7 +19,7 @@ import numpy as np
 
 from ident.basis.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
+from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import ComplexArray, RealArray
 from ident.fit.pole_unknowns import (
     chain_rule,
@@ -107,7 +107,7 @@ def refine(
     problem: Linearised,
     poles: Poles,
     bounds: Bounds,
-    fixed: Poles | None = None,
+    fixed: Poles = NO_POLES,
     *,
     max_iterations: int = 60,
     tolerance: float = 1e-9,
@@ -118,9 +118,9 @@ def refine(
     Stops when the decrease that the linearisation still promises is below `tolerance` of J. damping is that
     of the first step: `NEAR` an optimum, or `FAR` from one.
     """
-    n_fixed = (0, 0) if fixed is None else (fixed.real.size, fixed.pairs.size)
     real, pairs = poles.writable()
-    n_free_real, limits = real.size - n_fixed[0], bounds.array
+    n_fixed, limits = fixed.counts, bounds.array
+    n_free_real = real.size - n_fixed[0]
     x = clip_parameters(free_parameters(real, pairs, *n_fixed), n_free_real, limits)
     set_poles(x, real, pairs, *n_fixed)
     here = problem.linearise(real, pairs)
@@ -155,20 +155,18 @@ def refine(
     return Refined(Poles(real, pairs), here.rss, max_iterations, False)
 
 
-def pole_system(here: Linearisation, poles: Poles, fixed: Poles | None = None) -> tuple[RealArray, RealArray]:
+def pole_system(here: Linearisation, poles: Poles, fixed: Poles = NO_POLES) -> tuple[RealArray, RealArray]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T
     r."""
-    n_fixed = (0, 0) if fixed is None else (fixed.real.size, fixed.pairs.size)
-    chain = chain_rule(*poles.writable(), *n_fixed)
+    chain = chain_rule(*poles.writable(), *fixed.counts)
     return chain.T @ here.normal @ chain, chain.T @ here.gradient
 
 
-def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Poles | None = None) -> float:
+def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Poles = NO_POLES) -> float:
     """|P r|/|r| over the tangent directions of the poles that are neither fixed nor held by a bound.
 
     0 at an optimum. With records from rest, nothing fixed and no bound active this is |Phi2^T r|/|r| with
     orthonormal Phi2 (the basis with every pole doubled), by the tangent identity of design 4.2.
     """
-    n_fixed = (0, 0) if fixed is None else (fixed.real.size, fixed.pairs.size)
-    promised = scaled_system(*poles.writable(), *n_fixed, bounds.array, here.normal, here.gradient)[-1]
+    promised = scaled_system(*poles.writable(), *fixed.counts, bounds.array, here.normal, here.gradient)[-1]
     return float(np.sqrt(max(promised, 0.0) / here.rss)) if here.rss > 0 else 0.0

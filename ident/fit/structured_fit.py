@@ -103,7 +103,7 @@ class UnderRelativeDegree:
         fitted = solved.coefficients @ projection.shared
         if self.data.structure.estimate_initial_state:
             fitted = self.data.y - solved.residual
-        n_real, n_pairs = self.fixed.real.size, self.fixed.pairs.size
+        n_real, n_pairs = self.fixed.counts
         free = Poles(poles.real[n_real:], poles.pairs[n_pairs:])
         states = block_states(self.data, free, fitted)
         _, functionals = conditions_with_sensitivities(

@@ -152,8 +152,8 @@ class PoleSearch:
         """
         if best is self._settled:
             return best
-        n_fixed_real, n_fixed_pairs = self.fixed.real.size, self.fixed.pairs.size
-        n_real, n_pairs = best.poles.real.size, best.poles.pairs.size
+        n_fixed_real, n_fixed_pairs = self.fixed.counts
+        n_real, n_pairs = best.poles.counts
         # Up to two real poles are looked at together: one alone can be held by the other.
         couples = [slice(i, min(i + 2, n_real)) for i in range(n_fixed_real, n_real, 2)]
         singles = [slice(i, i + 1) for i in range(n_fixed_pairs, n_pairs)]

@@ -48,7 +48,7 @@ def embed_response(
     if not 0 <= shared_gain_std < np.inf:
         raise ValueError(f"shared_gain_std must not be negative; got {shared_gain_std}")
     options = options or EmbeddingOptions()
-    basis = _free_doubled(poles, fixed)
+    basis = poles.doubled(fixed.counts)
     regressors = data.columns(basis)
     spare = data.n_rows - regressors.shape[1]
     length = options.fir_length or max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
@@ -78,12 +78,4 @@ def embed_response(
         integrators=integrators,
         input_delay_samples=input_delay_samples,
         report=embedding_report("tangent embedding of a measured response", reduced, kernel),
-    )
-
-
-def _free_doubled(poles: Poles, fixed: Poles) -> Poles:
-    """Every pole twice but the known ones, which nobody moved."""
-    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
-    return Poles(
-        np.concatenate([fixed.real, np.repeat(real, 2)]), np.concatenate([fixed.pairs, np.repeat(pairs, 2)])
     )

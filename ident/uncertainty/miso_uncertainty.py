@@ -11,41 +11,25 @@ forget that the poles are shared.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ident.basis.functions import basis_response, block_responses
-from ident.basis.miso_model import MisoModel
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure, front_response
+from ident.basis.structure import front_response
 from ident.data.arrays import RealArray
 from ident.data.ellipses import spread_covariance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.fit.least_squares import Projection, Regression, block_states, fitted_output, project
 from ident.fit.regression import prepare_inputs
-
-
-class SharedPoles(Protocol):
-    """What is asked of an identification with several inputs (`ident.identification.MisoIdentification`)."""
-
-    @property
-    def model(self) -> MisoModel: ...
-    @property
-    def structure(self) -> Structure: ...
-    @property
-    def residuals(self) -> tuple[RealArray, ...]: ...
-    @property
-    def noise_std(self) -> float: ...
-    @property
-    def n_fixed(self) -> tuple[int, int]: ...
+from ident.identification import MisoIdentification
 
 
 def response_uncertainty(
     records: Sequence[Record],
-    identification: SharedPoles,
+    identification: MisoIdentification,
     omega_rad_s: RealArray,
     *,
     level: float = 0.95,
@@ -101,7 +85,7 @@ def response_uncertainty(
     return tuple(result)
 
 
-def _free_states(identification: SharedPoles) -> npt.NDArray[np.intp]:
+def _free_states(identification: MisoIdentification) -> npt.NDArray[np.intp]:
     """Indices of the block states that belong to searched poles: what was fixed comes first of each type."""
     poles = identification.model.poles
     n_real, n_pairs = identification.n_fixed
