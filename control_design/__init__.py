@@ -24,8 +24,8 @@ from control_design.plants.ellipses import Ellipses
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import Channel, Mode, UncertainPlant
 from control_design.plants.weights import RationalWeight
-from control_design.requirement import LoopFunction, SpecificationItem
 from control_design.specification import Specification, SpecificationError
+from control_design.specification.requirement import LoopFunction, SpecificationItem
 from control_design.synthesis.joint_synthesis import JointDesign, synthesise_jointly
 from control_design.synthesis.synthesis import SynthesisOptions, synthesise
 from control_design.synthesis.synthesis_result import (

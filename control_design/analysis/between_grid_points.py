@@ -33,8 +33,8 @@ from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import ExpandableSet, OwnGridSet, SetExpansion, expandable
-from control_design.requirement import WeightedRequirement
 from control_design.specification import Specification
+from control_design.specification.requirement import WeightedRequirement
 
 _EXCESS = 0.002  # asked of every bound over the dense maximum; 0.005 is promised
 _LEAST_EXCESS = 1e-5  # where a dense maximum lies this close under its limit

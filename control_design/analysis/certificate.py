@@ -16,10 +16,10 @@ from control_design.analysis.stability import NyquistCount, closed_loop_poles, l
 from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.frequency_grid import frequency_grid, plant_grid
+from control_design.plants.frequency_grid import frequency_grid, with_own_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
-from control_design.requirement import Findings, SpecificationItem
 from control_design.specification import Specification
+from control_design.specification.requirement import Findings, SpecificationItem
 
 _NOT_LOOKED_AT = AllFrequencies.nothing("not looked at")
 
@@ -176,7 +176,7 @@ def _check_plant(
     wanted = frequency_grid(
         plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=n_dense, n_mode=120 * len(light)
     )
-    grid = plant_grid(plant, wanted) if plant.own_grid is None else _with_own_grid(plant, wanted)
+    grid = with_own_grid(plant, wanted)
 
     def response(omega: Real) -> Complex:
         return controller.response(omega, with_delay=False)
@@ -250,15 +250,6 @@ def _check_plant(
         controller,
     )
     return verdict, [requirement.check(found) for requirement in specification.requirements(plant)]
-
-
-def _with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
-    """Every frequency of the user's grid, and `wanted` outside its range."""
-    own = plant.own_grid
-    assert own is not None
-    outside = wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
-    inside = own[own > 0]
-    return np.asarray(np.unique(np.concatenate([inside, outside])), dtype=np.float64)
 
 
 def _stable_share_item(

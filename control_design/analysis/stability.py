@@ -10,11 +10,38 @@ import numpy as np
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import UncertainPlant, count_integrators
+from control_design.plants.plant_set import UncertainPlant, count_integrators, delayed
 
 
-def closed_loop_matrix(controller: Controller, plant: UncertainPlant) -> Real:
-    """State matrix of the feedback of plant and controller, delay states included.
+class NominalLoop:
+    """One nominal plant with the computational delay at its input, ready to be closed many times."""
+
+    def __init__(self, plant: UncertainPlant, delay_samples: int) -> None:
+        system = delayed(plant.nominal, delay_samples)
+        self._a, self._b, self._c = (np.asarray(getattr(system, m), dtype=np.float64) for m in "ABC")
+        self._d = float(np.asarray(system.D)[0, 0])
+
+    def poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
+        """Poles (n,) with the controller a, b, c, d (without delay); one infinite pole for an algebraic
+        loop, 1 + D_K D_G = 0."""
+        loop = 1.0 + float(d[0, 0]) * self._d
+        n = self._a.shape[0]
+        if not (abs(loop) > 1e-12 and np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
+            return np.array([np.inf + 0j])
+        # u = (c x_k - d C x)/loop, e = -(C x + D u)
+        u = np.hstack([(-float(d[0, 0]) / loop) * self._c, c / loop])
+        e = -self._d * u
+        e[:, :n] -= self._c
+        closed = np.vstack([self._b @ u, b @ e])
+        closed[:n, :n] += self._a
+        closed[n:, n:] += a
+        if not np.all(np.isfinite(closed)):
+            return np.array([np.inf + 0j])
+        return np.asarray(np.linalg.eigvals(closed), dtype=np.complex128)
+
+
+def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
+    """Poles (n,) of the feedback of plant and controller, delay states included.
 
     Raises
     ------
@@ -25,22 +52,11 @@ def closed_loop_matrix(controller: Controller, plant: UncertainPlant) -> Real:
         raise ValueError(
             f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}"
         )
-    k = controller.to_control(include_delay=True)
-    g = plant.nominal
-    ak, bk, ck, dk = (np.asarray(getattr(k, m), dtype=np.float64) for m in "ABCD")
-    a, b, c, d = (np.asarray(getattr(g, m), dtype=np.float64) for m in "ABCD")
-    loop = 1.0 + float(dk[0, 0] * d[0, 0])
-    if abs(loop) < 1e-12:
+    loop = NominalLoop(plant, controller.computational_delay_samples)
+    poles = loop.poles(controller.A, controller.B, controller.C, controller.D)
+    if not np.all(np.isfinite(poles)):
         raise ValueError(f"plant {plant.name!r}: algebraic loop, 1 + D_K D_G = 0")
-    # u = (ck xk - dk c x)/loop, e = -(c x + d u)
-    u_x, u_k = -dk @ c / loop, ck / loop
-    e_x, e_k = -(c + d @ u_x), -(d @ u_k)
-    return np.block([[a + b @ u_x, b @ u_k], [bk @ e_x, ak + bk @ e_k]])
-
-
-def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
-    """Eigenvalues of `closed_loop_matrix`, (n,)."""
-    return np.asarray(np.linalg.eigvals(closed_loop_matrix(controller, plant)), dtype=np.complex128)
+    return poles
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from control_design.plants.ellipses import (
 )
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.plant_set import UncertainPlant
-from control_design.requirement import LoopFunction, WeightedRequirement
 from control_design.specification import Specification
+from control_design.specification.requirement import LoopFunction, WeightedRequirement
 
 
 @dataclass(frozen=True, eq=False)

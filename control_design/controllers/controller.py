@@ -15,6 +15,7 @@ import scipy.linalg
 
 from control_design.controllers.law import Law
 from control_design.plants.ellipses import Complex, Real, readonly_real
+from control_design.plants.plant_set import delayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +73,7 @@ class Controller(Law):
 
     def to_control(self, *, include_delay: bool = False) -> control.StateSpace:
         """Linear part as `control.StateSpace`; with include_delay the delay's states come after K's."""
-        a, b, c, d = np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D)
-        if include_delay:
-            for _ in range(self.computational_delay_samples):
-                n = a.shape[0]
-                a = np.block([[a, np.zeros((n, 1))], [c, np.zeros((1, 1))]])
-                b = np.vstack([b, d])
-                c = np.hstack([np.zeros((1, n)), np.ones((1, 1))])
-                d = np.zeros((1, 1))
-        return control.ss(a, b, c, d, self.dt_s)
+        return delayed(super().to_control(), self.computational_delay_samples if include_delay else 0)
 
     def stepper(self) -> ControllerStepper:
         """A fresh machine-side instance at rest."""

@@ -10,14 +10,15 @@ m(y))/m(y_j), a convex programme, by an interior point. gamma falls in every ste
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
 
 from control_design.plants.ellipses import Complex, Real
+from control_design.plants.frequency_grid import with_violations
 
 # Radii of the rounding of |.| at its kink. An active numerator is as large as gamma m, of which the rounding
 # is a thousandth: it changes the row by 5e-7. Sharper kinks of inactive rows only slow Newton down.
@@ -25,6 +26,7 @@ _ROUND_NUMERATOR = 1e-3
 _ROUND_REACH = 1e-4
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
 _GAP = 1e-5  # relative accuracy of gamma
+_EXCESS = 5e-4  # relative; accepted of the dense check over the programme
 _MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
 _KEPT = 1e-10  # singular values of the scaled basis below this fraction are no directions of the search
 
@@ -121,6 +123,53 @@ def smallest_ratio(
             break
     y = step.y(z)
     return MinimaxPoint(step.original(z), gamma, y[:, 0] + 1j * y[:, 1], spent)
+
+
+@dataclass(frozen=True, eq=False)
+class Exchanged:
+    """Best x (n,) of an exchange (None: no round found one), its values (F,) on every dense grid, and the
+    gamma of the last programme."""
+
+    x: Real | None
+    values: list[Real]
+    gamma: float
+
+    @property
+    def worst(self) -> float:
+        """Largest of the values; infinite without any."""
+        return max((float(np.max(each)) for each in self.values), default=float("inf"))
+
+
+def exchanged(
+    solve: Callable[[Real | None], MinimaxPoint],
+    check: Callable[[Real], list[Real]],
+    grids: list[Real],
+    dense: Sequence[Real],
+    *,
+    rounds: int,
+    most: int,
+    start: Real | None = None,
+) -> Exchanged:
+    """Solve on the grids, check on the dense ones, add what is violated to the grids (in place), and again.
+
+    solve: from a start (n,) to the optimum on the grids as they are. check: x to its values at the
+    frequencies `dense`, of which up to `most` maxima of each grid are added. Ends when none exceeds gamma.
+    """
+    best = Exchanged(None, [], 0.0)
+    for _ in range(rounds + 1):
+        point = solve(start)
+        if not np.isfinite(point.gamma):
+            break
+        start = point.x
+        values = check(start)
+        found = Exchanged(start, values, point.gamma)
+        best = found if found.worst < best.worst else replace(best, gamma=point.gamma)
+        limit = point.gamma * (1.0 + _EXCESS)
+        if found.worst <= limit:
+            break
+        for number, (omega, value) in enumerate(zip(dense, values, strict=True)):
+            grids[number] = with_violations(grids[number], omega, value, limit, most)
+    return best
 
 
 class _Scaled:

@@ -15,13 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 import scipy.signal
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
 from control_design.controllers.law import Law
-from control_design.convex.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
+from control_design.convex.minimax import (
+    MinimaxPoint,
+    PlaneRows,
+    exchanged,
+    plane,
+    smallest_ratio,
+    turning,
+)
 from control_design.convex.orthonormal_basis import basis_response, basis_state_space
 from control_design.plants.ellipses import (
     Complex,
@@ -31,17 +38,15 @@ from control_design.plants.ellipses import (
     farthest_distance,
     nearest_distance,
 )
-from control_design.plants.frequency_grid import frequency_grid, local_maxima, plant_grid
+from control_design.plants.frequency_grid import GridOptions, dense_grid, lean_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
 
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
 
 
-class ReferenceFilterOptions(BaseModel):
+class ReferenceFilterOptions(GridOptions):
     """Order of the reference filter and how finely it is designed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     order: int = Field(
         default=1, ge=0, le=12, description="real poles, searched; unused if poles_rad_s is given"
@@ -53,10 +58,6 @@ class ReferenceFilterOptions(BaseModel):
         default=True, description="F(1) = 1: what the loop does with constant references stays as it is"
     )
     boundary_samples: int = Field(default=24, ge=8, le=500, description="samples of every ellipse's boundary")
-    grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
-    mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
-    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
-    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
     exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")
 
 
@@ -186,23 +187,9 @@ class _Matching:
         self.grids: list[Real] = []
         self.dense: list[Ellipses] = []
         for plant in plants:
-            grid = frequency_grid(
-                plant.nyquist_rad_s,
-                plant.modes,
-                omega_min_rad_s=options.omega_min_rad_s,
-                n_log=options.grid_points,
-                n_mode=options.mode_points,
-            )
-            dense = frequency_grid(
-                plant.nyquist_rad_s,
-                plant.modes,
-                omega_min_rad_s=options.omega_min_rad_s,
-                n_log=int(0.7 * options.dense_points),
-                n_mode=int(0.3 * options.dense_points),
-            )
-            self.grids.append(plant_grid(plant, grid))
+            self.grids.append(lean_grid(plant, plant.modes, options))
             # The check stands on frequencies of its own, not on the programme's.
-            self.dense.append(plant.at(plant_grid(plant, dense)))
+            self.dense.append(plant.at(dense_grid(plant, plant.modes, options)))
         for plant, ellipses in zip(plants, self.dense, strict=True):
             if not np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1:
                 raise ValueError(
@@ -219,24 +206,21 @@ class _Matching:
         poles = self._given_poles()
         if poles is None:
             poles = self._searched_poles()
-        _, before, _ = self._errors(np.zeros(0, complex), np.ones(1))
-        best: tuple[float, float, Real] | None = None
-        for _ in range(self.options.exchange_rounds + 1):
-            point = self._coefficients(poles, self.grids, self.options.boundary_samples)
-            full = self._full(poles, point.x)
-            errors, worst, where = self._errors(poles, full)
-            if best is None or worst < best[0]:
-                best = worst, where, full
-            limit = point.gamma * (1 + 5e-4)
-            if worst <= limit:
-                break
-            for number, (ellipses, error) in enumerate(zip(self.dense, errors, strict=True)):
-                index = [i for i in local_maxima(error) if error[i] > limit][:12]
-                self.grids[number] = np.union1d(self.grids[number], ellipses.omega_rad_s[index])
-        assert best is not None
-        worst, where, full = best
+        before = max(float(np.max(each)) for each in self._errors(np.zeros(0, complex), np.ones(1)))
+        best = exchanged(
+            lambda _: self._coefficients(poles, self.grids, self.options.boundary_samples),
+            lambda x: self._errors(poles, self._full(poles, x)),
+            self.grids,
+            self._omegas,
+            rounds=self.options.exchange_rounds,
+            most=12,
+        )
+        assert best.x is not None
+        full, errors = self._full(poles, best.x), np.concatenate(best.values)
+        where = float(np.concatenate(self._omegas)[np.argmax(errors)])
         a, b = basis_state_space(poles)
-        return ReferenceFilter(a, b, full[None, 1:], np.array([[full[0]]]), self.dt_s, before, worst, where)
+        d = np.array([[full[0]]])
+        return ReferenceFilter(a, b, full[None, 1:], d, self.dt_s, before, best.worst, where)
 
     def _given_poles(self) -> Complex | None:
         rates = self.options.poles_rad_s
@@ -341,18 +325,16 @@ class _Matching:
             return x
         return np.concatenate([[1.0 - float(x @ self._at_zero(poles)[1:])], x])
 
-    def _errors(self, poles: Complex, full: Real) -> tuple[list[Real], float, float]:
-        """Exact weighted errors of F on the dense grids; the largest and its frequency."""
-        errors, worst, where = [], -1.0, 0.0
-        for ellipses in self.dense:
-            omega = ellipses.omega_rad_s
-            error = np.abs(self._weight_at(omega)) * worst_matching_error(
-                self.controller.response(omega),
-                self._basis(poles, omega) @ full,
-                self._model_at(omega),
-                ellipses,
+    @property
+    def _omegas(self) -> list[Real]:
+        return [ellipses.omega_rad_s for ellipses in self.dense]
+
+    def _errors(self, poles: Complex, full: Real) -> list[Real]:
+        """Exact weighted errors of F on the dense grids."""
+        return [
+            np.abs(self._weight_at(omega))
+            * worst_matching_error(
+                self.controller.response(omega), self._basis(poles, omega) @ full, self._model_at(omega), e
             )
-            errors.append(error)
-            if np.max(error) > worst:
-                worst, where = float(np.max(error)), float(omega[np.argmax(error)])
-        return errors, worst, where
+            for omega, e in zip(self._omegas, self.dense, strict=True)
+        ]

@@ -20,12 +20,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import control
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from control_design.analysis.grids import Grids
 from control_design.analysis.worst_case import PlantData, worst_of
-from control_design.convex.minimax import MinimaxPoint, PlaneRows, plane, smallest_ratio, turning
+from control_design.convex.minimax import (
+    MinimaxPoint,
+    PlaneRows,
+    exchanged,
+    plane,
+    smallest_ratio,
+    turning,
+)
 from control_design.convex.orthonormal_basis import basis_response
 from control_design.convex.youla_basis import (
     AffineLoop,
@@ -36,20 +43,16 @@ from control_design.convex.youla_basis import (
 )
 from control_design.convex.youla_hull import hull_bound
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.frequency_grid import local_maxima
-from control_design.plants.plant_set import UncertainPlant
-from control_design.requirement import LoopFunction
+from control_design.plants.frequency_grid import GridOptions
+from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
-from control_design.synthesis.problem import Problem
-from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.specification.requirement import LoopFunction
 
 Region = Literal["inscribed", "ellipse", "enclosing"]
 
 
-class YoulaOptions(BaseModel):
+class YoulaOptions(GridOptions):
     """How fine the basis and the grids are; the defaults take about two seconds a plant."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
     pairs_per_mode: int = Field(
@@ -59,8 +62,6 @@ class YoulaOptions(BaseModel):
     mode_points: int = Field(
         default=100, ge=0, le=1000, description="points spread around the flexible modes"
     )
-    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
-    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
     exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
     hull: bool = Field(
         default=False,
@@ -175,38 +176,23 @@ class BracketProblem:
 
     def __init__(self, plant: UncertainPlant, specification: Specification, options: YoulaOptions) -> None:
         self.plant, self.spec, self.options = plant, specification, options
-        self.problem = Problem(
-            (plant,),
-            specification,
-            SynthesisOptions(
-                grid_points=options.grid_points,
-                mode_points=options.mode_points,
-                dense_points=options.dense_points,
-                omega_min_rad_s=options.omega_min_rad_s,
-            ),
-        )
+        self.grids = Grids((plant,), specification, options)
         self.factors: Factors | None = None
         if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
-            self.factors = coprime_factors(_delayed(plant.nominal, specification.computational_delay_samples))
-        self.poles = chosen_poles(plant, self.problem.scale, options.real_poles, options.pairs_per_mode)
-        self.dense = self.problem.dense[0]
+            self.factors = coprime_factors(delayed(plant.nominal, specification.computational_delay_samples))
+        self.poles = self._poles(1)
+        self.dense = self.grids.dense[0]
         self.dense_loop = self._loop(self.dense)
         self.dense_basis = self._basis(self.dense, self.poles)
 
     def solve(self) -> PlantBracket:
-        coarse = chosen_poles(
-            self.plant,
-            self.problem.scale,
-            max(2, self.options.real_poles // 2),
-            max(1, self.options.pairs_per_mode // 2),
-        )
         enclosing, _, x = self._exchanged("enclosing", None)
         # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
         # inscribed.
         inscribed, grid_value, x_inscribed = self._exchanged("inscribed", None)
         ellipse, _, _ = self._exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
-        lean = self.problem.lean()[0]  # with all frequencies that the exchange has added
-        half = smallest_ratio(self._basis(lean, coarse), self._rows(lean, "enclosing"))
+        lean = self.grids.lean()[0]  # with all frequencies that the exchange has added
+        half = smallest_ratio(self._basis(lean, self._poles(2)), self._rows(lean, "enclosing"))
         offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
         exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
         ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
@@ -222,10 +208,15 @@ class BracketProblem:
             self._hull(inscribed_grid=grid_value, ellipse=ellipse) if self.options.hull and exact else None,
         )
 
+    def _poles(self, share: int) -> Complex:
+        """Poles of the basis, or of one with a share of them."""
+        real, pairs = self.options.real_poles // share, self.options.pairs_per_mode // share
+        return chosen_poles(self.plant, self.grids.scale_rad_s, max(2, real), max(1, pairs))
+
     def _hull(self, *, inscribed_grid: float, ellipse: float) -> float:
         if not np.isfinite(ellipse):
             return inscribed_grid
-        lean = self.problem.lean()[0]
+        lean = self.grids.lean()[0]
         return hull_bound(lean, self._loop(lean), self._basis(lean, self.poles), inscribed_grid, ellipse)
 
     def other_ellipse_values(self, shares: Sequence[float]) -> list[float]:
@@ -239,25 +230,22 @@ class BracketProblem:
 
     def _exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
         """Optimum with violated frequencies added: (value on the dense grid, on the programme's, x)."""
-        best, best_x, grid_value = float("inf"), start, 0.0
-        for _ in range(self.options.exchange_rounds + 1):
-            lean = self.problem.lean()[0]
-            point = self._ellipse(lean, start) if region == "ellipse" else self._disc(lean, region, start)
-            if not np.isfinite(point.gamma):
-                break
-            start, grid_value = point.x, point.gamma
-            values = self._dense_values(point.x, region)
-            worst = float(np.max(values))
-            if worst < best:
-                best, best_x = worst, point.x
-            limit = point.gamma * (1.0 + self.problem.options.exchange_tolerance)
-            if worst <= limit:
-                break
-            index = [i for i in local_maxima(values) if values[i] > limit][:24]
-            grid = self.problem.grids[0]
-            self.problem.grids[0] = np.union1d(grid, self.dense.ellipses.omega_rad_s[index])
-        x = np.zeros(self.dense_basis.shape[1]) if best_x is None else best_x
-        return best, grid_value, x
+
+        def solve(begin: Real | None) -> MinimaxPoint:
+            lean = self.grids.lean()[0]
+            return self._ellipse(lean, begin) if region == "ellipse" else self._disc(lean, region, begin)
+
+        found = exchanged(
+            solve,
+            lambda x: [self._dense_values(x, region)],
+            self.grids.grids,
+            [self.dense.ellipses.omega_rad_s],
+            rounds=self.options.exchange_rounds,
+            most=24,
+            start=start,
+        )
+        x = start if found.x is None else found.x
+        return found.worst, found.gamma, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
     def _disc(self, data: PlantData, region: Region, start: Real | None) -> MinimaxPoint:
         basis = self._basis(data, self.poles)
@@ -372,17 +360,3 @@ def _best_angles(loop: AffineLoop, data: PlantData, y: Complex) -> Real:
         best = np.take_along_axis(trial, np.argmax(margin, axis=1)[:, None], axis=1)[:, 0]
         width /= 8.0
     return np.asarray(best)
-
-
-def _delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
-    """The plant behind a delay of whole samples."""
-    if samples == 0:
-        return system
-    line = control.ss(
-        np.eye(samples, k=-1),
-        np.eye(samples, 1),
-        np.eye(1, samples, k=samples - 1),
-        np.zeros((1, 1)),
-        system.dt,
-    )
-    return control.series(line, system)

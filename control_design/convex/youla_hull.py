@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 from control_design.analysis.worst_case import PlantData
 from control_design.convex.youla_basis import AffineLoop
 from control_design.plants.ellipses import Complex, Real, nearest_distance
-from control_design.requirement import LoopFunction
+from control_design.specification.requirement import LoopFunction
 
 _DIRECTIONS = 24  # half-planes of every hull
 _ANGLES, _RADII = 300, 60  # samples of the disc that is known to contain R

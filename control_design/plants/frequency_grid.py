@@ -6,9 +6,21 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 
 from control_design.plants.ellipses import Real
 from control_design.plants.plant_set import Mode, UncertainPlant
+
+
+class GridOptions(BaseModel):
+    """How fine the frequency grids of a programme and of its dense check are."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
+    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
+    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
 
 
 def mode_points(mode: Mode, count: int, half_widths: float = 20.0) -> Real:
@@ -43,6 +55,49 @@ def frequency_grid(
     return np.asarray(grid[keep], dtype=np.float64)
 
 
+def lean_grid(
+    plant: UncertainPlant, modes: Sequence[Mode], options: GridOptions, extra: npt.ArrayLike = ()
+) -> Real:
+    """Frequencies of a programme, to begin with."""
+    grid = frequency_grid(
+        plant.nyquist_rad_s,
+        modes,
+        omega_min_rad_s=options.omega_min_rad_s,
+        n_log=options.grid_points,
+        n_mode=options.mode_points,
+        extra=extra,
+    )
+    return plant_grid(plant, grid)
+
+
+def dense_grid(
+    plant: UncertainPlant, modes: Sequence[Mode], options: GridOptions, extra: npt.ArrayLike = ()
+) -> Real:
+    """Frequencies of its dense check."""
+    grid = frequency_grid(
+        plant.nyquist_rad_s,
+        modes,
+        omega_min_rad_s=options.omega_min_rad_s,
+        n_log=int(0.7 * options.dense_points),
+        n_mode=int(0.3 * options.dense_points),
+        extra=extra,
+    )
+    return with_own_grid(plant, grid)
+
+
+def _outside(own: Real, wanted: Real) -> Real:
+    return wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
+
+
+def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
+    """`wanted` where the uncertainty is known everywhere; else all of its own frequencies, and `wanted`
+    outside their range."""
+    own = plant.own_grid
+    if own is None:
+        return wanted
+    return np.asarray(np.union1d(own[own > 0], _outside(own, wanted)), dtype=np.float64)
+
+
 def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
     """`wanted` where the uncertainty is known everywhere; else the nearest of its own frequencies, and
     `wanted` outside their range, where `Channel.at` has the nominal response only."""
@@ -52,8 +107,7 @@ def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
     inside = wanted[(wanted >= own[0]) & (wanted <= own[-1])]
     index = np.unique(np.clip(np.searchsorted(own, inside), 0, own.size - 1))
     index = np.union1d(index, np.array([0, own.size - 1]))
-    outside = wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
-    return np.asarray(np.unique(np.concatenate([own[index], outside])), dtype=np.float64)
+    return np.asarray(np.union1d(own[index], _outside(own, wanted)), dtype=np.float64)
 
 
 def local_maxima(value: Real) -> npt.NDArray[np.int64]:
@@ -62,6 +116,11 @@ def local_maxima(value: Real) -> npt.NDArray[np.int64]:
     peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
     index = np.flatnonzero(peak)
     return np.asarray(index[np.argsort(-value[index], kind="stable")], dtype=np.int64)
+
+
+def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: int) -> Real:
+    """The grid with the `most` largest local maxima of value (F,) at omega (F,) that exceed the limit."""
+    return np.union1d(grid, omega[[i for i in local_maxima(value) if value[i] > limit][:most]])
 
 
 def starting_edges(

@@ -158,6 +158,17 @@ def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex
     return response
 
 
+def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
+    """A SISO discrete system behind a delay of whole samples; the delay's states come after its own."""
+    a, b, c, d = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
+    for _ in range(samples):
+        n = a.shape[0]
+        a = np.block([[a, b], [np.zeros((1, n + 1))]])
+        b = np.vstack([np.zeros((n, 1)), np.ones((1, 1))])
+        c, d = np.hstack([c, d]), np.zeros((1, 1))
+    return control.ss(a, b, c, d, system.dt)
+
+
 def count_integrators(poles_z: Complex) -> int:
     """Poles at z = 1.
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.plants.ellipses import Complex, Ellipses, Real
-from control_design.requirement import LoopFunction
+from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.interrupts import interrupts_kept
 
 Symbol = Any  # casadi.SX; its stubs disagree with its own arithmetic on numpy arrays

@@ -1,4 +1,4 @@
-"""Plants and specification on grids: a lean one for the optimisers, a dense one for their checks."""
+"""What a controller of any order is judged by: stable loops, rows of the optimisers, dense check."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from control_design.analysis.stability import closed_loop_poles
+from control_design.analysis.grids import Grids
+from control_design.analysis.stability import NominalLoop
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Ellipses, Real, scale_to_minus_one
-from control_design.plants.frequency_grid import frequency_grid, local_maxima, mode_points, plant_grid
+from control_design.plants.frequency_grid import mode_points, with_violations
 from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant, winds
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
-from control_design.requirement import LoopFunction
-from control_design.specification import Specification, performance_modes
+from control_design.specification import Specification
+from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import NlpPoint, Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
@@ -23,7 +24,7 @@ _LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points o
 _DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
 
 
-class Problem:
+class Problem(Grids):
     """What does not depend on the controller's order; the lean grids grow by exchange, the rest is fixed."""
 
     def __init__(
@@ -33,38 +34,12 @@ class Problem:
         options: SynthesisOptions,
         guards: tuple[Guard, ...] = (),
     ) -> None:
-        self.plants, self.spec, self.options, self.guards = plants, specification, options, guards
+        super().__init__(plants, specification, options)
+        self.options, self.guards = options, guards
         self._guarded = sorted_by_plant(guards)
         self.dt_s = plants[0].dt_s
-        self.scale = options.scale_rad_s or _frequency_scale(plants, specification)
-        self._loops = [_Loop(plant, specification.computational_delay_samples) for plant in plants]
-        self.grids: list[Real] = []
-        self.dense: list[PlantData] = []
-        for plant in plants:
-            modes = _grid_modes(plant, specification)
-            extra = [edge for asked in specification.weighted(plant) for edge in asked.band or ()]
-            lean = frequency_grid(
-                plant.nyquist_rad_s,
-                modes,
-                omega_min_rad_s=options.omega_min_rad_s,
-                n_log=options.grid_points,
-                n_mode=options.mode_points,
-                extra=extra,
-            )
-            dense = frequency_grid(
-                plant.nyquist_rad_s,
-                modes,
-                omega_min_rad_s=options.omega_min_rad_s,
-                n_log=int(0.7 * options.dense_points),
-                n_mode=int(0.3 * options.dense_points),
-                extra=lean,
-            )
-            if plant.own_grid is not None:
-                own = plant.own_grid
-                outside = dense[(dense < own[0] * (1 - 1e-9)) | (dense > own[-1] * (1 + 1e-9))]
-                dense = np.unique(np.concatenate([own[own > 0], outside]))
-            self.grids.append(plant_grid(plant, lean))
-            self.dense.append(PlantData.build(plant, specification, dense))
+        self.scale = options.scale_rad_s or self.scale_rad_s
+        self._loops = [NominalLoop(plant, specification.computational_delay_samples) for plant in plants]
 
     @property
     def integrators(self) -> int:
@@ -74,13 +49,6 @@ class Problem:
     @property
     def asks_tracking(self) -> bool:
         return self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
-
-    def lean(self, grids: Sequence[Real] | None = None) -> list[PlantData]:
-        """Every plant on its lean grid, as it is now or as given."""
-        return [
-            PlantData.build(plant, self.spec, grid)
-            for plant, grid in zip(self.plants, self.grids if grids is None else grids, strict=True)
-        ]
 
     def rows(self, grids: Sequence[Real] | None = None) -> list[Rows]:
         """Rows of the optimisers on the lean grids, as they are now or as given."""
@@ -144,10 +112,8 @@ class Problem:
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
         """Whether every nominal loop is (poles of the full state space, strictly inside the circle), and
         every guard's."""
-        a, b, c, d = cascade.state_space(parameters)
-        return all(
-            bool(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0)) for loop in self._loops
-        ) and self.guarded(cascade, parameters)
+        poles = self.closed_loop_poles(cascade, parameters)
+        return all(np.all(np.abs(each) < 1.0) for each in poles) and self.guarded(cascade, parameters)
 
     def guarded(self, cascade: Cascade, parameters: Real, guards: Sequence[Guard] | None = None) -> bool:
         """Whether 1 + K G winds as it has to for every guard, or for those given."""
@@ -173,13 +139,10 @@ class Problem:
         """Whether it can be built and every nominal loop and guard is stable; false also where no anti-windup
         gain exists, which a numerically degenerate controller shows."""
         try:
-            controller = self.controller(cascade, parameters)
+            self.controller(cascade, parameters)
         except ValueError:
             return False
-        return all(
-            bool(np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1.0)
-            for plant in self.plants
-        ) and self.guarded(cascade, parameters)
+        return self.stable(cascade, parameters)
 
     def controller(self, cascade: Cascade, parameters: Real) -> Controller:
         """The controller of a parameter vector."""
@@ -229,10 +192,9 @@ class Problem:
 
     def _add(self, position: int, omega: Real, value: Real, limit: float, most: int) -> int:
         """Put the largest local maxima above the limit on the grid of one plant; how many were new."""
-        index = [i for i in local_maxima(value) if value[i] > limit][:most]
-        new = np.setdiff1d(omega[index], self.grids[position])
-        self.grids[position] = np.union1d(self.grids[position], new)
-        return int(new.size)
+        before, after = self.grids[position], with_violations(self.grids[position], omega, value, limit, most)
+        self.grids[position] = after
+        return after.size - before.size
 
     def _rows(
         self,
@@ -273,59 +235,6 @@ def _modulus(value: float, ellipses: Ellipses) -> tuple[tuple[LoopFunction, Real
     return ((LoopFunction.SENSITIVITY, np.full(ellipses.omega_rad_s.size, value)),)
 
 
-class _Loop:
-    """One nominal plant with the computational delay at its input, ready to be closed many times."""
-
-    def __init__(self, plant: UncertainPlant, delay_samples: int) -> None:
-        a, b, c, d = (np.asarray(getattr(plant.nominal, m), dtype=np.float64) for m in "ABCD")
-        for _ in range(delay_samples):
-            n = a.shape[0]
-            a = np.block([[a, b], [np.zeros((1, n + 1))]])
-            b = np.vstack([np.zeros((n, 1)), np.ones((1, 1))])
-            c, d = np.hstack([c, d]), np.zeros((1, 1))
-        self._a, self._b, self._c, self._d = a, b, c, float(d[0, 0])
-
-    def poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
-        """Poles (n,) with this controller; one infinite pole for an algebraic loop."""
-        loop = 1.0 + float(d[0, 0]) * self._d
-        n = self._a.shape[0]
-        if not (abs(loop) > 1e-12 and np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
-            return np.array([np.inf + 0j])
-        # u = (c x_k - d C x)/loop, e = -(C x + D u)
-        u = np.hstack([(-float(d[0, 0]) / loop) * self._c, c / loop])
-        e = -self._d * u
-        e[:, :n] -= self._c
-        closed = np.vstack([self._b @ u, b @ e])
-        closed[:n, :n] += self._a
-        closed[n:, n:] += a
-        if not np.all(np.isfinite(closed)):
-            return np.array([np.inf + 0j])
-        return np.asarray(np.linalg.eigvals(closed), dtype=np.complex128)
-
-
 def _around(mode: Mode) -> Real:
     """Points around a pole or zero of either side of the circle."""
     return mode_points(Mode(mode.omega_rad_s, abs(mode.zeta)), 25)
-
-
-def _frequency_scale(plants: Sequence[UncertainPlant], specification: Specification) -> float:
-    """Frequency around which the controller has to act: bandwidth and lowest mode, or a tenth of Nyquist."""
-    candidates = [mode.omega_rad_s for plant in plants for mode in plant.modes[:1]]
-    if specification.bandwidth_rad_s is not None:
-        candidates.append(3.0 * specification.bandwidth_rad_s)
-    if not candidates:
-        return 0.1 * plants[0].nyquist_rad_s
-    return float(np.exp(np.mean(np.log(candidates))))
-
-
-def _grid_modes(plant: UncertainPlant, specification: Specification) -> tuple[Mode, ...]:
-    """Modes that deserve dense points: the plant's, and the performance channel's where damping is asked
-    for."""
-    modes = list(plant.modes)
-    if specification.mode_peak_ratio is not None:
-        modes += [
-            m
-            for m in performance_modes(plant)
-            if all(abs(m.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
-        ]
-    return tuple(modes)

@@ -17,8 +17,8 @@ from control_design.analysis.worst_case import PlantData
 from control_design.controllers.biquads import Cascade, SectionKind, tustin_frequency
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import local_maxima
-from control_design.requirement import LoopFunction
-from control_design.specification import ModulusMargin
+from control_design.specification.requirement import LoopFunction
+from control_design.specification.specification import ModulusMargin
 
 _DECADES_OF_TRACKING = 1.5  # below the crossover, in which the integrator-like loop is wished for
 _HIGHEST = 0.95  # of Nyquist: the Tustin frequency has its pole there

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from control_design.plants.frequency_grid import GridOptions
 
 
-class SynthesisOptions(BaseModel):
+class SynthesisOptions(GridOptions):
     """How hard to search; the defaults solve an order-5 design in a few seconds."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     starts: int = Field(
         default=6, ge=1, le=100, description="random low-gain starts of each order, and as many shaped ones"
@@ -29,10 +29,6 @@ class SynthesisOptions(BaseModel):
         lt=0.1,
         description="accepted relative excess of the dense check over the programme",
     )
-    grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
-    mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
-    dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
-    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
     iterations: int = Field(
         default=100,
         ge=10,

@@ -10,7 +10,7 @@ from scipy.signal import bilinear
 
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Ellipses
-from control_design.requirement import LoopFunction
+from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import AngleProgram, Rows
 
 _SECTIONS = [

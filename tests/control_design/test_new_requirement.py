@@ -14,12 +14,11 @@ from control_design import (
     UncertainPlant,
     YoulaOptions,
     certify,
-    specification,
     synthesise,
     youla_bracket,
 )
 from control_design.controllers.biquads import Cascade
-from control_design.requirement import WeightedRequirement
+from control_design.specification import WeightedRequirement, specification
 from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
 from validation.example_plants import flexible_link

@@ -9,7 +9,7 @@ import pytest
 from control_design import Specification, SynthesisOptions, UncertainPlant, certify, synthesise
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
-from control_design.requirement import LoopFunction
+from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.descent import MinimaxDescent, _Boundary
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import StartMaker, with_cancelling_section

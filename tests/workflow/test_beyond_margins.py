@@ -19,8 +19,8 @@ from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import JointCoverage
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import UncertainPlant
-from control_design.requirement import LoopFunction
 from control_design.specification import RationalWeight, Specification
+from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from tests.workflow.report_examples import (
     DT_S,

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
 from control_design.plants.plant_set import UncertainPlant
-from control_design.requirement import LoopFunction
 from control_design.specification import Specification
+from control_design.specification.requirement import LoopFunction
 from workflow.figures import style
 from workflow.figures.bands import Real
 from workflow.figures.registry import drawing

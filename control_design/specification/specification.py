@@ -25,7 +25,7 @@ from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, modes_of
 from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight
-from control_design.requirement import (
+from control_design.specification.requirement import (
     Findings,
     LoopFunction,
     Requirement,
@@ -34,8 +34,6 @@ from control_design.requirement import (
     constant_weight,
     tustin_zeros,
 )
-
-__all__ = ["RationalWeight", "Specification", "SpecificationError", "performance_modes"]
 
 
 class SpecificationError(ValueError):

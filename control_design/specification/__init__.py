@@ -1,0 +1,14 @@
+"""What the loop has to do: the engineer's words, and the requirements they stand for."""
+
+from control_design.plants.weights import RationalWeight
+from control_design.specification.requirement import LoopFunction, SpecificationItem, WeightedRequirement
+from control_design.specification.specification import Specification, SpecificationError
+
+__all__ = [
+    "LoopFunction",
+    "RationalWeight",
+    "Specification",
+    "SpecificationError",
+    "SpecificationItem",
+    "WeightedRequirement",
+]
