@@ -16,7 +16,7 @@ import control
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real, readonly_complex, readonly_real
-from control_design.plants.first_order import FirstOrder, Intervals, constant, pole_factor
+from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import UncertainPlant, frequency_response
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
@@ -97,7 +97,7 @@ class LinkUncertainty:
         + j (omega/20)^2) and j times it.
         """
         poles, zeros, gain = _roots_and_gain(_NOMINAL)
-        inverse = {complex(root): pole_factor(complex(root - 1), intervals) for root in (*poles, *zeros[:2])}
+        inverse = {complex(root): intervals.pole(complex(root - 1)) for root in (*poles, *zeros[:2])}
         centre = RationalResponse(gain, zeros - 1, poles - 1, 0, _DT_S).expand(intervals, cleared)
         columns = []
         for key, spread in _SPREAD[self.scenario].items():
@@ -105,7 +105,7 @@ class LinkUncertainty:
             up = _roots_and_gain(_NOMINAL | {key: _NOMINAL[key] * (1 + step)})
             down = _roots_and_gain(_NOMINAL | {key: _NOMINAL[key] * (1 - step)})
             factor = spread / (2 * step)
-            slope = constant((up[2] - down[2]) * factor / gain, intervals)
+            slope = intervals.constant((up[2] - down[2]) * factor / gain)
             moved = ((up[0] - down[0], poles, factor), (up[1] - down[1], zeros, -factor))
             for changes, roots, signed in moved:
                 for change, root in zip(changes, roots, strict=True):

@@ -28,7 +28,7 @@ from control_design.plants.ellipses import (
     farthest_distance,
     largest_disturbance_gain,
 )
-from control_design.plants.first_order import FirstOrder, Intervals, cleared_integrators
+from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.plants.rational_response import RationalResponse
@@ -124,7 +124,7 @@ class _Loop:
         loop = self.members.expand(intervals, i_plant).times(
             self.controller.delayed(delay).expand(intervals, own)
         )
-        clear = cleared_integrators(own + i_plant, intervals)
+        clear = intervals.cleared(own + i_plant)
         loop = SetExpansion(clear + loop.centre, loop.groups)
         normal = _normal(loop.centre.value, loop.gram())
         slack = loop.remainder()
@@ -166,7 +166,7 @@ class _Loop:
             largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
             upper, middle = largest * upper, _farthest(channel, 0) * middle
         if each.requirement.above > 0:  # where it asks for less, another requirement is bounded instead
-            least = each.requirement.above * _least(cleared_integrators(weight.integrators, intervals))
+            least = each.requirement.above * _least(intervals.cleared(weight.integrators))
             more = weight.expand(intervals, weight.integrators).largest() > least
             upper, middle = np.where(more, upper, 0.0), np.where(more, middle, 0.0)
         return upper, middle
@@ -181,7 +181,7 @@ class _Loop:
         M <= M0 + e/(d d0) + M M0 |K - K0|.
         """
         own, i_plant = self.controller.integrators, self.plant.n_integrators
-        clear = cleared_integrators(own + i_plant, intervals)
+        clear = intervals.cleared(own + i_plant)
         k = self.controller.delayed(self.specification.computational_delay_samples).expand(intervals)
         members = self.members.expand(intervals, 0)
         most = largest_disturbance_gain(k.value, _ellipses(intervals, members))

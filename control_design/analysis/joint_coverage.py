@@ -16,13 +16,13 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.stability import closed_loop_poles, loop_integrators
+from control_design.analysis.stability import closed_loop_poles, loop_integrators, winds
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.plants.ellipses import Complex, Ellipses, Real, radius_of
 from control_design.plants.first_order import Intervals
 from control_design.plants.frequency_grid import frequency_grid
-from control_design.plants.guards import Guard, different_responses, guard_grid, winds
+from control_design.plants.guards import Guard, different_responses, guard_grid
 from control_design.plants.plant_set import Channel, Mode, UncertainPlant, modes_of
 from control_design.plants.set_expansion import FirstOrderUncertainty
 from control_design.specification import Specification
@@ -104,7 +104,7 @@ def joint_coverage(
     outside = np.max([one.distance for one in found], axis=0)
     # The worst case at a radius is compared in standard deviations, common to all plants.
     wanted = float(np.quantile(gamma, coverage, method="higher"))
-    given = [_radius(loop.plant.level) for loop in loops]
+    given = [radius_of(loop.plant.level) for loop in loops]
     at_given = max(loop.worst(radius) for loop, radius in zip(loops, given, strict=True))
     low, high = 1e-3, _LARGEST_RADIUS
     for _ in range(60):
@@ -184,13 +184,13 @@ class _Sampled:
             channel = each.requirement.channel
             if channel is not None and np.any(each.own > 0):
                 asked = channel.at(grid[each.own > 0])
-                performance[each.requirement.name] = _scaled(asked, 1 / _radius(channel.level))
+                performance[each.requirement.name] = asked.scaled(1 / radius_of(channel.level))
         integrators, unstable = loop_integrators(controller, plant)
         return cls(
             plant,
             controller,
             data,
-            _scaled(data.ellipses, 1 / _radius(plant.level)),
+            data.ellipses.scaled(1 / radius_of(plant.level)),
             performance,
             controller.response(grid, with_delay=False),
             integrators,
@@ -204,9 +204,9 @@ class _Sampled:
             ellipses, channel = self.unit_performance.get(each.requirement.name), each.channel
             if ellipses is not None and channel is not None:
                 channel = channel.copy()
-                channel[each.own > 0] = _scaled(ellipses, radius).farthest()
+                channel[each.own > 0] = ellipses.scaled(radius).farthest()
             weightings.append(replace(each, channel=channel))
-        data = replace(self.data, ellipses=_scaled(self.unit, radius), weightings=tuple(weightings))
+        data = replace(self.data, ellipses=self.unit.scaled(radius), weightings=tuple(weightings))
         return float(np.max(worst_of(data.weighted(self.loop))))
 
     def gamma_of(self, members: Complex, performance: Responses | None) -> Real:
@@ -355,20 +355,6 @@ def linear_responses(
         return np.asarray(centre.value + kept[0] @ generators.value.T, dtype=np.complex128)
 
     return at
-
-
-def _scaled(ellipses: Ellipses, factor: float) -> Ellipses:
-    return Ellipses(
-        ellipses.omega_rad_s,
-        ellipses.centre,
-        factor * ellipses.semi_major,
-        factor * ellipses.semi_minor,
-        ellipses.direction,
-    )
-
-
-def _radius(level: float) -> float:
-    return float(np.sqrt(-2.0 * np.log1p(-level)))
 
 
 def _level(radius: float) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
@@ -75,6 +76,33 @@ class NyquistCount:
     matches: bool
 
 
+def _steps(value: Complex) -> Real:
+    """Phase steps between neighbours on the last axis."""
+    return np.asarray(np.angle(value[..., 1:] * np.conj(value[..., :-1])), dtype=np.float64)
+
+
+def half_turns(value: Complex, integrators: int) -> Real:
+    """Phase change / pi (...) of 1 + L (..., F) from near zero frequency to Nyquist.
+
+    The remainders to the limit directions at both ends, known up to half turns, close the count to a multiple
+    of 1/2.
+    """
+    first, last = np.angle(value[..., 0] * 1j**integrators), np.angle(value[..., -1])
+    total = np.sum(_steps(value), axis=-1) + (first - np.pi * np.round(first / np.pi))
+    total -= last - np.pi * np.round(last / np.pi)
+    return np.round(total / np.pi, 9) + 0.0  # no minus sign on zero
+
+
+def winds(
+    loop_gain: Complex, *, integrators: int, unstable_poles: int
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """(1 + L turns as a stable loop's, some phase step is wider than pi/3), each (D,), for L (D, F) from
+    near zero frequency to Nyquist; see `nyquist_count`."""
+    turns = half_turns(1.0 + loop_gain, integrators)
+    right = np.abs(turns - (unstable_poles + integrators / 2.0)) < 0.25
+    return right, np.max(np.abs(_steps(1.0 + loop_gain)), axis=1) > np.pi / 3
+
+
 def nyquist_count(
     loop_gain: Callable[[Real], Complex],
     start: Real,
@@ -106,23 +134,16 @@ def nyquist_count(
             omega = np.concatenate([lower, omega])
             value = np.concatenate([1.0 + loop_gain(lower), value])
         for _ in range(30):
-            wide = np.flatnonzero(np.abs(np.angle(value[1:] / _nonzero(value[:-1]))) > np.pi / 8)
+            wide = np.flatnonzero(np.abs(_steps(value)) > np.pi / 8)
             wide = wide[(omega[wide + 1] - omega[wide]) > 1e-12 * omega[wide + 1]]
             if wide.size == 0 or omega.size > 200_000:
                 break
             middle = 0.5 * (omega[wide] + omega[wide + 1])
             omega = np.insert(omega, wide + 1, middle)
             value = np.insert(value, wide + 1, 1.0 + loop_gain(middle))
-    steps = np.angle(value[1:] / _nonzero(value[:-1]))
-    turns = float(np.sum(steps) / np.pi)
-    # The remainders to the limit directions at both ends, known up to half turns, close the count to a
-    # multiple of 1/2.
-    first = np.angle(value[0] * 1j**integrators)
-    turns += (first - np.pi * np.round(first / np.pi)) / np.pi
-    last = np.angle(value[-1])
-    turns -= (last - np.pi * np.round(last / np.pi)) / np.pi
+    turns = float(half_turns(value, integrators))
     required = unstable_poles + integrators / 2.0
-    largest = float(np.max(np.abs(steps))) if steps.size else np.pi
+    largest = float(np.max(np.abs(_steps(value)))) if omega.size > 1 else np.pi
     matches = bool(abs(turns - required) < 0.25 and largest < np.pi / 2 and np.all(np.isfinite(value)))
     return NyquistCount(turns, required, largest, int(omega.size), matches)
 
@@ -133,7 +154,3 @@ def loop_integrators(controller: Controller, plant: UncertainPlant) -> tuple[int
     own = count_integrators(poles)
     others = poles[np.argsort(np.abs(poles - 1.0), kind="stable")][own:]
     return plant.n_integrators + own, plant.unstable_poles + int(np.sum(np.abs(others) >= 1.0))
-
-
-def _nonzero(value: Complex) -> Complex:
-    return np.where(value == 0, 1e-300, value)

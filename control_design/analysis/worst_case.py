@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -191,18 +191,11 @@ def worst_case(
         more = PlantData.build(plant, specification, extra)
         k = response(extra)
         added = more.weighted(k)
-        order = np.argsort(np.concatenate([omega, extra]), kind="stable")
-        merged = np.concatenate([omega, extra])[order]
-        keep = np.concatenate([[True], np.diff(merged) > 0])
-        order = order[keep]
+        omega = np.concatenate([omega, extra])
+        order = np.argsort(omega, kind="stable")
         values = {key: np.concatenate([values[key], added[key]])[order] for key in values}
         loop = np.concatenate([loop, k * more.delay])[order]
-        ellipses = Ellipses(
-            merged[keep],
-            *(
-                np.concatenate([getattr(ellipses, name), getattr(more.ellipses, name)])[order]
-                for name in ("centre", "semi_major", "semi_minor", "direction")
-            ),
-        )
-        omega = merged[keep]
+        pairs = ([getattr(e, field.name) for e in (ellipses, more.ellipses)] for field in fields(Ellipses))
+        ellipses = Ellipses(*(np.concatenate(pair)[order] for pair in pairs))
+        omega = omega[order]
     return WorstCase(omega, ellipses, loop, values)

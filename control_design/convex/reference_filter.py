@@ -35,8 +35,7 @@ from control_design.plants.ellipses import (
     Ellipses,
     Real,
     distance_to_minus_one,
-    farthest_distance,
-    nearest_distance,
+    largest_ratio,
 )
 from control_design.plants.frequency_grid import GridOptions, dense_grid, lean_grid
 from control_design.plants.plant_set import UncertainPlant
@@ -99,44 +98,10 @@ class ReferenceFilter(Law):
         return out
 
 
-def worst_matching_error(
-    loop_gain: Complex, follow: Complex, model: Complex, ellipses: Ellipses, *, iterations: int = 60
-) -> Real:
+def worst_matching_error(k: Complex, follow: Complex, model: Complex, ellipses: Ellipses) -> Real:
     """max over G in E of |F G k/(1 + G k) - T_ref| at every frequency, (F,); inf where a member puts the loop
-    on -1.
-
-    loop_gain k, follow F, model T_ref: (F,). Exact: with alpha = (F - T_ref) k and beta = -T_ref the error is
-    |alpha G + beta|/|1 + k G|; it is <= h on the disc |G - g0| <= r for |alpha| > h |k| and outside it
-    otherwise, g0 = (h^2 conj(k) - conj(alpha) beta)/A, r = h |alpha - k beta|/|A|, A = |alpha|^2 - h^2 |k|^2.
-    h by bisection between the centre's error and (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G|.
-    """
-    k = np.asarray(loop_gain, dtype=np.complex128)
-    alpha, beta = (follow - model) * k, -np.asarray(model)
-    e = ellipses
-    distance = distance_to_minus_one(k, e)
-    blocked = distance <= 0
-    safe = np.where(blocked, 1.0, distance)
-    low = np.abs(alpha * e.centre + beta) / np.maximum(np.abs(1.0 + k * e.centre), 1e-300)
-    reach = np.abs(alpha) * e.semi_major
-    high = np.maximum((np.abs(alpha * e.centre + beta) + reach) / safe, low) * (1 + 1e-12) + 1e-300
-    low = np.minimum(low, high)
-    for _ in range(iterations):
-        mid = 0.5 * (low + high)
-        a = np.abs(alpha) ** 2 - (mid * np.abs(k)) ** 2
-        tiny = 1e-13 * (np.abs(alpha) ** 2 + (mid * np.abs(k)) ** 2) + 1e-300
-        a = np.where(np.abs(a) < tiny, tiny, a)  # a half-plane is the limit of both cases
-        middle = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / a
-        radius = mid * np.abs(alpha - k * beta) / np.abs(a)
-        turned = (middle - e.centre) * np.conj(e.direction)
-        inside = np.where(
-            a > 0,
-            farthest_distance(turned, e.semi_major, e.semi_minor) <= radius,
-            nearest_distance(turned, e.semi_major, e.semi_minor) >= radius,
-        )
-        high, low = np.where(inside, mid, high), np.where(inside, low, mid)
-        if np.all(high - low <= _ACCURACY * high):
-            break
-    return np.asarray(np.where(blocked, np.inf, high))
+    on -1. Controller k, follow F, model T_ref: (F,). The error is |(F - T_ref) k G - T_ref|/|1 + k G|."""
+    return largest_ratio((follow - model) * k, -model, k, ellipses, accuracy=_ACCURACY)
 
 
 def design_reference_filter(

@@ -124,21 +124,6 @@ class YoulaBracket:
         """How far gamma lies above the ellipse value, relative: 0.02 = a higher order could buy about 2 %."""
         return gamma / self.ellipse - 1.0
 
-    def sentence(self, gamma: float, order: int) -> str:
-        """One line for a design of this gamma and order."""
-        floor = f"none goes below about {self.floor:.3g}"
-        if not (np.isfinite(self.ellipse) and np.isfinite(gamma)):
-            return (
-                f"order {order}: gamma {gamma:.4g}, any order is known to reach {self.ellipse:.4g}; {floor}"
-            )
-        share = 100.0 * self.excess(gamma)
-        if len(self.plants) > 1:
-            reach = f"the hardest plant alone allows {self.ellipse:.4g}"
-        else:
-            reach = f"a controller of any order is known to reach {self.ellipse:.4g}"
-        word = f"{share:.2g} % above" if share >= 0 else f"{-share:.2g} % below"
-        return f"order {order}: gamma {gamma:.4g}, {word} what {reach}; {floor}"
-
 
 def youla_bracket(
     plants: UncertainPlant | Sequence[UncertainPlant],

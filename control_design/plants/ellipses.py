@@ -7,7 +7,7 @@ rounding: no sampling of the boundary, no enclosing disc.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -29,6 +29,11 @@ def readonly_complex(value: npt.ArrayLike) -> Complex:
     array = np.array(value, dtype=np.complex128)
     array.setflags(write=False)
     return array
+
+
+def radius_of(level: float) -> float:
+    """Radius, in standard deviations, of the ellipse that holds a plane Gaussian with probability level."""
+    return float(np.sqrt(-2.0 * np.log1p(-level)))
 
 
 class ResponseSet(Protocol):
@@ -73,10 +78,7 @@ class Ellipses:
             object.__setattr__(self, name, readonly_real(getattr(self, name)))
         for name in ("centre", "direction"):
             object.__setattr__(self, name, readonly_complex(getattr(self, name)))
-        shapes = {
-            name: getattr(self, name).shape
-            for name in ("omega_rad_s", "centre", "semi_major", "semi_minor", "direction")
-        }
+        shapes = {field.name: getattr(self, field.name).shape for field in fields(self)}
         if self.omega_rad_s.ndim != 1 or len(set(shapes.values())) != 1:
             raise ValueError(f"ellipses need arrays of one shape (F,); got {shapes}")
         if self.omega_rad_s.size and not (
@@ -107,8 +109,7 @@ class Ellipses:
             raise ValueError(f"{what}: covariance must be (F, 2, 2); got {covariance.shape}")
         a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
         trace = a + d
-        half_gap = np.hypot((a - d) / 2, b)
-        large = trace / 2 + half_gap
+        large = trace / 2 + np.hypot((a - d) / 2, b)
         # small = determinant / large keeps the relative accuracy of thin ellipses.
         determinant = a * d - b * covariance[:, 1, 0]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -125,21 +126,24 @@ class Ellipses:
             raise ValueError(
                 f"{what}: covariance at {worst:.4g} rad/s is not symmetric positive semi-definite"
             )
-        quantile = -2.0 * np.log1p(-level)
-        angle = 0.5 * np.arctan2(2 * b, a - d)
+        quantile, angle = radius_of(level) ** 2, 0.5 * np.arctan2(2 * b, a - d)
         semi_major = np.sqrt(quantile * large)
         semi_minor = np.minimum(np.sqrt(quantile * np.maximum(small, 0.0)), semi_major)
         return cls(np.asarray(omega_rad_s), centre, semi_major, semi_minor, np.exp(1j * angle))
 
+    @classmethod
+    def of_no_size(cls, omega_rad_s: Real, response: Complex) -> Ellipses:
+        """A response that is known exactly, (F,)."""
+        zero = np.zeros(omega_rad_s.size)
+        return cls(omega_rad_s, response, zero, zero, np.ones(zero.size, np.complex128))
+
+    def scaled(self, factor: float) -> Ellipses:
+        """Axes times a factor."""
+        return replace(self, semi_major=factor * self.semi_major, semi_minor=factor * self.semi_minor)
+
     def subset(self, index: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Ellipses:
         """The ellipses at the given positions."""
-        return Ellipses(
-            self.omega_rad_s[index],
-            self.centre[index],
-            self.semi_major[index],
-            self.semi_minor[index],
-            self.direction[index],
-        )
+        return Ellipses(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def points(self, d1: Real, d2: Real) -> Complex:
         """Members centre + u1 s1 d1 + j u1 s2 d2; d1, d2 broadcast against (F,) on the last axis."""
@@ -262,40 +266,45 @@ def scale_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
     return np.asarray(np.where((k == 0) | np.isnan(scale), np.inf, scale), dtype=np.float64)
 
 
-def largest_disturbance_gain(k: Complex, ellipses: Ellipses, *, iterations: int = 60) -> Real:
-    """max |G / (1 + G k)| over G in E at every frequency, (F,); inf where some member puts the loop on -1.
-    Exact.
+def largest_disturbance_gain(k: Complex, ellipses: Ellipses) -> Real:
+    """max |G / (1 + G k)| over G in E at every frequency, (F,); see `largest_ratio`."""
+    return largest_ratio(np.ones_like(k), np.zeros_like(k), k, ellipses)
 
-    |G| <= h |1 + G k| is, with q = h^2 |k|^2, an Apollonius set: |G - g0| >= r for q > 1, <= r for q < 1,
-    with g0 = h^2 conj(k)/(1 - q) and r = h/|1 - q|. The ellipse lies in it or not by its exact
-    nearest/farthest distance from g0; h by bisection (the same lossless statement as the S-lemma of the
-    design notes, without multipliers).
+
+def largest_ratio(
+    alpha: Complex, beta: Complex, k: Complex, ellipses: Ellipses, *, accuracy: float = 1e-13
+) -> Real:
+    """max |alpha G + beta| / |1 + k G| over G in E at every frequency, (F,), rounded up by at most the
+    relative accuracy; inf where some member has 1 + k G = 0.
+
+    With A = |alpha|^2 - h^2 |k|^2, |alpha G + beta| <= h |1 + k G| is an Apollonius set: |G - g0| <= r for A
+    > 0, >= r for A < 0, with g0 = (h^2 conj(k) - conj(alpha) beta)/A and r = h |alpha - k beta|/|A|. The
+    ellipse lies in it or not by its exact nearest/farthest distance from g0; h by bisection between the
+    centre's value and (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G| (the same lossless statement
+    as the S-lemma of the design notes, without multipliers).
     """
-    blocked = distance_to_minus_one(k, ellipses) <= 0.0
-    centre_value = np.abs(ellipses.centre) / np.maximum(np.abs(1.0 + k * ellipses.centre), 1e-300)
-    upper = np.where(
-        blocked, 1.0, ellipses.farthest() / np.maximum(distance_to_minus_one(k, ellipses), 1e-300)
-    )
-    low = np.minimum(centre_value, upper)
-    high = np.maximum(upper, 1e-300)
-    for _ in range(iterations):
+    e = ellipses
+    distance = distance_to_minus_one(k, e)
+    blocked = distance <= 0.0
+    centre_value = np.abs(alpha * e.centre + beta)
+    upper = (centre_value + np.abs(alpha) * e.semi_major) / np.where(blocked, 1.0, distance)
+    low = centre_value / np.maximum(np.abs(1.0 + k * e.centre), 1e-300)
+    high = np.maximum(upper, low) * (1 + 1e-12) + 1e-300
+    low = np.minimum(low, high)
+    for _ in range(60):
         mid = 0.5 * (low + high)
-        inside = _in_apollonius_set(mid, k, ellipses)
-        high = np.where(inside, mid, high)
-        low = np.where(inside, low, mid)
-        if np.all(high - low <= 1e-13 * high):
+        a, part = np.abs(alpha) ** 2, (mid * np.abs(k)) ** 2
+        tiny = 1e-13 * (a + part) + 1e-300
+        gap = np.where(np.abs(a - part) < tiny, tiny, a - part)  # a half-plane is the limit of both cases
+        middle = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / gap
+        radius = mid * np.abs(alpha - k * beta) / np.abs(gap)
+        turned = (middle - e.centre) * np.conj(e.direction)
+        inside = np.where(
+            gap > 0,
+            farthest_distance(turned, e.semi_major, e.semi_minor) <= radius,
+            nearest_distance(turned, e.semi_major, e.semi_minor) >= radius,
+        )
+        high, low = np.where(inside, mid, high), np.where(inside, low, mid)
+        if np.all(high - low <= accuracy * high):
             break
     return np.asarray(np.where(blocked, np.inf, high), dtype=np.float64)
-
-
-def _in_apollonius_set(h: Real, k: Complex, ellipses: Ellipses) -> npt.NDArray[np.bool_]:
-    """True where |G| <= h |1 + G k| holds on all of E."""
-    q = (h * np.abs(k)) ** 2
-    gap = 1.0 - q
-    gap = np.where(np.abs(gap) < 1e-13, 1e-13, gap)  # a half-plane is the limit of both cases
-    centre = h**2 * np.conj(k) / gap
-    radius = h / np.abs(gap)
-    turned = (centre - ellipses.centre) * np.conj(ellipses.direction)
-    outside = nearest_distance(turned, ellipses.semi_major, ellipses.semi_minor) >= radius
-    within = farthest_distance(turned, ellipses.semi_major, ellipses.semi_minor) <= radius
-    return np.asarray(np.where(gap < 0, outside, within), dtype=np.bool_)

@@ -40,6 +40,38 @@ class Intervals:
         beyond = np.maximum(np.abs(offset) - self.half_width * self.dt_s, 0.0)
         return np.asarray(np.hypot(inward, 2.0 * np.sqrt(size) * np.sin(beyond / 2)), dtype=np.float64)
 
+    def constant(self, value: complex) -> FirstOrder:
+        """A constant."""
+        size, h = self.centre.size, self.half_width
+        return FirstOrder(np.full(size, complex(value)), np.zeros(size, complex), np.zeros(size), h)
+
+    def zero(self, root_minus_1: complex) -> FirstOrder:
+        """z - q, q = 1 + root_minus_1. Its second derivative in omega has modulus dt^2."""
+        shift, dt, h = self.z_minus_1, self.dt_s, self.half_width
+        return FirstOrder(shift - root_minus_1, 1j * dt * (1.0 + shift), 0.5 * (h * dt) ** 2, h)
+
+    def pole(self, root_minus_1: complex) -> FirstOrder:
+        """1/(z - p), p = 1 + root_minus_1: |d2/d omega2| = dt^2 |z + p|/|z - p|^3, bounded by the distance of
+        the arc."""
+        shift, dt, h = self.z_minus_1, self.dt_s, self.half_width
+        value = 1.0 / (shift - root_minus_1)
+        nearest = np.maximum(self.distance_to(root_minus_1), 1e-100)
+        bound = dt**2 * (1.0 + abs(1.0 + root_minus_1)) / nearest**3
+        return FirstOrder(value, -1j * dt * (1.0 + shift) * value**2, 0.5 * h**2 * bound, h)
+
+    def shift(self, samples: int) -> FirstOrder:
+        """z^samples: |d2/d omega2| = (samples dt)^2."""
+        rate, h = samples * self.dt_s, self.half_width
+        value = np.exp(1j * rate * self.centre)
+        return FirstOrder(value, 1j * rate * value, 0.5 * (rate * h) ** 2, h)
+
+    def cleared(self, count: int) -> FirstOrder:
+        """(z - 1)^count for positive, 1/(z - 1)^|count| for negative count."""
+        result = self.constant(1.0)
+        for _ in range(abs(count)):
+            result = result.times(self.zero(0.0) if count > 0 else self.pole(0.0))
+        return result
+
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
@@ -95,57 +127,5 @@ class FirstOrder:
 def _norm(value: Complex) -> Real:
     if value.ndim == 1:
         return np.abs(value)
-    return np.asarray(np.sqrt(np.einsum("fq,fq->f", value.real, value.real) + _imaginary_squares(value)))
-
-
-def _imaginary_squares(value: Complex) -> Real:
-    return np.asarray(np.einsum("fq,fq->f", value.imag, value.imag))
-
-
-def constant(value: complex, intervals: Intervals) -> FirstOrder:
-    """A constant."""
-    size = intervals.centre.size
-    return FirstOrder(
-        np.full(size, complex(value)), np.zeros(size, complex), np.zeros(size), intervals.half_width
-    )
-
-
-def zero_factor(root_minus_1: complex, intervals: Intervals) -> FirstOrder:
-    """z - q, q = 1 + root_minus_1. Its second derivative in omega has modulus dt^2."""
-    shift = intervals.z_minus_1
-    remainder = 0.5 * (intervals.half_width * intervals.dt_s) ** 2
-    return FirstOrder(
-        shift - root_minus_1, 1j * intervals.dt_s * (1.0 + shift), remainder, intervals.half_width
-    )
-
-
-def pole_factor(root_minus_1: complex, intervals: Intervals) -> FirstOrder:
-    """1/(z - p), p = 1 + root_minus_1: |d2/d omega2| = dt^2 |z + p|/|z - p|^3, bounded by the distance of the
-    arc."""
-    dt = intervals.dt_s
-    shift = intervals.z_minus_1
-    value = 1.0 / (shift - root_minus_1)
-    nearest = np.maximum(intervals.distance_to(root_minus_1), 1e-100)
-    bound = dt**2 * (1.0 + abs(1.0 + root_minus_1)) / nearest**3
-    slope = -1j * dt * (1.0 + shift) * value**2
-    return FirstOrder(value, slope, 0.5 * intervals.half_width**2 * bound, intervals.half_width)
-
-
-def shift_factor(samples: int, intervals: Intervals) -> FirstOrder:
-    """z^samples: |d2/d omega2| = (samples dt)^2."""
-    rate = samples * intervals.dt_s
-    value = np.exp(1j * rate * intervals.centre)
-    return FirstOrder(
-        value, 1j * rate * value, 0.5 * (rate * intervals.half_width) ** 2, intervals.half_width
-    )
-
-
-def cleared_integrators(count: int, intervals: Intervals) -> FirstOrder:
-    """(z - 1)^count for positive, 1/(z - 1)^|count| for negative count."""
-    result = constant(1.0, intervals)
-    if count == 0:
-        return result
-    factor = zero_factor(0.0, intervals) if count > 0 else pole_factor(0.0, intervals)
-    for _ in range(abs(count)):
-        result = result.times(factor)
-    return result
+    squares = (np.einsum("fq,fq->f", part, part) for part in (value.real, value.imag))
+    return np.asarray(np.sqrt(sum(squares)))

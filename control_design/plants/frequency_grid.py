@@ -86,7 +86,8 @@ def dense_grid(
 
 
 def _outside(own: Real, wanted: Real) -> Real:
-    return wanted[(wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))]
+    outside = (wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))
+    return np.asarray(wanted[outside], dtype=np.float64)
 
 
 def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
@@ -95,7 +96,7 @@ def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
     own = plant.own_grid
     if own is None:
         return wanted
-    return np.asarray(np.union1d(own[own > 0], _outside(own, wanted)), dtype=np.float64)
+    return np.union1d(own[own > 0], _outside(own, wanted))
 
 
 def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
@@ -107,7 +108,7 @@ def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
     inside = wanted[(wanted >= own[0]) & (wanted <= own[-1])]
     index = np.unique(np.clip(np.searchsorted(own, inside), 0, own.size - 1))
     index = np.union1d(index, np.array([0, own.size - 1]))
-    return np.asarray(np.union1d(own[index], _outside(own, wanted)), dtype=np.float64)
+    return np.union1d(own[index], _outside(own, wanted))
 
 
 def local_maxima(value: Real) -> npt.NDArray[np.int64]:

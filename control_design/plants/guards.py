@@ -49,10 +49,7 @@ class Guard:
         own = self.omega_rad_s
         above = np.clip(np.searchsorted(own, wanted), 1, own.size - 1)
         index = np.unique(np.where(wanted - own[above - 1] < own[above] - wanted, above - 1, above))
-        zero = np.zeros(index.size)
-        return Ellipses(
-            self.omega_rad_s[index], self.response[index], zero, zero, np.ones(index.size, np.complex128)
-        )
+        return Ellipses.of_no_size(self.omega_rad_s[index], self.response[index])
 
 
 def guard_grid(plant: UncertainPlant, omega_min_rad_s: float) -> Real:
@@ -64,21 +61,6 @@ def guard_grid(plant: UncertainPlant, omega_min_rad_s: float) -> Real:
         n_log=1200,
         n_mode=400 * len(plant.modes),
     )
-
-
-def winds(
-    loop_gain: Complex, *, integrators: int, unstable_poles: int
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """(1 + L turns as a stable loop's, some phase step is wider than pi/3), each (D,), for L (D, F) from
-    near zero frequency to Nyquist; see `stability.nyquist_count`."""
-    value = 1.0 + loop_gain
-    steps = np.angle(value[:, 1:] * np.conj(value[:, :-1]))
-    first = np.angle(value[:, 0] * 1j**integrators)
-    last = np.angle(value[:, -1])
-    total = np.sum(steps, axis=1) + (first - np.pi * np.round(first / np.pi))
-    total -= last - np.pi * np.round(last / np.pi)
-    required = unstable_poles + integrators / 2.0
-    return np.abs(total / np.pi - required) < 0.25, np.max(np.abs(steps), axis=1) > np.pi / 3
 
 
 def different_responses(responses: Complex, most: int) -> npt.NDArray[np.int64]:

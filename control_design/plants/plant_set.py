@@ -94,7 +94,7 @@ class Channel:
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         if self.uncertainty is None:
-            return self._exact(omega)
+            return Ellipses.of_no_size(omega, self.nominal_response(omega))
         if hasattr(self.uncertainty, "at"):
             record: Any = self.uncertainty.at(omega, self.level)
             return Ellipses.from_covariance(
@@ -105,10 +105,6 @@ class Channel:
                 what="uncertainty",
             )
         return self._from_own_grid(omega)
-
-    def _exact(self, omega: Real) -> Ellipses:
-        zero = np.zeros(omega.size)
-        return Ellipses(omega, self.nominal_response(omega), zero, zero, np.ones(omega.size, complex))
 
     def _from_own_grid(self, omega: Real) -> Ellipses:
         record: Any = self.uncertainty

@@ -10,15 +10,7 @@ import numpy.typing as npt
 import scipy.linalg
 
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.first_order import (
-    FirstOrder,
-    Intervals,
-    cleared_integrators,
-    constant,
-    pole_factor,
-    shift_factor,
-    zero_factor,
-)
+from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.weights import RationalWeight
 
 
@@ -101,19 +93,19 @@ class RationalResponse:
 
     def expand(self, intervals: Intervals, cleared: int = 0) -> FirstOrder:
         """(z - 1)^cleared times the response, to first order on the intervals."""
-        result = constant(self.gain, intervals)
+        result = intervals.constant(self.gain)
         zeros = self.zeros_minus_1[np.argsort(np.abs(self.zeros_minus_1), kind="stable")]
         poles = self.poles_minus_1[np.argsort(np.abs(self.poles_minus_1), kind="stable")]
         for index in range(max(zeros.size, poles.size)):
             # One pole, one zero in turn: partial products keep the size of the whole.
             if index < poles.size:
-                result = result.times(pole_factor(complex(poles[index]), intervals))
+                result = result.times(intervals.pole(complex(poles[index])))
             if index < zeros.size:
-                result = result.times(zero_factor(complex(zeros[index]), intervals))
+                result = result.times(intervals.zero(complex(zeros[index])))
         if self.delay_samples:
-            result = result.times(shift_factor(-self.delay_samples, intervals))
+            result = result.times(intervals.shift(-self.delay_samples))
         if cleared != self.integrators:
-            result = result.times(cleared_integrators(cleared - self.integrators, intervals))
+            result = result.times(intervals.cleared(cleared - self.integrators))
         return result
 
     def at(self, omega_rad_s: Real) -> Complex:

@@ -14,16 +14,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from control_design.plants.ellipses import Complex, Real
-from control_design.plants.first_order import (
-    FirstOrder,
-    Intervals,
-    cleared_integrators,
-    constant,
-    pole_factor,
-    shift_factor,
-    zero_factor,
-)
+from control_design.plants.ellipses import Complex, Real, radius_of
+from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import Channel
 from control_design.plants.rational_response import RationalResponse
 from ident.uncertainty import ResponsePosterior
@@ -91,7 +83,7 @@ def expandable(channel: Channel, integrators: int, between_own_points: str) -> E
         if between_own_points != "linear":
             return None
         return OwnGridSet(channel, RationalResponse.from_state_space(channel.nominal, integrators))
-    radius = float(np.sqrt(-2.0 * np.log1p(-channel.level)))
+    radius = radius_of(channel.level)
     if isinstance(uncertainty, ResponsePosterior):
         return PosteriorSet(uncertainty, radius)
     if isinstance(uncertainty, FirstOrderUncertainty):
@@ -137,8 +129,8 @@ class PosteriorSet:
         centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), h)
         spread = FirstOrder(value @ factor, slope @ factor, remainder @ np.linalg.norm(factor, axis=1), h)
         # 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i
-        common = shift_factor(posterior.integrators - posterior.input_delay_samples, intervals)
-        common = common.times(cleared_integrators(cleared - posterior.integrators, intervals))
+        common = intervals.shift(posterior.integrators - posterior.input_delay_samples)
+        common = common.times(intervals.cleared(cleared - posterior.integrators))
         return SetExpansion(common.times(centre), (common.times(spread).scaled(self.radius),))
 
     def _columns(self, intervals: Intervals) -> tuple[Complex, Complex, Real]:
@@ -146,9 +138,9 @@ class PosteriorSet:
         integrators and delay."""
         posterior = self.posterior
         columns: list[FirstOrder] = []
-        all_pass = constant(1.0, intervals)
+        all_pass = intervals.constant(1.0)
         for a in posterior.poles.real:
-            driven = all_pass.times(pole_factor(complex(a - 1.0), intervals))
+            driven = all_pass.times(intervals.pole(complex(a - 1.0)))
             columns.append(driven.scaled(float(np.sqrt((1 - a) * (1 + a)))))
             all_pass = driven.times(_reflected_zero(complex(a), intervals))
         for p in posterior.poles.pairs:
@@ -157,15 +149,15 @@ class PosteriorSet:
             one_minus_gamma = (1 - abs(p.real)) * (1 + abs(p.real)) - p.imag**2
             gain = float(np.sqrt(one_minus_gamma * (1 + gamma)))
             other = float(np.sqrt(one_minus_gamma**2 + 4 * p.imag**2) / (1 + gamma))
-            driven = all_pass.times(pole_factor(p - 1.0, intervals))
-            driven = driven.times(pole_factor(p.conjugate() - 1.0, intervals))
-            columns.append(driven.times(zero_factor(complex(beta - 1.0), intervals)).scaled(gain))
+            driven = all_pass.times(intervals.pole(p - 1.0))
+            driven = driven.times(intervals.pole(p.conjugate() - 1.0))
+            columns.append(driven.times(intervals.zero(complex(beta - 1.0))).scaled(gain))
             columns.append(driven.scaled(gain * other))
             all_pass = driven.times(_reflected_zero(p, intervals))
             all_pass = all_pass.times(_reflected_zero(p.conjugate(), intervals))
         if posterior.has_feedthrough:
-            columns.append(constant(1.0, intervals))
-        columns += [shift_factor(-lag, intervals) for lag in range(1, posterior.fir_length + 1)]
+            columns.append(intervals.constant(1.0))
+        columns += [intervals.shift(-lag) for lag in range(1, posterior.fir_length + 1)]
         return (
             np.stack([column.value for column in columns], axis=1),
             np.stack([column.slope for column in columns], axis=1),
@@ -176,7 +168,7 @@ class PosteriorSet:
 def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
     """1 - conj(p) z."""
     q = p.conjugate()
-    factor = zero_factor(0.0, intervals).scaled(-q)
+    factor = intervals.zero(0.0).scaled(-q)
     return FirstOrder(factor.value + (1.0 - q), factor.slope, factor.remainder, factor.half_width)
 
 
@@ -203,7 +195,7 @@ class OwnGridSet:
         ellipses = self.channel.at(own)
         h = intervals.half_width
         none = np.zeros(h.size)
-        clear = cleared_integrators(cleared, intervals)
+        clear = intervals.cleared(cleared)
         c0, c1 = ellipses.centre[left], ellipses.centre[left + 1]
         between = clear.times(FirstOrder(c0 + share * (c1 - c0), (c1 - c0) / gap, none, h))
         alone = self.nominal.expand(intervals, cleared)

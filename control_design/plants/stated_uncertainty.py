@@ -9,7 +9,7 @@ from typing import Literal
 import control
 import numpy as np
 
-from control_design.plants.ellipses import Real
+from control_design.plants.ellipses import Real, radius_of
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import count_integrators, frequency_response
 from control_design.plants.rational_response import RationalResponse
@@ -45,11 +45,6 @@ class StatedDiscs:
         if not 0 < self.level < 1:
             raise ValueError(f"level must lie in (0, 1); got {self.level}")
 
-    @property
-    def _scale(self) -> float:
-        """Radius of the level's ellipse in standard deviations."""
-        return float(np.sqrt(-2.0 * np.log1p(-self.level)))
-
     @cached_property
     def _rational(self) -> tuple[RationalResponse, RationalResponse]:
         """Nominal and weight by poles and zeros."""
@@ -69,7 +64,7 @@ class StatedDiscs:
     def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
         """Nominal response and circular covariances at omega (F,)."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        variance = (self.radius(omega) / self._scale) ** 2
+        variance = (self.radius(omega) / radius_of(self.level)) ** 2
         return FrequencyUncertainty(
             omega,
             frequency_response(self.nominal, omega),
@@ -91,5 +86,5 @@ class StatedDiscs:
             disc = weight.expand(intervals).times(centre)
         else:
             disc = weight.expand(intervals, cleared)
-        disc = disc.scaled(1.0 / self._scale)
+        disc = disc.scaled(1.0 / radius_of(self.level))
         return centre, stacked([disc, disc.scaled(1j)])

@@ -11,9 +11,9 @@ import numpy as np
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Real
 from control_design.synthesis.descent import MinimaxDescent, natural_units
-from control_design.synthesis.search_tasks import StartEnd, StartTask, Workshop
+from control_design.synthesis.search_tasks import Candidate, StartTask, Workshop
 from control_design.synthesis.starts import StartMaker, with_gain
-from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
+from control_design.synthesis.synthesis_result import StartReport
 from control_design.synthesis.work_pool import WorkPool
 
 Told = Callable[[float, str], None]
@@ -29,15 +29,6 @@ _RETRIEVALS = 3  # rounds for ends that are good on the grid and not robustly st
 _RETREAT, _RETREATS = 0.8, 20  # factor on their gain, and how often, until they are stable on the finer grid
 _FINISHING = 10  # rounds for the best alone, until dense check and grid agree
 _AGREE = 1.001
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A stable controller: parameters, worst case on the lean grid it came from, and on the dense grid."""
-
-    parameters: Real
-    gamma_grid: float
-    gamma: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,15 +138,9 @@ class OrderSearch:
     def _task(self, parameters: Real, *, eased: bool = False) -> StartTask:
         return StartTask(self.cascade, parameters, tuple(self.problem.grids), _STEPS, eased)
 
-    def _taken(self, end: StartEnd) -> Candidate:
-        """A start's end as a candidate (infinite gamma where it is unstable), reported."""
-        last = len(end.stages) - 1
-        for number, stage in enumerate(end.stages):
-            dense = end.gamma_dense if number == last and np.isfinite(end.gamma_dense) else None
-            at = len(self.reports) + 1
-            gamma = min(stage.gamma, LARGEST_GAMMA)
-            self.reports.append(StartReport(at, stage.status, stage.iterations, gamma, dense))
-        return Candidate(end.parameters, end.gamma, end.gamma_dense)
+    def _taken(self, end: Candidate) -> Candidate:
+        self.reports += end.reports
+        return end
 
     def _as_given(self, parameters: Real) -> Candidate:
         return Candidate(

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from control_design.analysis.grids import Grids
-from control_design.analysis.stability import NominalLoop
+from control_design.analysis.stability import NominalLoop, winds
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Ellipses, Real, scale_to_minus_one
 from control_design.plants.frequency_grid import mode_points, with_violations
-from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant, winds
+from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
@@ -65,7 +65,7 @@ class Problem(Grids):
             plant = self.plants[guard.plant]
             points = guard.ellipses((self.grids if grids is None else grids)[guard.plant])
             omega = points.omega_rad_s
-            delay = np.exp(-1j * omega * self.dt_s * self.spec.computational_delay_samples)
+            delay = self.delay(omega)
             asked = self.spec.magnitude(plant, omega, LoopFunction.SENSITIVITY)
             rows.append(self._rows(plant, points, delay, _modulus(GUARD_MODULUS, points), asked))
         return rows
@@ -115,12 +115,20 @@ class Problem(Grids):
         poles = self.closed_loop_poles(cascade, parameters)
         return all(np.all(np.abs(each) < 1.0) for each in poles) and self.guarded(cascade, parameters)
 
+    def delay(self, omega_rad_s: Real) -> Complex:
+        """The computational delay at omega (F,)."""
+        samples = self.spec.computational_delay_samples
+        return np.asarray(np.exp(-1j * omega_rad_s * self.dt_s * samples), dtype=np.complex128)
+
+    def delayed_response(self, cascade: Cascade, parameters: Real, omega_rad_s: Real) -> Complex:
+        """K with its delay at omega (F,)."""
+        return cascade.response(parameters, omega_rad_s) * self.delay(omega_rad_s)
+
     def guarded(self, cascade: Cascade, parameters: Real, guards: Sequence[Guard] | None = None) -> bool:
         """Whether 1 + K G winds as it has to for every guard, or for those given."""
-        samples = self.spec.computational_delay_samples
         for number, omega, responses in self._guarded if guards is None else sorted_by_plant(guards):
             plant = self.plants[number]
-            k = cascade.response(parameters, omega) * np.exp(-1j * omega * self.dt_s * samples)
+            k = self.delayed_response(cascade, parameters, omega)
             stable, wide = winds(
                 responses * k,
                 integrators=plant.n_integrators + int(self.spec.integrator),
@@ -182,10 +190,9 @@ class Problem(Grids):
                 depth = 2.0 - np.minimum(scale_to_minus_one(k * data.delay, data.ellipses)[covered], 1.0)
                 worst[covered] = depth * 2.0 * np.max(worst[~covered], initial=limit)
             added += self._add(position, omega, worst, limit, most)
-        samples = self.spec.computational_delay_samples
         for guard in self.guards:
             omega = guard.omega_rad_s
-            k = cascade.response(parameters, omega) * np.exp(-1j * omega * self.dt_s * samples)
+            k = self.delayed_response(cascade, parameters, omega)
             near = GUARD_MODULUS / np.maximum(np.abs(1.0 + guard.response * k), 1e-300)
             added += self._add(guard.plant, omega, near, limit, most)
         return added

@@ -14,6 +14,7 @@ from control_design.plants.ellipses import Real
 from control_design.synthesis.angle_program import AngleProgram
 from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
+from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,23 +32,15 @@ class StartTask:
     eased: bool = False
 
 
-@dataclass(frozen=True)
-class Stage:
-    """Status, iterations and worst case on the lean grid of one solver run (inf: unstable)."""
-
-    status: str
-    iterations: int
-    gamma: float
-
-
 @dataclass(frozen=True, eq=False)
-class StartEnd:
-    """Where a start ended: parameters, worst case on the lean and on the dense grid, what was run."""
+class Candidate:
+    """Where a start ended: parameters, worst case on the lean grid it came from and on the dense grid (inf:
+    unstable), what was run."""
 
     parameters: Real
+    gamma_grid: float
     gamma: float
-    gamma_dense: float
-    stages: tuple[Stage, ...]
+    reports: tuple[StartReport, ...] = ()
 
 
 class Workshop:
@@ -72,21 +65,22 @@ class Workshop:
             )
         return self._descent
 
-    def do(self, task: StartTask) -> StartEnd:
+    def do(self, task: StartTask) -> Candidate:
         """Improve one start."""
         descent = self.descent(task.cascade, task.grids)
-        start, stages = task.parameters, []
+        start, reports = task.parameters, []
         if task.eased:
             program = self._eased_program(task)
             gamma = self.problem.gamma(task.cascade, start, eased=True)
             point = program.solve(self.problem.at(task.cascade, start, program.plants, gamma))
-            stages.append(Stage(point.status, point.iterations, 1.0 / point.g))
+            reports.append(StartReport(point.status, point.iterations, 1.0 / point.g, None))
             if np.isfinite(descent.value(point.parameters)):
                 start = point.parameters
         end = descent.run(start, task.steps)
-        stages.append(Stage("descent", end.steps, end.gamma))
         dense = self.problem.gamma(task.cascade, end.parameters) if np.isfinite(end.gamma) else float("inf")
-        return StartEnd(end.parameters, end.gamma, dense, tuple(stages))
+        seen = min(end.gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
+        reports.append(StartReport("descent", end.steps, *seen))
+        return Candidate(end.parameters, end.gamma, dense, tuple(reports))
 
     def _eased_program(self, task: StartTask) -> AngleProgram:
         if self._program is None:

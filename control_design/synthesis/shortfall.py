@@ -56,8 +56,7 @@ def _guards(problem: Problem, cascade: Cascade, parameters: Real) -> list[Blocki
     for guard in problem.guards:
         if not problem.guarded(cascade, parameters, [guard]):
             omega = guard.omega_rad_s
-            delay = np.exp(-1j * omega * problem.dt_s * problem.spec.computational_delay_samples)
-            distance = np.abs(1.0 + guard.response * cascade.response(parameters, omega) * delay)
+            distance = np.abs(1.0 + guard.response * problem.delayed_response(cascade, parameters, omega))
             at = int(np.argmin(distance))
             points.append(BlockingPoint(problem.plants[guard.plant].name, GUARDED, float(omega[at]), np.inf))
     return points

@@ -14,9 +14,9 @@ from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
-from control_design.synthesis.order_search import Candidate, OrderResult, OrderSearch
+from control_design.synthesis.order_search import OrderResult, OrderSearch
 from control_design.synthesis.problem import Problem
-from control_design.synthesis.search_tasks import Workshop
+from control_design.synthesis.search_tasks import Candidate, Workshop
 from control_design.synthesis.shortfall import what_destabilises
 from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -88,21 +88,17 @@ def synthesise(
             result = OrderSearch(workshop, pool, cascade, own, part, given).run()
             reports += result.reports
     assert cascade is not None
-    numbered = tuple(
-        StartReport(number + 1, r.status, r.iterations, r.gamma_grid, r.gamma_dense)
-        for number, r in enumerate(reports)
-    )
     best = result.best
     if best is None or best.gamma >= _MEANINGLESS:
         nearest = result.nearest if best is None else best.parameters
-        return _nothing_stable(problem, cascade, nearest, best, numbered)
+        return _nothing_stable(problem, cascade, nearest, best, tuple(reports))
     tell(1.0, f"gamma {best.gamma:.4g}")
     return SynthesisResult(
         outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
         controller=problem.controller(cascade, best.parameters),
         gamma=best.gamma,
         blocking=_blocking(problem, cascade, best),
-        starts=numbered,
+        starts=tuple(reports),
         gamma_history=result.history,
         grid_points=sum(grid.size for grid in problem.grids),
     )

@@ -42,12 +42,11 @@ LARGEST_GAMMA = 1e300
 
 @dataclass(frozen=True)
 class StartReport:
-    """One start: solver status, iterations, gamma of the programme's grid and of the dense grid.
+    """One run of a solver from one start: status, iterations, gamma of its own grid and of the dense grid.
 
     gamma_dense None: unstable, or (status "descent") not checked on the dense grid.
     """
 
-    start: int
     status: str
     iterations: int
     gamma_grid: float

@@ -23,7 +23,7 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis.interrupts import interrupts_wait, leave_to_parent
 from control_design.synthesis.problem import Problem
-from control_design.synthesis.search_tasks import StartEnd, StartTask, Workshop
+from control_design.synthesis.search_tasks import Candidate, StartTask, Workshop
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -75,13 +75,13 @@ class WorkPool:
                     os.environ[name] = value
         self._pool = pool
 
-    def do(self, tasks: Sequence[StartTask]) -> Iterator[StartEnd]:
+    def do(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
         """Answers in the order of the tasks. Whoever stops asking leaves the rest undone."""
         if self._pool is None:
             for task in tasks:
                 yield self._workshop.do(task)
             return
-        waiting: list[Future[StartEnd]] = [self._pool.submit(_do, task) for task in tasks]
+        waiting: list[Future[Candidate]] = [self._pool.submit(_do, task) for task in tasks]
         try:
             for future in waiting:
                 yield future.result()
@@ -132,6 +132,6 @@ def _ready() -> None:
     """Nothing: a task that starts the processes."""
 
 
-def _do(task: StartTask) -> StartEnd:
+def _do(task: StartTask) -> Candidate:
     assert _own is not None
     return _own.do(task)

@@ -8,7 +8,7 @@ import pytest
 
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
 from control_design.analysis.worst_case import worst_case
-from control_design.plants.first_order import FirstOrder, Intervals, cleared_integrators
+from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import frequency_response
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
@@ -172,7 +172,7 @@ def test_a_resonance_the_grid_does_not_know_is_found_by_the_bounds():
 
         def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
             centre, disc = super().first_order(intervals, cleared)
-            needle = cleared_integrators(cleared, intervals).times(self._needle(intervals)[0])
+            needle = intervals.cleared(cleared).times(self._needle(intervals)[0])
             columns = [
                 FirstOrder(disc.value[:, i], disc.slope[:, i], disc.remainder, disc.half_width)
                 for i in range(2)

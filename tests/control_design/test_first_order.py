@@ -9,13 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from control_design import Channel, LoopFunction, RationalWeight, Specification, UncertainPlant
-from control_design.plants.first_order import (
-    FirstOrder,
-    Intervals,
-    cleared_integrators,
-    pole_factor,
-    zero_factor,
-)
+from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import frequency_response
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import OwnGridSet, PosteriorSet
@@ -62,13 +56,13 @@ def test_factors_hold_over_their_interval_and_the_distance_is_the_smallest(radiu
     intervals = Intervals(np.array([theta / _DT]), np.array([width / _DT]), _DT)
     omega, offsets = _frequencies(intervals)
     z = np.exp(1j * omega * _DT)
-    assert _excess(zero_factor(root - 1, intervals), z - root, offsets) <= 1
+    assert _excess(intervals.zero(root - 1), z - root, offsets) <= 1
     nearest = intervals.distance_to(complex(root - 1))[0]
     sampled = np.min(np.abs(z - root))
     # 401 samples miss the nearest point by half a step, width/400, at most.
     assert nearest <= sampled * (1 + 1e-9) + 1e-15
     assert nearest >= sampled - width / 390
-    assert _excess(pole_factor(root - 1, intervals), 1 / (z - root), offsets) <= 1
+    assert _excess(intervals.pole(root - 1), 1 / (z - root), offsets) <= 1
 
 
 def test_remainder_of_a_product_is_of_second_order_and_close_to_the_truth():
@@ -78,7 +72,7 @@ def test_remainder_of_a_product_is_of_second_order_and_close_to_the_truth():
         intervals = Intervals(np.array([20.0]), np.array([width]), _DT)
         omega, offsets = _frequencies(intervals)
         z = np.exp(1j * omega * _DT)
-        product = pole_factor(root - 1, intervals).times(zero_factor(-0.5, intervals))
+        product = intervals.pole(root - 1).times(intervals.zero(-0.5))
         truth = (z - 0.5) / (z - root)
         assert _excess(product, truth, offsets) <= 1
         assert _excess(product, truth, offsets) >= 0.3
@@ -130,7 +124,7 @@ def test_cleared_integrators_are_powers_of_z_minus_one():
     omega, offsets = _frequencies(intervals)
     for count in (-2, -1, 0, 1, 2):
         truth = (np.exp(1j * omega * _DT) - 1) ** count
-        assert _excess(cleared_integrators(count, intervals), truth, offsets) <= 1
+        assert _excess(intervals.cleared(count), truth, offsets) <= 1
 
 
 @pytest.mark.parametrize("integrators", [0, 1])

@@ -16,7 +16,8 @@ from control_design import (
     synthesise_jointly,
 )
 from control_design.analysis.joint_coverage import gamma_of_draws, unstable_draws
-from control_design.plants.guards import different_responses, guard_grid, winds
+from control_design.analysis.stability import winds
+from control_design.plants.guards import different_responses, guard_grid
 from control_design.plants.plant_set import frequency_response
 from ident import Poles
 from ident.uncertainty import ResponsePosterior

@@ -323,7 +323,7 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         controller=law,
         gamma=certificate.gamma,
         blocking=(BlockingPoint("hub", "modulus", 12.5, certificate.gamma),),
-        starts=(StartReport(0, "Solve_Succeeded", 41, 0.7, certificate.gamma),),
+        starts=(StartReport("Solve_Succeeded", 41, 0.7, certificate.gamma),),
         gamma_history=(certificate.gamma,),
         grid_points=200,
     )
