@@ -90,7 +90,8 @@ def half_turns(value: Complex, integrators: int) -> Real:
     first, last = np.angle(value[..., 0] * 1j**integrators), np.angle(value[..., -1])
     total = np.sum(_steps(value), axis=-1) + (first - np.pi * np.round(first / np.pi))
     total -= last - np.pi * np.round(last / np.pi)
-    return np.round(total / np.pi, 9) + 0.0  # no minus sign on zero
+    closed = np.round(total / np.pi, 9) + 0.0  # no minus sign on zero
+    return np.asarray(closed, dtype=np.float64)
 
 
 def winds(
