@@ -188,14 +188,11 @@ def _check_plant(
         return controller.response(omega) * plant.at(omega).centre
 
     integrators, unstable = loop_integrators(controller, plant)
-    if refinable:
-        count = nyquist_count(loop_gain, worst.omega_rad_s, integrators=integrators, unstable_poles=unstable)
-        nominal = nominal_margins(loop_gain, worst.omega_rad_s)
-    else:
-        count = nyquist_count(
-            loop_gain, grid, integrators=integrators, unstable_poles=unstable, refinable=False
-        )
-        nominal = nominal_margins(loop_gain, grid, refinable=False)
+    dense = worst.omega_rad_s
+    count = nyquist_count(
+        loop_gain, dense, integrators=integrators, unstable_poles=unstable, refinable=refinable
+    )
+    nominal = nominal_margins(loop_gain, dense, refinable=refinable)
     distance = worst.values["distance"]
     margins = ellipse_margins(worst.loop_factor, worst.ellipses, distance).worse(nominal)
     at = int(np.argmin(distance))

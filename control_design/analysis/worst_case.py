@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -66,31 +66,29 @@ class PlantData:
         delay = np.exp(-1j * omega * plant.dt_s * specification.computational_delay_samples)
         return cls(plant, plant.at(omega), delay, tuple(weightings))
 
+    def _most(self, sizes: Iterable[Real]) -> Real:
+        return np.asarray(np.max([np.zeros(self.delay.size), *sizes], axis=0), dtype=np.float64)
+
     def largest(self, function: LoopFunction) -> Real:
         """Largest weight (F,) on a closed-loop function of the members; zeros where none is asked."""
-        sizes = [each.size for each in self.weightings if each.function is function]
-        return np.max(sizes, axis=0) if sizes else np.zeros(self.delay.size)
+        return self._most(each.size for each in self.weightings if each.function is function)
 
     @property
     def sensitivity(self) -> Real:
         """Largest weight (F,) on S itself: tracking and modulus margin."""
-        own = [each.own for each in self.weightings if each.requirement.function is LoopFunction.SENSITIVITY]
-        return np.asarray(np.max(own, axis=0), dtype=np.float64)
+        itself = LoopFunction.SENSITIVITY
+        return self._most(each.own for each in self.weightings if each.requirement.function is itself)
 
     def of(self, kind: type[WeightedRequirement]) -> Real:
         """Weight (F,) of one kind of requirement; zeros where it is not asked."""
-        found = [each.size for each in self.weightings if isinstance(each.requirement, kind)]
-        return found[0] if found else np.zeros(self.delay.size)
+        return self._most(each.size for each in self.weightings if isinstance(each.requirement, kind))
 
     @property
     def open_loop_disturbance(self) -> Real:
         """Largest |W Gp| (F,) of the requirements on disturbances without a controller, at the centre."""
-        found = [np.zeros(self.delay.size)]
-        for each in self.weightings:
-            if each.requirement.function is LoopFunction.DISTURBANCE:
-                size = np.abs(self.ellipses.centre) if each.channel is None else each.channel
-                found.append(each.own * size)
-        return np.asarray(np.max(found, axis=0), dtype=np.float64)
+        asked = [w for w in self.weightings if w.requirement.function is LoopFunction.DISTURBANCE]
+        centre = np.abs(self.ellipses.centre)
+        return self._most(w.own * (centre if w.channel is None else w.channel) for w in asked)
 
     def row_weights(self) -> tuple[tuple[LoopFunction, Real], ...]:
         """Weights (F,) by function of the members, as rows of the optimisers: all that are asked at every

@@ -88,28 +88,13 @@ class Controller(Law):
     @classmethod
     def load_mat(cls, path: str | PathLike[str]) -> Controller:
         """Inverse of `save_mat`."""
-        data = scipy.io.loadmat(Path(path))
-        missing = [key for key in ("A", "B", "C", "D", "dt_s") if key not in data]
-        if missing:
-            raise ValueError(f"{path}: not a controller file, it lacks {missing[0]!r}")
-        n = data["D"].size and data["A"].shape[0]
-
-        def limit(key: str) -> float | None:
-            value = float(data[key].item())
-            return value if np.isfinite(value) else None
-
-        return cls(
-            A=data["A"].reshape(n, n),
-            B=data["B"].reshape(n, 1),
-            C=data["C"].reshape(1, n),
-            D=data["D"].reshape(1, 1),
-            dt_s=float(data["dt_s"].item()),
-            computational_delay_samples=int(data["computational_delay_samples"].item()),
-            input_limit=limit("input_limit"),
-            rate_limit=limit("rate_limit"),
-            anti_windup_gain=data["anti_windup_gain"].reshape(n, 1),
-            name=str(data["name"].item()),
-        )
+        data = scipy.io.loadmat(Path(path), simplify_cells=True)
+        known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
+        unlimited = {key: None for key in ("input_limit", "rate_limit") if np.isinf(known.get(key, 0.0))}
+        try:
+            return cls.from_dict({"format": cls.format_name(), **known, **unlimited})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 class ControllerStepper:

@@ -65,14 +65,19 @@ class Law:
         plain = {
             key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in values.items()
         }
-        return {"format": f"flexlink-{self.kind.replace(' ', '_')}-1", "law": self.equations, **plain}
+        return {"format": self.format_name(), "law": self.equations, **plain}
+
+    @classmethod
+    def format_name(cls) -> str:
+        """What a file of this kind says it is."""
+        return f"flexlink-{cls.kind.replace(' ', '_')}-1"
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Inverse of `to_dict`; ValueError if it is not of this format, naming a key it lacks."""
-        known = f"flexlink-{cls.kind.replace(' ', '_')}-1"
-        if data.get("format") != known:
-            raise ValueError(f"not a {cls.kind} file: format is {data.get('format')!r}, expected {known!r}")
+        if data.get("format") != cls.format_name():
+            found = f"format is {data.get('format')!r}, expected {cls.format_name()!r}"
+            raise ValueError(f"not a {cls.kind} file: {found}")
         missing = [field.name for field in fields(cls) if field.name not in data]
         if missing:
             raise ValueError(f"{cls.kind} file lacks the key {missing[0]!r}")

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import control
 import numpy as np
 import scipy.optimize
-import scipy.signal
 from pydantic import Field
 
 from control_design.analysis.stability import closed_loop_poles
@@ -29,7 +29,7 @@ from control_design.convex.minimax import (
     smallest_ratio,
     turning,
 )
-from control_design.convex.orthonormal_basis import basis_response, basis_state_space
+from control_design.convex.youla_basis import with_constant
 from control_design.plants.ellipses import (
     Complex,
     Ellipses,
@@ -40,6 +40,8 @@ from control_design.plants.ellipses import (
 from control_design.plants.frequency_grid import GridOptions, dense_grid, lean_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
+from ident.basis.functions import basis_state_space
+from ident.basis.poles import Poles
 
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
 
@@ -90,12 +92,7 @@ class ReferenceFilter(Law):
         reference = np.asarray(reference, dtype=np.float64)
         if reference.ndim != 1:
             raise ValueError(f"reference must be (T,); got {reference.shape}")
-        state, out = np.zeros(self.order), np.empty(reference.size)
-        b, c, d = self.B[:, 0], self.C[0], float(self.D[0, 0])
-        for index, value in enumerate(reference):
-            out[index] = c @ state + d * value
-            state = self.A @ state + b * value
-        return out
+        return np.asarray(control.forced_response(self.to_control(), inputs=reference).outputs)
 
 
 def worst_matching_error(k: Complex, follow: Complex, model: Complex, ellipses: Ellipses) -> Real:
@@ -171,7 +168,7 @@ class _Matching:
         poles = self._given_poles()
         if poles is None:
             poles = self._searched_poles()
-        before = max(float(np.max(each)) for each in self._errors(np.zeros(0, complex), np.ones(1)))
+        before = max(float(np.max(each)) for each in self._errors(Poles(), np.ones(1)))
         best = exchanged(
             lambda _: self._coefficients(poles, self.grids, self.options.boundary_samples),
             lambda x: self._errors(poles, self._full(poles, x)),
@@ -183,22 +180,22 @@ class _Matching:
         assert best.x is not None
         full, errors = self._full(poles, best.x), np.concatenate(best.values)
         where = float(np.concatenate(self._omegas)[np.argmax(errors)])
-        a, b = basis_state_space(poles)
+        a, b, _, _ = basis_state_space(poles)
         d = np.array([[full[0]]])
         return ReferenceFilter(a, b, full[None, 1:], d, self.dt_s, before, best.worst, where)
 
-    def _given_poles(self) -> Complex | None:
+    def _given_poles(self) -> Poles | None:
         rates = self.options.poles_rad_s
         if rates is None:
-            return np.zeros(0, complex) if self.options.order == 0 else None
+            return Poles() if self.options.order == 0 else None
         if not all(0 < rate < np.pi / self.dt_s for rate in rates):
             raise ValueError(
                 f"poles_rad_s must lie between 0 and the Nyquist frequency {np.pi / self.dt_s:.4g}; "
                 f"got {rates}"
             )
-        return np.exp(-self.dt_s * np.array(rates)).astype(complex)
+        return Poles(np.exp(-self.dt_s * np.array(rates)))
 
-    def _searched_poles(self) -> Complex:
+    def _searched_poles(self) -> Poles:
         """Simplex search of the logarithmic decay rates on thinned grids, half the samples."""
         thin = [grid[::3] for grid in self.grids]
         samples = max(8, self.options.boundary_samples // 2)
@@ -207,7 +204,7 @@ class _Matching:
 
         def cost(logs: Real) -> float:
             outside = float(np.sum(np.maximum(low - logs, 0) + np.maximum(logs - high, 0)))
-            poles = np.exp(-self.dt_s * np.exp(np.clip(np.sort(logs), low, high))).astype(complex)
+            poles = Poles(np.exp(-self.dt_s * np.exp(np.clip(np.sort(logs), low, high))))
             return self._coefficients(poles, thin, samples).gamma + outside
 
         corner = self._model_corner()
@@ -224,7 +221,7 @@ class _Matching:
             if best is None or float(answer.fun) < best[0]:
                 best = float(answer.fun), np.clip(np.sort(answer.x), low, high)
         assert best is not None
-        return np.exp(-self.dt_s * np.exp(best[1])).astype(complex)
+        return Poles(np.exp(-self.dt_s * np.exp(best[1])))
 
     def _model_corner(self) -> float:
         """Frequency where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency."""
@@ -241,14 +238,11 @@ class _Matching:
             return np.ones(omega.size, complex)
         return self.weight.at(imaginary_axis(omega, self.dt_s))
 
-    def _basis(self, poles: Complex, omega: Real) -> Complex:
-        return basis_response(poles, omega, self.dt_s)
-
-    def _at_zero(self, poles: Complex) -> Real:
+    def _at_zero(self, poles: Poles) -> Real:
         """Values of all basis functions at z = 1."""
-        return np.asarray(np.real(basis_response(poles, np.zeros(1), self.dt_s)[0]))
+        return np.asarray(np.real(with_constant(poles, np.zeros(1), self.dt_s)[0]))
 
-    def _coefficients(self, poles: Complex, grids: Sequence[Real], samples: int) -> MinimaxPoint:
+    def _coefficients(self, poles: Poles, grids: Sequence[Real], samples: int) -> MinimaxPoint:
         """Best free coefficients; with unit gain F = 1 + sum c_i (L_i - L_i(1)), else all of them."""
         angle = 2 * np.pi * np.arange(samples) / samples
         parts, bases, count = [], [], 0
@@ -258,7 +252,7 @@ class _Matching:
             loop = ellipses.points(np.cos(angle)[:, None], np.sin(angle)[:, None]) * k
             tracking = loop / (1 + loop)
             w, target = self._weight_at(omega), self._model_at(omega)
-            basis = self._basis(poles, omega)
+            basis = with_constant(poles, omega, self.dt_s)
             offset = np.zeros_like(tracking)
             if self.options.unit_gain:
                 offset, basis = tracking, basis[:, 1:] - self._at_zero(poles)[1:]
@@ -284,7 +278,7 @@ class _Matching:
             return MinimaxPoint(np.zeros(0), float(np.max(rows.numerator(plane(nothing)))), nothing, 0)
         return smallest_ratio(whole, rows)
 
-    def _full(self, poles: Complex, x: Real) -> Real:
+    def _full(self, poles: Poles, x: Real) -> Real:
         """Coefficients of the constant and all functions."""
         if not self.options.unit_gain:
             return x
@@ -294,12 +288,15 @@ class _Matching:
     def _omegas(self) -> list[Real]:
         return [ellipses.omega_rad_s for ellipses in self.dense]
 
-    def _errors(self, poles: Complex, full: Real) -> list[Real]:
+    def _errors(self, poles: Poles, full: Real) -> list[Real]:
         """Exact weighted errors of F on the dense grids."""
         return [
             np.abs(self._weight_at(omega))
             * worst_matching_error(
-                self.controller.response(omega), self._basis(poles, omega) @ full, self._model_at(omega), e
+                self.controller.response(omega),
+                with_constant(poles, omega, self.dt_s) @ full,
+                self._model_at(omega),
+                e,
             )
             for omega, e in zip(self._omegas, self.dense, strict=True)
         ]

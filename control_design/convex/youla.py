@@ -33,13 +33,13 @@ from control_design.convex.minimax import (
     smallest_ratio,
     turning,
 )
-from control_design.convex.orthonormal_basis import basis_response
 from control_design.convex.youla_basis import (
     AffineLoop,
     Factors,
     chosen_poles,
     coprime_factors,
     stable_loop,
+    with_constant,
 )
 from control_design.convex.youla_hull import hull_bound
 from control_design.plants.ellipses import Complex, Real
@@ -47,6 +47,7 @@ from control_design.plants.frequency_grid import GridOptions
 from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
+from ident.basis.poles import Poles
 
 Region = Literal["inscribed", "ellipse", "enclosing"]
 
@@ -193,7 +194,7 @@ class BracketProblem:
             self._hull(inscribed_grid=grid_value, ellipse=ellipse) if self.options.hull and exact else None,
         )
 
-    def _poles(self, share: int) -> Complex:
+    def _poles(self, share: int) -> Poles:
         """Poles of the basis, or of one with a share of them."""
         real, pairs = self.options.real_poles // share, self.options.pairs_per_mode // share
         return chosen_poles(self.plant, self.grids.scale_rad_s, max(2, real), max(1, pairs))
@@ -265,8 +266,8 @@ class BracketProblem:
             return stable_loop(data.ellipses.centre * data.delay)
         return self.factors.loop(data.ellipses.omega_rad_s)
 
-    def _basis(self, data: PlantData, poles: Complex) -> Complex:
-        return basis_response(poles, data.ellipses.omega_rad_s, self.plant.dt_s)
+    def _basis(self, data: PlantData, poles: Poles) -> Complex:
+        return with_constant(poles, data.ellipses.omega_rad_s, self.plant.dt_s)
 
     def _rows(self, data: PlantData, region: Region, angles: Real | None = None) -> PlaneRows:
         """Rows of one region on a grid, in the plane of Q = basis x."""

@@ -10,9 +10,17 @@ import scipy.linalg
 
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant, frequency_response, modes_of
+from ident.basis.functions import basis_response
+from ident.basis.poles import Poles
 
 
-def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Complex:
+def with_constant(poles: Poles, omega_rad_s: Real, dt_s: float) -> Complex:
+    """Constant and orthonormal functions with the given poles at z = e^{j omega dt}: (F, 1 + functions)."""
+    z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * dt_s)
+    return np.hstack([np.ones((z.size, 1), np.complex128), basis_response(poles, z)])
+
+
+def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Poles:
     """Poles that reach everywhere the answer may need them.
 
     Real ones spread logarithmically from the slowest corner of the plant to the Nyquist frequency; pairs at
@@ -23,15 +31,15 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pai
     decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt
     slow = decay[(decay > 1e-3 * scale_rad_s)]
     lowest = min(float(np.min(slow, initial=np.inf)), 0.02 * scale_rad_s)
-    poles = [np.exp(-dt * np.geomspace(lowest, 0.95 * plant.nyquist_rad_s, real_poles)).astype(complex)]
+    real, found = np.exp(-dt * np.geomspace(lowest, 0.95 * plant.nyquist_rad_s, real_poles)), []
     resonances = [*plant.modes, *modes_of(plant.zeros, dt)]
     resonances = [each for each in resonances if each.omega_rad_s < plant.nyquist_rad_s]
     count = max(2, min(pairs, 3 * pairs // max(len(resonances), 1)))
     for each in resonances:
         least = np.clip(1.3 * abs(each.zeta), 0.005, 0.3)
         zeta = np.geomspace(least, 0.7, count)
-        poles.append(np.exp(dt * each.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
-    return np.concatenate(poles)
+        found.append(np.exp(dt * each.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+    return Poles(real, np.concatenate(found) if found else np.zeros(0, complex))
 
 
 @dataclass(frozen=True, eq=False)

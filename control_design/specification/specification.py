@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -35,6 +35,8 @@ from control_design.specification.requirement import (
     tustin_zeros,
 )
 
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
 
 class SpecificationError(ValueError):
     """The specification contradicts itself or the plant; no controller of any order can meet it."""
@@ -45,10 +47,8 @@ class Specification(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    bandwidth_rad_s: float | None = Field(
+    bandwidth_rad_s: _Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="|S| stays below -3 dB up to here, rad/s; none = no tracking requirement (pure damping)",
     )
     integrator: bool = Field(default=False, description="the controller has a pole at z = 1")
@@ -61,20 +61,16 @@ class Specification(BaseModel):
     modulus_margin: float = Field(
         default=0.5, gt=0, lt=1, description="smallest distance of the loop from -1 (1/max|S|)"
     )
-    effort_limit: float | None = Field(
+    effort_limit: _Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="largest |K S|, input unit per measured unit; none = not limited",
     )
-    effort_rolloff_rad_s: float | None = Field(
+    effort_rolloff_rad_s: _Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="above it the limit on |K S| falls with 1/frequency",
     )
-    delay_margin_s: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False, description="extra loop delay that must not destabilise, s"
+    delay_margin_s: _Positive | None = Field(
+        default=None, description="extra loop delay that must not destabilise, s"
     )
     mode_peak_ratio: float | None = Field(
         default=None,
@@ -93,16 +89,12 @@ class Specification(BaseModel):
         default=None,
         description="band of the damping requirement; none = a factor 1.5 either side of the lowest mode",
     )
-    input_limit: float | None = Field(
+    input_limit: _Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="saturation of the command (both signs), input unit",
     )
-    rate_limit: float | None = Field(
+    rate_limit: _Positive | None = Field(
         default=None,
-        gt=0,
-        allow_inf_nan=False,
         description="largest change of the command, input unit per second",
     )
     controller_order: int = Field(default=4, ge=1, le=16, description="number of controller states")

@@ -42,13 +42,8 @@ class StartMaker:
         controller_damping: float | None,
         keeps_sign: bool,
     ) -> None:
-        self.cascade, self.data, self.integrators, self.score, self.rng = (
-            cascade,
-            data,
-            integrators,
-            score,
-            rng,
-        )
+        self.cascade, self.data, self.integrators = cascade, data, integrators
+        self.score, self.rng = score, rng
         self.least_damping = controller_damping or 0.0
         self.keeps_sign = keeps_sign
 

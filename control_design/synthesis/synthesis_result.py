@@ -78,25 +78,16 @@ class SynthesisResult:
 
     def explain(self) -> str:
         """One line: met, or how far and which frequency and requirement block it."""
-        first = self.blocking[0] if self.blocking else None
+        said, where = str(self.outcome.value), ""
+        if self.blocking:
+            first = self.blocking[0]
+            where = f"{first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} rad/s blocks"
         if self.outcome is Outcome.NOT_CONVERGED:
-            nearest = (
-                ""
-                if first is None
-                else f"; where it came nearest, {first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} "
-                "rad/s blocks"
-            )
-            return f"{self.outcome.value}{nearest}"
-        where = (
-            ""
-            if first is None
-            else f"; {first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} rad/s blocks"
-        )
-        if self.outcome is Outcome.MET_ON_GRID:
-            return f"{self.outcome.value} (gamma {self.gamma:.4g}{where} more)"
-        return (
-            f"{self.outcome.value} (gamma {self.gamma:.4g}, {100 * (self.gamma - 1):.3g} % too much{where})"
-        )
+            return said + (f"; where it came nearest, {where}" if where else "")
+        met = self.outcome is Outcome.MET_ON_GRID
+        share = "" if met else f", {100 * (self.gamma - 1):.3g} % too much"
+        blocks = f"; {where}{' more' if met else ''}" if where else ""
+        return f"{said} (gamma {self.gamma:.4g}{share}{blocks})"
 
     def controller_or_raise(self) -> Controller:
         """The controller if the specification is met on the grid.

@@ -6,7 +6,6 @@ import control
 import numpy as np
 import pytest
 
-from control_design.convex.orthonormal_basis import basis_response, basis_state_space
 from control_design.convex.youla import YoulaOptions, youla_bracket
 from control_design.convex.youla_basis import coprime_factors
 from control_design.plants.plant_set import UncertainPlant
@@ -29,18 +28,6 @@ def _spec(**changes):
 
 def _plant(numerator, denominator, **more):
     return UncertainPlant("small", control.ss(control.tf(numerator, denominator, _DT_S)), **more)
-
-
-def test_basis_is_orthonormal_on_the_circle():
-    poles = np.array([0.9, 0.5, 0.8 + 0.3j, 0.9, -0.2 + 0.6j])
-    omega = 2 * np.pi * np.arange(4096) / 4096 / _DT_S
-    values = basis_response(poles, omega, _DT_S)
-    np.testing.assert_allclose(values.conj().T @ values / 4096, np.eye(8), atol=1e-9)
-    a, b = basis_state_space(poles)
-    np.testing.assert_allclose(a @ a.T + b @ b.T, np.eye(7), atol=1e-12)
-    z = np.exp(1j * omega[5:2000:400] * _DT_S)
-    states = np.array([np.linalg.solve(value * np.eye(7) - a, b)[:, 0] for value in z])
-    np.testing.assert_allclose(states, values[5:2000:400, 1:], atol=1e-10)
 
 
 @pytest.mark.parametrize("integrators", [1, 2])
