@@ -252,7 +252,7 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
             f"{proof.proved!s:>6}  {spent:9.2f}  {unstable:3d} of {SAMPLED}"
         )
         if not proof.proved:
-            out(f"       {proof.reason}")
+            out(f"       {proof.obstacle.value}")
         if result.outcome is Outcome.NOT_MET:
             counts["silent"] += not result.blocking
             out(f"       {result.explain()}")

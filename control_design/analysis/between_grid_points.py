@@ -13,7 +13,8 @@ The quotient is then largest at an end, and the remainders are added there. Ever
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -43,36 +44,44 @@ _PARTS = 3  # an interval that is not good enough is cut in so many
 _MODEL_ERROR = 1e-6  # largest relative disagreement of zeros and poles with the state space
 
 
+class Obstacle(Enum):
+    """Why nothing was proved for all frequencies; `AllFrequencies.obstacle_at` is the number in brackets."""
+
+    OWN_FREQUENCIES = "the uncertainty is known on its own frequencies only"
+    OWN_PERFORMANCE_FREQUENCIES = "the performance channel is known on its own frequencies only"
+    NO_DERIVATIVES = "the uncertainty does not say how it changes between frequencies"
+    INEXACT = "zeros, poles and generators miss responses and ellipses (relative difference)"
+    NOT_STABLE = "the loop is not robustly stable on the dense grid"
+    NO_DISTANCE = "no positive distance from -1 could be shown at one frequency (rad/s)"
+    WINDING = "1 + K c does not wind as a stable loop's"
+
+
 @dataclass(frozen=True)
 class AllFrequencies:
     """What was proved for every frequency from 0 to Nyquist, ends included, on one plant.
 
-    possible: the uncertainty can be bounded between frequencies. proved: no ellipse reaches -1 anywhere and
-    the winding of 1 + K c is the one of a stable loop. bounds: upper bound of each weighted worst case (inf:
-    none found), gamma the largest of them. distance: lower bound of dist(-1, K E). half_turns: of 1 + K c
-    from 0+ to Nyquist, in units of pi, exact by the intervals (0 without a proof). reason: why nothing was
-    proved, or "".
+    obstacle: why nothing was proved; None: no ellipse reaches -1 anywhere and the winding of 1 + K c is the
+    one of a stable loop. bounds: upper bound of each weighted worst case (inf: none found), gamma the largest
+    of them. distance: lower bound of dist(-1, K E). half_turns: of 1 + K c from 0+ to Nyquist, in units of
+    pi, exact by the intervals (0 without a proof).
     """
 
-    possible: bool
-    proved: bool
-    gamma: float
-    bounds: dict[str, float]
-    distance: float
-    half_turns: float
-    intervals: int
-    reason: str
+    obstacle: Obstacle | None
+    obstacle_at: float | None = None
+    gamma: float = np.inf
+    bounds: dict[str, float] = field(default_factory=dict)
+    distance: float = 0.0
+    half_turns: float = 0.0
+    intervals: int = 0
 
-    @classmethod
-    def nothing(cls, reason: str) -> AllFrequencies:
-        """No proof."""
-        none = float("inf")
-        return cls(False, False, none, {}, 0.0, 0.0, 0, reason)
+    @property
+    def proved(self) -> bool:
+        return self.obstacle is None
 
-    @classmethod
-    def refuted(cls, reason: str) -> AllFrequencies:
-        """The dense check alone already says no."""
-        return replace(cls.nothing(reason), possible=True)
+    @property
+    def possible(self) -> bool:
+        """Whether the uncertainty can be bounded between frequencies."""
+        return self.obstacle in (None, Obstacle.NOT_STABLE, Obstacle.NO_DISTANCE, Obstacle.WINDING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,18 +309,15 @@ def bound_all_frequencies(
     own -= plant.n_integrators
     members = expandable(plant.channel, plant.n_integrators, between_own_points)
     if members is None:
-        return AllFrequencies.nothing(
-            "the uncertainty is known on its own frequencies only"
-            if plant.own_grid is not None
-            else "the uncertainty does not say how it changes between frequencies"
-        )
+        known = plant.own_grid is not None
+        return AllFrequencies(Obstacle.OWN_FREQUENCIES if known else Obstacle.NO_DERIVATIVES)
     asked: list[_Asked] = []
     for requirement in specification.weighted(plant):
         channel = None
         if requirement.channel is not None:
             channel = expandable(requirement.channel, 0, between_own_points)
             if channel is None:
-                return AllFrequencies.nothing("the performance channel is known on its own frequencies only")
+                return AllFrequencies(Obstacle.OWN_PERFORMANCE_FREQUENCIES)
         asked.append(
             _Asked(requirement, RationalResponse.from_weight(requirement.weight, plant.dt_s), channel)
         )
@@ -333,9 +339,7 @@ def bound_all_frequencies(
     )
     difference = _model_error(loop, controller, edges[1:])
     if difference > _MODEL_ERROR:
-        return AllFrequencies.nothing(
-            f"zeros, poles and generators reproduce responses and ellipses only to {difference:.1e}"
-        )
+        return AllFrequencies(Obstacle.INEXACT, difference)
     targets = {}
     for each in loop.asked:
         most = worst.peak(each.requirement.name)[0]
@@ -424,16 +428,7 @@ def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -
     distance = float(np.min(distances))
     if distance <= 0:
         omega = float(centre[order][np.argmin(distances)])
-        return AllFrequencies(
-            True,
-            False,
-            float("inf"),
-            bounds,
-            0.0,
-            0.0,
-            used,
-            f"no positive distance from -1 could be shown at {omega:.6g} rad/s",
-        )
+        return AllFrequencies(Obstacle.NO_DISTANCE, omega, bounds=bounds, intervals=used)
     # Within an interval 1 + L stays in a half-plane, so the principal value of the turn from its start to its
     # end is the turn; at a joint the two estimates of one value differ by less than a quarter turn each.
     turn = float(np.sum(np.angle(end / start)) + np.sum(np.angle(start[1:] / end[:-1])))
@@ -441,8 +436,5 @@ def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -
     turn += float(np.angle(start[0] * np.sign(start[0].real)) - np.angle(end[-1] * np.sign(end[-1].real)))
     turns = float(np.round(turn / np.pi))
     half_turns = turns - integrators / 2.0 + 0.0  # no minus sign on zero
-    stable = turns == unstable + integrators
-    reason = (
-        "" if stable else f"1 + K c winds by {half_turns:g} half turns, not {unstable + integrators / 2:g}"
-    )
-    return AllFrequencies(True, stable, max(bounds.values()), bounds, distance, half_turns, used, reason)
+    obstacle = None if turns == unstable + integrators else Obstacle.WINDING
+    return AllFrequencies(obstacle, None, max(bounds.values()), bounds, distance, half_turns, used)

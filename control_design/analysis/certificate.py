@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from control_design.analysis.between_grid_points import AllFrequencies, bound_all_frequencies
+from control_design.analysis.between_grid_points import AllFrequencies, Obstacle, bound_all_frequencies
 from control_design.analysis.joint_coverage import JointCoverage, at_level
 from control_design.analysis.joint_coverage import joint_coverage as calibrate
 from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
@@ -21,15 +21,13 @@ from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from control_design.specification.requirement import Findings, SpecificationItem
 
-_NOT_LOOKED_AT = AllFrequencies.nothing("not looked at")
-
 
 @dataclass(frozen=True)
 class PlantVerdict:
     """Everything checked on one plant.
 
     closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted
-    value over the ellipses (<= 1 met, 0 = not asked), frequency of the largest. bandwidth_rad_s: up to here
+    value over the ellipses (<= 1 met, 0 = not asked). bandwidth_rad_s: up to here
     every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
     uncertainty is known everywhere; assumed_linear: between its points the response was assumed on a straight
     line between members. stated: an uncertainty was given at all. own_performance: the damping requirement
@@ -46,16 +44,14 @@ class PlantVerdict:
     worst_margins: Margins
     worst_margin_omega_rad_s: float
     worst_weighted: float
-    worst_weighted_kind: str
-    worst_weighted_omega_rad_s: float
     worst_peak_sensitivity: float
     bandwidth_rad_s: float
     frequencies: int
-    own_grid_rad_s: tuple[float, float] | None = None
-    assumed_linear: bool = False
-    stated: bool = True
-    own_performance: bool = False
-    all_frequencies: AllFrequencies = _NOT_LOOKED_AT
+    own_grid_rad_s: tuple[float, float] | None
+    assumed_linear: bool
+    stated: bool
+    own_performance: bool
+    all_frequencies: AllFrequencies
 
 
 @dataclass(frozen=True)
@@ -197,8 +193,7 @@ def _check_plant(
     margins = ellipse_margins(worst.loop_factor, worst.ellipses, distance).worse(nominal)
     at = int(np.argmin(distance))
     peaks = {name: worst.peak(name) for name in worst.names}
-    kind = max(peaks, key=lambda name: peaks[name][0])
-    weighted, where = peaks[kind]
+    weighted = max(peak for peak, _ in peaks.values())
     stable = bool(radius < 1.0)
     below = np.flatnonzero(distance < np.sqrt(2.0))
     bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
@@ -213,7 +208,7 @@ def _check_plant(
             between_own_points=between_own_points,
         )
     else:
-        proof = AllFrequencies.refuted("the loop is not robustly stable on the dense grid")
+        proof = AllFrequencies(Obstacle.NOT_STABLE)
     verdict = PlantVerdict(
         plant=plant.name,
         stable=stable,
@@ -224,8 +219,6 @@ def _check_plant(
         worst_margins=margins,
         worst_margin_omega_rad_s=float(worst.omega_rad_s[at]),
         worst_weighted=weighted if margins.modulus > 0 else float("inf"),
-        worst_weighted_kind=kind,
-        worst_weighted_omega_rad_s=where,
         worst_peak_sensitivity=1.0 / margins.modulus if margins.modulus > 0 else float("inf"),
         bandwidth_rad_s=bandwidth,
         frequencies=int(worst.omega_rad_s.size),

@@ -47,7 +47,6 @@ from control_design.plants.frequency_grid import GridOptions
 from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
-from ident.basis.poles import Poles
 
 Region = Literal["inscribed", "ellipse", "enclosing"]
 
@@ -77,8 +76,7 @@ class PlantBracket:
     stable.
 
     inscribed_grid: value of the inscribed problem on the programme's own grid, a lower bound within the basis
-    however coarse the grid. coarse_enclosing: the enclosing value with about half the basis; close to
-    `enclosing` means that the basis is large enough. exact_centre: the parametrisation is about the ellipses'
+    however coarse the grid. exact_centre: the parametrisation is about the ellipses'
     centres themselves (stable plants, or centre = nominal); otherwise `inscribed` is a local optimum too.
     hull: the tighter lower bound of `youla_hull`, None if not asked for or without exact_centre.
     """
@@ -88,7 +86,6 @@ class PlantBracket:
     ellipse: float
     enclosing: float
     inscribed_grid: float
-    coarse_enclosing: float
     functions: int
     exact_centre: bool
     hull: float | None = None
@@ -166,10 +163,10 @@ class BracketProblem:
         self.factors: Factors | None = None
         if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
             self.factors = coprime_factors(delayed(plant.nominal, specification.computational_delay_samples))
-        self.poles = self._poles(1)
+        self.poles = chosen_poles(plant, self.grids.scale_rad_s, options.real_poles, options.pairs_per_mode)
         self.dense = self.grids.dense[0]
         self.dense_loop = self._loop(self.dense)
-        self.dense_basis = self._basis(self.dense, self.poles)
+        self.dense_basis = self._basis(self.dense)
 
     def solve(self) -> PlantBracket:
         enclosing, _, x = self._exchanged("enclosing", None)
@@ -177,8 +174,6 @@ class BracketProblem:
         # inscribed.
         inscribed, grid_value, x_inscribed = self._exchanged("inscribed", None)
         ellipse, _, _ = self._exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
-        lean = self.grids.lean()[0]  # with all frequencies that the exchange has added
-        half = smallest_ratio(self._basis(lean, self._poles(2)), self._rows(lean, "enclosing"))
         offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
         exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
         ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
@@ -188,22 +183,16 @@ class BracketProblem:
             ellipse,
             enclosing,
             grid_value,
-            half.gamma,
             int(self.dense_basis.shape[1]),
             exact,
             self._hull(inscribed_grid=grid_value, ellipse=ellipse) if self.options.hull and exact else None,
         )
 
-    def _poles(self, share: int) -> Poles:
-        """Poles of the basis, or of one with a share of them."""
-        real, pairs = self.options.real_poles // share, self.options.pairs_per_mode // share
-        return chosen_poles(self.plant, self.grids.scale_rad_s, max(2, real), max(1, pairs))
-
     def _hull(self, *, inscribed_grid: float, ellipse: float) -> float:
         if not np.isfinite(ellipse):
             return inscribed_grid
         lean = self.grids.lean()[0]
-        return hull_bound(lean, self._loop(lean), self._basis(lean, self.poles), inscribed_grid, ellipse)
+        return hull_bound(lean, self._loop(lean), self._basis(lean), inscribed_grid, ellipse)
 
     def other_ellipse_values(self, shares: Sequence[float]) -> list[float]:
         """Ellipse values from other starts: a share of the inscribed answer, the rest of the enclosing one.
@@ -234,13 +223,13 @@ class BracketProblem:
         return found.worst, found.gamma, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
     def _disc(self, data: PlantData, region: Region, start: Real | None) -> MinimaxPoint:
-        basis = self._basis(data, self.poles)
+        basis = self._basis(data)
         if start is not None and not np.min(self._rows(data, region).denominator(plane(basis @ start))) > 0:
             start = None
         return smallest_ratio(basis, self._rows(data, region), start)
 
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
-        basis = self._basis(data, self.poles)
+        basis = self._basis(data)
         loop = self._loop(data)
         point: MinimaxPoint | None = None
         for _ in range(self.options.ellipse_rounds):
@@ -266,8 +255,8 @@ class BracketProblem:
             return stable_loop(data.ellipses.centre * data.delay)
         return self.factors.loop(data.ellipses.omega_rad_s)
 
-    def _basis(self, data: PlantData, poles: Poles) -> Complex:
-        return with_constant(poles, data.ellipses.omega_rad_s, self.plant.dt_s)
+    def _basis(self, data: PlantData) -> Complex:
+        return with_constant(self.poles, data.ellipses.omega_rad_s, self.plant.dt_s)
 
     def _rows(self, data: PlantData, region: Region, angles: Real | None = None) -> PlaneRows:
         """Rows of one region on a grid, in the plane of Q = basis x."""

@@ -85,12 +85,10 @@ def different_responses(responses: Complex, most: int) -> npt.NDArray[np.int64]:
 
 def sorted_by_plant(guards: Sequence[Guard]) -> list[tuple[int, Real, Complex]]:
     """Guards of one plant on one grid together: (number of the plant, omega (F,), responses (D, F))."""
-    together: list[tuple[int, Real, list[Complex]]] = []
+    together: dict[tuple[int, bytes], list[Guard]] = {}
     for guard in guards:
-        for number, omega, found in together:
-            if number == guard.plant and np.array_equal(omega, guard.omega_rad_s):
-                found.append(guard.response)
-                break
-        else:
-            together.append((guard.plant, guard.omega_rad_s, [guard.response]))
-    return [(number, omega, np.array(found)) for number, omega, found in together]
+        together.setdefault((guard.plant, guard.omega_rad_s.tobytes()), []).append(guard)
+    return [
+        (number, alike[0].omega_rad_s, np.array([guard.response for guard in alike]))
+        for (number, _), alike in together.items()
+    ]

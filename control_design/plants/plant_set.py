@@ -156,6 +156,8 @@ def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex
 
 def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
     """A SISO discrete system behind a delay of whole samples; the delay's states come after its own."""
+    if samples == 0:
+        return system
     a, b, c, d = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
     for _ in range(samples):
         n = a.shape[0]
@@ -303,9 +305,3 @@ class UncertainPlant:
     def at(self, omega_rad_s: Real) -> Ellipses:
         """Ellipses of input -> measured output at omega (F,)."""
         return self.channel.at(omega_rad_s)
-
-    def performance_at(self, omega_rad_s: Real) -> Ellipses | None:
-        """Ellipses of the performance channel at omega (F,), or None if it is the measured output itself."""
-        if self.performance is None:
-            return None
-        return self.performance.at(omega_rad_s)

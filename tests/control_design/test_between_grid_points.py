@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
+from control_design.analysis.between_grid_points import Obstacle
 from control_design.analysis.worst_case import worst_case
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import frequency_response
@@ -69,7 +70,7 @@ def test_link_is_bounded_for_all_frequencies_within_half_a_percent(scenario):
     )
     certificate = certify(controller, [plant], spec)
     proof = certificate.plants[0].all_frequencies
-    assert proof.proved, proof.reason
+    assert proof.proved, proof.obstacle
     # 200 times the first partition of about 500 intervals
     sampled = _sampled(controller, plant, spec, 100_000)
     for kind in ("tracking", "modulus", "effort"):
@@ -92,7 +93,7 @@ def test_integrating_loops_are_bounded_down_to_zero_frequency(integrators):
         spec = Specification(bandwidth_rad_s=0.3, effort_limit=4.0, modulus_margin=0.3)
     certificate = certify(controller, [plant], spec)
     proof = certificate.plants[0].all_frequencies
-    assert proof.proved, proof.reason
+    assert proof.proved, proof.obstacle
     assert proof.half_turns == 1.0
     sampled = _sampled(controller, plant, spec, 60_000)
     for kind in ("tracking", "modulus", "effort"):
@@ -144,7 +145,7 @@ def test_posterior_loops_never_exceed_their_bounds(seed):
     controller = Controller(raw.A, raw.B, size * raw.C, size * raw.D, _DT)
     spec = Specification(modulus_margin=0.2, effort_limit=10.0, bandwidth_rad_s=None)
     proof = certify(controller, [plant], spec, n_dense=1500).plants[0].all_frequencies
-    assert proof.proved, proof.reason
+    assert proof.proved, proof.obstacle
     sampled = _sampled(controller, plant, spec, 40_000)
     for kind in ("modulus", "effort"):
         assert sampled[kind] <= proof.bounds[kind] <= 1.005 * sampled[kind]
@@ -188,7 +189,8 @@ def test_a_resonance_the_grid_does_not_know_is_found_by_the_bounds():
     proof = certificate.plants[0].all_frequencies
     assert proof.possible
     assert not proof.proved
-    assert "33.3333" in proof.reason
+    assert proof.obstacle is Obstacle.NO_DISTANCE
+    assert proof.obstacle_at == pytest.approx(33.3333, abs=1e-3)
     assert not certificate.certified
 
 
@@ -203,12 +205,11 @@ def test_what_cannot_be_bounded_says_so_and_stands_on_the_grid():
     assert certificate.certified
     assert certificate.gamma_bound is None
     assert [v.all_frequencies.possible for v in certificate.plants] == [False, False]
-    reasons = [v.all_frequencies.reason for v in certificate.plants]
-    assert "does not say how it changes" in reasons[0]
-    assert "known on its own frequencies" in reasons[1]
+    found = [v.all_frequencies.obstacle for v in certificate.plants]
+    assert found == [Obstacle.NO_DERIVATIVES, Obstacle.OWN_FREQUENCIES]
     assumed = certify(controller, [measured], spec, between_own_points="linear")
     proof = assumed.plants[0].all_frequencies
-    assert proof.proved, proof.reason
+    assert proof.proved, proof.obstacle
     assert assumed.plants[0].assumed_linear
     assert assumed.gamma * (1 - 1e-12) <= proof.gamma
 
@@ -224,7 +225,9 @@ def test_generators_that_are_not_those_of_the_ellipses_are_refused():
     certificate = certify(_controller(0.0, 0.0, 0.0, 0.3), [plant], Specification(modulus_margin=0.3))
     proof = certificate.plants[0].all_frequencies
     assert not proof.possible
-    assert "reproduce responses and ellipses only to" in proof.reason
+    assert proof.obstacle is Obstacle.INEXACT
+    assert proof.obstacle_at is not None
+    assert proof.obstacle_at > 1e-3
 
 
 def test_exact_plants_are_bounded_and_unstable_loops_are_refuted():

@@ -340,7 +340,7 @@ def achievable(reached: float = 0.8) -> AchievablePerformance:
     """What a controller of any order reaches, made up."""
     return AchievablePerformance(
         YoulaBracket(
-            (PlantBracket("hub", reached - 0.002, reached, reached + 0.002, reached - 0.003, 0.81, 57, True),)
+            (PlantBracket("hub", reached - 0.002, reached, reached + 0.002, reached - 0.003, 57, True),)
         )
     )
 

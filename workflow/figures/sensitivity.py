@@ -54,7 +54,8 @@ def sensitivity_curves(
     |S|, which is an upper bound because the two ellipses are not independent.
     """
     omega = np.asarray(omega_rad_s, dtype=np.float64)
-    ellipses, performance = plant.at(omega), plant.performance_at(omega)
+    ellipses = plant.at(omega)
+    performance = None if plant.performance is None else plant.performance.at(omega)
     gain = controller.response(omega)
     nominal = 1 / np.abs(1 + gain * ellipses.centre)
     worst = 1 / np.maximum(distance_to_minus_one(gain, ellipses), 1e-300)
