@@ -97,11 +97,7 @@ class _Bounds:
     end: Complex
 
     def part(self, index: npt.NDArray[np.bool_]) -> _Bounds:
-        intervals = replace(
-            self.intervals,
-            centre=self.intervals.centre[index],
-            half_width=self.intervals.half_width[index],
-        )
+        intervals = self.intervals.part(index)
         upper = {kind: value[index] for kind, value in self.upper.items()}
         middle = {kind: value[index] for kind, value in self.middle.items()}
         return _Bounds(intervals, upper, middle, self.distance[index], self.start[index], self.end[index])
@@ -150,13 +146,11 @@ class _Loop:
             use = (intervals.centre - h < band[1]) & (intervals.centre + h > band[0])
             upper[name], middle[name] = np.zeros(h.size), np.zeros(h.size)
             if np.any(use):
-                within = replace(intervals, centre=intervals.centre[use], half_width=h[use])
                 below = {side: value[use] for side, value in ends.items()}
                 bound = self._with_member if each.requirement.of_member.of_plant else self._alone
-                upper[name][use], middle[name][use] = bound(each, within, below, at_middle[use])
-        reach = np.maximum(np.abs(clear.end(-1)), np.abs(clear.end(1))) + clear.remainder
+                upper[name][use], middle[name][use] = bound(each, intervals.part(use), below, at_middle[use])
         low = np.minimum(ends[-1], ends[1])
-        distance = np.where(low > 0, low / reach, 0.0)
+        distance = np.where(low > 0, low / clear.largest(), 0.0)
         return _Bounds(intervals, upper, middle, distance, loop.centre.end(-1), loop.centre.end(1))
 
     def _alone(
@@ -190,17 +184,12 @@ class _Loop:
         M <= M0 + e/(d d0) + M M0 |K - K0|.
         """
         own, i_plant = self.controller.integrators, self.plant.n_integrators
-        clear = intervals.cleared(own + i_plant)
         k = self.controller.delayed(self.specification.computational_delay_samples).expand(intervals)
         members = self.members.expand(intervals, 0)
         most = largest_disturbance_gain(k.value, _ellipses(intervals, members))
-        h = intervals.half_width
-        moved = np.abs(members.centre.slope) * h + members.remainder()
-        for group in members.groups:
-            moved = moved + np.sqrt(np.einsum("fq,fq->f", np.abs(group.slope), np.abs(group.slope))) * h
-        low = np.minimum(ends[-1], ends[1])
-        nearest = low / (np.maximum(np.abs(clear.end(-1)), np.abs(clear.end(1))) + clear.remainder)
-        turn = most * (np.abs(k.slope) * h + k.remainder)
+        moved = members.centre.change() + sum(group.change() for group in members.groups)
+        nearest = np.minimum(ends[-1], ends[1]) / intervals.cleared(own + i_plant).largest()
+        turn = most * k.change()
         good = (nearest > 0) & (turn < 1) & np.isfinite(most)
         with np.errstate(divide="ignore", invalid="ignore"):
             # d0 >= nearest as well: the middle belongs to the interval.
@@ -213,8 +202,7 @@ class _Loop:
 
 def _least(factor: FirstOrder) -> Real:
     """Lower bound of the modulus of (z - 1)^i over the intervals (0 where the linear part may vanish)."""
-    change = np.abs(factor.slope) * factor.half_width
-    return np.maximum(np.abs(factor.value) - change - factor.remainder, 0.0)
+    return np.maximum(np.abs(factor.value) - factor.change(), 0.0)
 
 
 def _quotient(numerator: FirstOrder, ends: dict[int, Real]) -> Real:
@@ -271,16 +259,8 @@ def _ellipses(intervals: Intervals, members: SetExpansion) -> Ellipses:
 
 def _farthest(members: SetExpansion, side: int) -> Real:
     """Largest modulus over the linear part of the set at one end of the intervals."""
-    ends = SetExpansion(
-        _at_end(members.centre, side), tuple(_at_end(group, side) for group in members.groups)
-    )
-    major, minor, direction = _axes(ends.gram())
-    return farthest_distance(ends.centre.value * np.conj(direction), major, minor)
-
-
-def _at_end(expansion: FirstOrder, side: int) -> FirstOrder:
-    value = expansion.end(side)
-    return FirstOrder(value, np.zeros_like(value), np.zeros(expansion.half_width.size), expansion.half_width)
+    major, minor, direction = _axes(members.gram(side))
+    return farthest_distance(members.centre.end(side) * np.conj(direction), major, minor)
 
 
 def bound_all_frequencies(

@@ -239,17 +239,14 @@ class _Sampled:
     def stable_of(self, responses: Responses, members: Complex) -> npt.NDArray[np.bool_]:
         """Whether 1 + K G winds as it must, (D,); on a ten times finer grid where a step is wide."""
         omega = self.unit.omega_rad_s
-        stable, wide = self._winds(members * (self.loop * self.data.delay))
+        required = {"integrators": self.integrators, "unstable_poles": self.unstable}
+        stable, wide = winds(members * (self.loop * self.data.delay), **required)
         if np.any(wide):
             share = np.linspace(0, 1, 11)[:-1]
             fine = np.append((omega[:-1, None] + np.diff(omega)[:, None] * share).ravel(), omega[-1])
             loop = self.controller.response(fine)
-            again, _ = self._winds(responses(fine)[wide] * loop)
-            stable[wide] = again
+            stable[wide], _ = winds(responses(fine)[wide] * loop, **required)
         return stable
-
-    def _winds(self, loop: Complex) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        return winds(loop, integrators=self.integrators, unstable_poles=self.unstable)
 
 
 def sampled_gamma(loop: _Sampled, rng: np.random.Generator, draws: int) -> SampledGamma:

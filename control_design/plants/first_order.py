@@ -7,9 +7,10 @@ the circle carries over to every rational response. Rounding of double precision
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Real
 
@@ -39,6 +40,10 @@ class Intervals:
         offset = np.angle(np.exp(1j * (np.angle(1.0 + root_minus_1) - self.centre * self.dt_s)))
         beyond = np.maximum(np.abs(offset) - self.half_width * self.dt_s, 0.0)
         return np.asarray(np.hypot(inward, 2.0 * np.sqrt(size) * np.sin(beyond / 2)), dtype=np.float64)
+
+    def part(self, index: npt.NDArray[np.bool_]) -> Intervals:
+        """Some of them."""
+        return replace(self, centre=self.centre[index], half_width=self.half_width[index])
 
     def constant(self, value: complex) -> FirstOrder:
         """A constant."""
@@ -118,6 +123,10 @@ class FirstOrder:
         """The linear part at the upper (side = 1) or lower (side = -1) end of the interval."""
         h = self.half_width if self.value.ndim == 1 else self.half_width[:, None]
         return np.asarray(self.value + side * h * self.slope, dtype=np.complex128)
+
+    def change(self) -> Real:
+        """Upper bound of the distance from the value at the middle, (F,)."""
+        return _norm(self.slope) * self.half_width + self.remainder
 
     def largest(self) -> Real:
         """Upper bound of the modulus over the interval, (F,). The modulus of a linear function is convex."""

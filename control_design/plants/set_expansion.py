@@ -46,12 +46,13 @@ class SetExpansion:
             self.centre.remainder + sum(group.remainder for group in self.groups), dtype=np.float64
         )
 
-    def gram(self) -> Real:
-        """Shape matrix P (F, 2, 2) at the centres: the ellipse e^T P^-1 e <= 1, which encloses the sum of
-        several groups."""
+    def gram(self, side: int = 0) -> Real:
+        """Shape matrix P (F, 2, 2) at the centres, or of the linear part at one end (side = +-1): the ellipse
+        e^T P^-1 e <= 1, which encloses the sum of several groups."""
         total = np.zeros((self.centre.value.size, 2, 2))
         for group in self.groups:
-            rows = np.stack([group.value.real, group.value.imag], axis=1)
+            value = group.end(side)
+            rows = np.stack([value.real, value.imag], axis=1)
             total += rows @ np.swapaxes(rows, 1, 2) * len(self.groups)
         return total
 
@@ -199,12 +200,9 @@ class OwnGridSet:
         c0, c1 = ellipses.centre[left], ellipses.centre[left + 1]
         between = clear.times(FirstOrder(c0 + share * (c1 - c0), (c1 - c0) / gap, none, h))
         alone = self.nominal.expand(intervals, cleared)
-        centre = FirstOrder(
-            np.where(inside, between.value, alone.value),
-            np.where(inside, between.slope, alone.slope),
-            np.where(inside, between.remainder, alone.remainder),
-            h,
-        )
+        pairs = ((getattr(between, name), getattr(alone, name)) for name in ("value", "slope", "remainder"))
+        value, slope, remainder = (np.where(inside, here, there) for here, there in pairs)
+        centre = FirstOrder(value, slope, remainder, h)
         axes = ellipses.direction[:, None] * np.stack(
             [ellipses.semi_major + 0j, 1j * ellipses.semi_minor], axis=1
         )
