@@ -60,7 +60,7 @@ class StartMaker:
                 continue
             gamma = self.score(parameters)
             if not np.isfinite(gamma):
-                parameters = self._with_gain(parameters, 0.4)
+                parameters = with_gain(self.cascade, parameters, 0.4)
                 gamma = self.score(parameters)
             if np.isfinite(gamma):
                 pool.append((parameters, gamma))
@@ -168,22 +168,19 @@ class StartMaker:
         stable."""
         crossover = 10 ** self.rng.uniform(-0.7, 0.0)
         parameters = self._random_sections()
-        parameters = self._with_gain(parameters, self._low_gain(parameters))
+        parameters = with_gain(self.cascade, parameters, self._low_gain(parameters))
         for _ in range(12):
             if self.integrators >= 2:
                 # Less gain does not stabilise two integrators: a lead around a slower and slower crossover
                 # does.
                 parameters = self._lead_sections(crossover)
                 gain = self._crossover_gain(parameters, crossover * self.cascade.scale_rad_s)
-                parameters = self._with_gain(parameters, gain)
+                parameters = with_gain(self.cascade, parameters, gain)
                 crossover *= 0.6
             if np.isfinite(self.score(parameters)):
                 break
-            parameters = self._with_gain(parameters, 0.5)
+            parameters = with_gain(self.cascade, parameters, 0.5)
         return parameters
-
-    def _with_gain(self, parameters: Real, factor: float) -> Real:
-        return with_gain(self.cascade, parameters, factor)
 
     def _random_sections(self) -> Real:
         """Sections with corners within a factor 5 of the scale, numerators near their denominators."""
