@@ -63,6 +63,11 @@ class Controller(Law):
                     f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
                 )
 
+    @classmethod
+    def proportional(cls, gain: float, dt_s: float, **settings: Any) -> Controller:
+        """u = gain e, without states; further settings as fields."""
+        return cls(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[gain]]), dt_s, **settings)
+
     def response(self, omega_rad_s: Real, *, with_delay: bool = True) -> Complex:
         """K(e^{j omega dt}), (F,), times z^-delay unless with_delay is False."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)

@@ -128,16 +128,8 @@ def _nothing_stable(
     reports: tuple[StartReport, ...],
 ) -> SynthesisResult:
     """No controller, and where the search came nearest to one: which requirement fails there."""
-    zero = np.zeros((1, 1))
-    nothing = Controller(
-        np.zeros((0, 0)),
-        np.zeros((0, 1)),
-        np.zeros((1, 0)),
-        zero,
-        problem.dt_s,
-        computational_delay_samples=problem.spec.computational_delay_samples,
-        name="none: no stable design found",
-    )
+    delay, name = problem.spec.computational_delay_samples, "none: no stable design found"
+    nothing = Controller.proportional(0.0, problem.dt_s, computational_delay_samples=delay, name=name)
     points = sum(grid.size for grid in problem.grids)
     blocking = () if nearest is None else what_destabilises(problem, cascade, nearest)
     if not blocking and edge is not None:

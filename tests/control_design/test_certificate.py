@@ -22,14 +22,7 @@ _DT = 0.005
 
 
 def _gain(value: float, delay: int = 1) -> Controller:
-    return Controller(
-        np.zeros((0, 0)),
-        np.zeros((0, 1)),
-        np.zeros((1, 0)),
-        [[value]],
-        _DT,
-        computational_delay_samples=delay,
-    )
+    return Controller.proportional(value, _DT, computational_delay_samples=delay)
 
 
 def _arm(relative_std: float = 0.02) -> UncertainPlant:

@@ -56,7 +56,7 @@ def test_hub_torque_reaches_the_second_input():
     g = hub_arm()
     two = control.ss(g.A, np.hstack([np.asarray(g.B), 2 * np.asarray(g.B)]), g.C, np.zeros((1, 2)), _DT)
     torque = np.sin(np.arange(200) * 0.1)
-    still = Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[0.0]], _DT)
+    still = Controller.proportional(0.0, _DT)
     got = simulate(still, LinearMachine(two), np.zeros(200), hub_torque_Nm=torque).measured
     np.testing.assert_allclose(got, control.forced_response(g, inputs=2 * torque).outputs, rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match="needs a second one"):
@@ -135,7 +135,7 @@ class _Noisy(LinearMachine):
         return super().measure() + self._std * self._rng.standard_normal(1)
 
 
-_GAIN = Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[3.0]], _DT)
+_GAIN = Controller.proportional(3.0, _DT)
 
 
 def _analytic_sensitivity(omega):

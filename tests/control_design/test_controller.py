@@ -76,7 +76,7 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
     for controller in (
         _random(np.random.default_rng(3), input_limit=5.0, rate_limit=100.0, name="hub"),
         _pi(),
-        Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[2.0]], _DT),
+        Controller.proportional(2.0, _DT),
     ):
         text = controller.to_json()
         copies = [Controller.from_json(text)]

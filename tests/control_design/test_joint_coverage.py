@@ -22,8 +22,7 @@ _DT = 0.005
 
 
 def _gain(value: float, delay: int = 1) -> Controller:
-    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
-    return Controller(*none, [[value]], _DT, computational_delay_samples=delay)
+    return Controller.proportional(value, _DT, computational_delay_samples=delay)
 
 
 def _lag_with_uncertain_gain(std: float) -> UncertainPlant:

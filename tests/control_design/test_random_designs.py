@@ -38,9 +38,8 @@ def test_state_space_of_a_draw_is_the_posteriors_response_inside_the_ellipses(se
 def test_sampled_plants_of_a_proved_loop_are_stable_and_of_a_bad_one_are_not():
     seed = 0
     plant, posterior, _ = random_case(seed)
-    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
     size = 1 / np.max(np.abs(posterior.centre(np.geomspace(0.1, 600, 2000))))
-    gentle, wild = (Controller(*none, [[share * size]], plant.dt_s) for share in (0.3, 100.0))
+    gentle, wild = (Controller.proportional(share * size, plant.dt_s) for share in (0.3, 100.0))
     certificate = certify(gentle, [plant], Specification(modulus_margin=0.2), n_dense=1500)
     assert certificate.plants[0].all_frequencies.proved
     assert unstable_samples(gentle, posterior, np.random.default_rng(1)) == 0

@@ -33,7 +33,7 @@ def test_an_identified_model_with_integrator_and_its_posterior_are_an_uncertain_
     ellipses = plant.at(omega)
     np.testing.assert_allclose(ellipses.centre, plant.channel.nominal_response(omega), rtol=1e-7)
     assert np.all(ellipses.semi_major > 0)
-    controller = Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[0.5]], dt)
+    controller = Controller.proportional(0.5, dt)
     certificate = certify(controller, [plant], Specification(), n_dense=1000)
     verdict = certificate.plants[0]
     assert verdict.nyquist.matches == verdict.stable
@@ -47,13 +47,12 @@ def test_the_arm_without_effects_answers_like_its_linear_model_and_saturates_wit
     hub = control.c2d(
         control.ss(model.A, np.asarray(model.B)[:, :1], np.asarray(model.C)[:1], 0), arm.dt_s, "zoh"
     )
-    fields = {"A": np.zeros((0, 0)), "B": np.zeros((0, 1)), "C": np.zeros((1, 0)), "D": [[10.0]]}
-    controller = Controller(**fields, dt_s=arm.dt_s)
+    controller = Controller.proportional(10.0, arm.dt_s)
     reference = np.full(400, 0.2)
     on_arm = simulate(controller, arm, reference)
     predicted = simulate(controller, LinearMachine(hub), reference)
     # Exact discretisation on both sides: rounding of 400 steps of signals of size 0.2.
     np.testing.assert_allclose(on_arm.measured, predicted.measured, rtol=0, atol=1e-10)
-    limited = simulate(Controller(**fields, dt_s=arm.dt_s, input_limit=1.0), arm, reference)
+    limited = simulate(Controller.proportional(10.0, arm.dt_s, input_limit=1.0), arm, reference)
     assert np.max(np.abs(limited.command)) == pytest.approx(1.0)
     assert step_metrics(limited).limited_fraction > 0
