@@ -111,3 +111,12 @@ def real_realisation(poles: Poles) -> tuple[RealArray, RealArray]:
         blocks.append(combination(complex(pole), *kautz_numerators(complex(pole))))
     T = scipy.linalg.block_diag(*blocks)
     return np.real(T @ A @ np.linalg.inv(T)), np.real(T @ B)
+
+
+def printed_functions(xi: ComplexArray, z: ComplexArray) -> ComplexArray:
+    """(5) as it stands at the points z (F,), one column a pole of xi (B,); complex for complex poles."""
+    columns, product = [], np.ones_like(z)
+    for pole in xi:
+        columns.append(np.sqrt(1 - abs(pole) ** 2) / (z - pole) * product)
+        product = product * (1 - np.conj(pole) * z) / (z - pole)
+    return np.column_stack(columns)

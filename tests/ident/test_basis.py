@@ -13,11 +13,12 @@ from ident.basis.functions import (
     all_pass_signal,
     basis_response,
     basis_state_space,
+    block_parameters,
     free_response,
     regressor,
 )
 from ident.basis.poles import Poles
-from tests.ident.paper_oracles import complex_realisation, real_realisation
+from tests.ident.paper_oracles import complex_realisation, printed_functions, real_realisation
 
 real_poles = st.lists(st.floats(-0.95, 0.95), max_size=3)
 pair_poles = st.lists(
@@ -26,6 +27,7 @@ pair_poles = st.lists(
 )
 poles_inside = st.builds(Poles, real_poles, pair_poles).filter(lambda poles: poles.order > 0)
 MIXED = Poles([0.5, 0.9, -0.3], [0.8 * np.exp(0.4j), 0.95 * np.exp(2.0j)])
+Z = np.exp(1j * np.linspace(0.1, 3, 7))
 CIRCLE = np.exp(2j * np.pi * np.arange(4096) / 4096)
 
 
@@ -39,9 +41,13 @@ def test_realisation_is_lossless(poles):
 
 @pytest.mark.parametrize("gamma", [0.99, 0.9999, 0.999999])
 def test_realisation_is_lossless_next_to_the_circle(gamma):
+    """Where inverting E of (24) loses digits."""
     poles = Poles([gamma, 1 - 1e-9], np.sqrt(gamma) * np.exp(1j * np.array([1e-3, 0.1, 3.0])))
     A, B, _, _ = basis_state_space(poles)
     assert np.linalg.norm(A @ A.T + B @ B.T - np.eye(poles.order)) <= 1e-14
+    np.testing.assert_allclose(block_parameters(poles)[2:, 0], gamma, rtol=1e-15)
+    away = np.exp(1j * np.array([0.3, 1.1, 2.0]))
+    assert np.abs(np.abs(all_pass_response(poles, away)) - 1).max() < 1e-13
 
 
 @settings(deadline=None)
@@ -63,12 +69,8 @@ def test_kernel_identity(poles):
 
 
 def test_real_poles_give_the_printed_formula():
-    x, z = np.array([0.5, -0.3, 0.9]), np.exp(1j * np.linspace(0.1, 3, 7))
-    product = np.ones_like(z)
-    for i, a in enumerate(x):
-        column = basis_response(Poles(x), z)[:, i]
-        np.testing.assert_allclose(column, np.sqrt(1 - a**2) / (z - a) * product, rtol=1e-12)
-        product = product * (1 - a * z) / (z - a)
+    x = np.array([0.5, -0.3, 0.9])
+    np.testing.assert_allclose(basis_response(Poles(x), Z), printed_functions(x, Z), rtol=1e-12)
 
 
 def test_fir_is_delay():
@@ -114,13 +116,8 @@ def test_paper_state_space_gives_the_same_basis():
 
 def test_paper_complex_states_are_the_printed_functions():
     A, B = complex_realisation(MIXED)
-    xi, z = MIXED.values, np.exp(1j * np.array([0.3, 1.1, 2.9]))
-    response = np.array([np.linalg.solve(value * np.eye(xi.size) - A, B)[:, 0] for value in z])
-    product = np.ones_like(z)
-    for i, pole in enumerate(xi):
-        expected = np.sqrt(1 - abs(pole) ** 2) / (z - pole) * product
-        np.testing.assert_allclose(response[:, i], expected, rtol=1e-10)
-        product = product * (1 - np.conj(pole) * z) / (z - pole)
+    response = np.array([np.linalg.solve(value * np.eye(MIXED.order) - A, B)[:, 0] for value in Z])
+    np.testing.assert_allclose(response, printed_functions(MIXED.values, Z), rtol=1e-10)
 
 
 def test_regressor_steps_the_state_space():

@@ -9,12 +9,11 @@ import pytest
 import scipy.signal
 
 from ident.basis.options import IdentOptions
-from ident.checks.input_checks import clipped_share, excitation_limit_rad_s
 from ident.finding import FindingKind
 from ident.fit.residual_colour import effective_samples
 from ident.identify import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
-from tests.ident.findings import kinds, only
+from tests.ident.findings import kinds
 from tests.ident.storage import same, stored_and_read
 
 OMEGA = np.geomspace(0.1, 600, 400)
@@ -245,41 +244,6 @@ def test_an_overdamped_pair_is_named():
     y = scipy.signal.lfilter([0, 1, 0.4], np.polymul([1, -0.95], [1, -0.6]), u) + 0.05 * rng.normal(size=1000)
     result = identify([as_record(u, y)], IdentOptions(n_real=0, n_pairs=1))
     assert FindingKind.OVERDAMPED_PAIR in kinds(result.warnings)
-
-
-def test_weak_excitation_is_named():
-    k = np.arange(4000) * 0.005
-    u = sum(np.sin(w * k + w) for w in (3.0, 7.0, 11.0, 17.0, 23.0))
-    assert 20 < excitation_limit_rad_s([as_record(u, u)]) < 60
-    rng = np.random.default_rng(0)
-    y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u) + 1e-3 * rng.normal(size=4000)
-    result = identify([as_record(u, y)], IdentOptions(n_real=1, n_pairs=0))
-    assert FindingKind.WEAK_INPUT in kinds(result.warnings)
-    exciting = identify([p1(0).record], IdentOptions(n_real=2, n_pairs=1))
-    assert FindingKind.WEAK_INPUT not in kinds(exciting.warnings)
-
-
-def test_clipped_samples_are_named():
-    rng = np.random.default_rng(0)
-    u = np.repeat(rng.normal(size=250), 4)
-    y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u)
-    limit = np.quantile(np.abs(y), 0.9)
-    result = identify([as_record(u, np.clip(y, -limit, limit))], IdentOptions(n_real=1, n_pairs=0))
-    warning = only(result.warnings, FindingKind.CLIPPED)
-    assert (warning["signal"], warning["name"]) == ("output", "y")
-
-
-def test_what_is_no_clipping():
-    k = np.arange(5000)
-    assert clipped_share(np.sign(np.sin(k))) == 0  # binary by design
-    assert clipped_share(np.round(50 * np.sin(0.01 * k))) == 0  # a slow sine in a converter's steps
-    assert clipped_share(np.random.default_rng(0).normal(size=5000)) == 0
-    assert clipped_share(np.clip(np.sin(0.01 * k), -0.9, 2)) == pytest.approx(0.144, abs=0.01)
-
-
-def test_few_samples_per_unknown_come_with_advice():
-    result = identify([p2(0, 80).record], IdentOptions(n_real=2, n_pairs=1))
-    assert FindingKind.FEW_SAMPLES in kinds(result.warnings)
 
 
 def test_effective_samples_of_white_and_coloured_noise():

@@ -54,6 +54,15 @@ def test_an_input_of_low_frequencies_is_named_with_its_limit():
     assert 50 < found["limit_rad_s"] < 150
 
 
+def test_a_sum_of_sines_ends_with_its_last_one():
+    k = np.arange(4000) * DT_S
+    u = sum(np.sin(w * k + w) for w in (3.0, 7.0, 11.0, 17.0, 23.0))
+    assert 20 < excitation_limit_rad_s([as_record(u, u)]) < 60
+    y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u) + 1e-3 * np.random.default_rng(0).normal(size=4000)
+    only(warnings_of(as_record(u, y), n_real=1, n_pairs=0), FindingKind.WEAK_INPUT)
+    assert FindingKind.WEAK_INPUT not in kinds(warnings_of(p1(0).record, n_real=2, n_pairs=1))
+
+
 def test_noise_on_the_measured_input_does_not_hide_that():
     rng = np.random.default_rng(0)
     low_pass = scipy.signal.butter(6, 60.0 / NYQUIST, output="sos")
@@ -105,6 +114,8 @@ def test_a_full_scale_converter_is_clipping():
     y = filtered(binary())
     counts = np.clip(np.round(600 * y / y.std() + 512), 0, 1023)  # ten bits
     assert clipped_share(counts) > 0.05
+    one_sided = np.clip(np.sin(0.01 * np.arange(5000)), -0.9, 2)
+    assert clipped_share(one_sided) == pytest.approx(0.144, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -118,8 +129,9 @@ def test_a_full_scale_converter_is_clipping():
         np.round(20 * scipy.signal.chirp(np.linspace(0, 20, 5000), 0.1, 20, 8.0)),
         np.concatenate([np.zeros(900), np.round(100 * (1 - np.cos(np.linspace(0, 6, 2000)))), np.zeros(900)]),
         np.random.default_rng(0).integers(-3, 4, 4000).astype(float),  # seven levels by design
+        np.random.default_rng(0).normal(size=5000),
     ],
-    ids=["binary", "measured", "counts", "amplifier", "sine", "chirp", "rest", "levels"],
+    ids=["binary", "measured", "counts", "amplifier", "sine", "chirp", "rest", "levels", "noise"],
 )
 def test_what_is_no_clipping(signal):
     assert clipped_share(signal) == 0
