@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.basis.functions import (
@@ -31,7 +31,6 @@ Z = np.exp(1j * np.linspace(0.1, 3, 7))
 CIRCLE = np.exp(2j * np.pi * np.arange(4096) / 4096)
 
 
-@settings(deadline=None)
 @given(poles_inside)
 def test_realisation_is_lossless(poles):
     A, B, C, D = basis_state_space(poles)
@@ -50,7 +49,6 @@ def test_realisation_is_lossless_next_to_the_circle(gamma):
     assert np.abs(np.abs(all_pass_response(poles, away)) - 1).max() < 1e-13
 
 
-@settings(deadline=None)
 @given(poles_inside)
 def test_basis_is_orthonormal_on_the_circle(poles):
     basis = basis_response(poles, CIRCLE)
@@ -58,7 +56,6 @@ def test_basis_is_orthonormal_on_the_circle(poles):
     np.testing.assert_allclose(basis.conj().T @ basis / CIRCLE.size, np.eye(poles.order), atol=1e-11)
 
 
-@settings(deadline=None)
 @given(poles_inside)
 def test_kernel_identity(poles):
     z1, z2 = np.array([1.3 * np.exp(0.2j), -1.1, 1.05j]), np.array([1.2, 1.5 * np.exp(1j), -1.01j])

@@ -1,4 +1,4 @@
-"""Bounds on real machines: predicted ellipses against measured repeats (skipped without the data)."""
+"""Measured arms: what identification gets out of them, and its ellipses against measured repeats."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 
+from ident.basis.functions import free_response
 from ident.basis.options import IdentOptions
 from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.closed_loop import check_feedback, two_stage
+from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited
+from ident.finding import FindingKind
 from ident.frequency_fit import identify_frf
 from ident.identify import identify
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors
@@ -22,23 +26,149 @@ HZ = 2 * np.pi
 COUNTS_PER_RAD = 1024 / (2 * np.pi)
 
 
-def sweeps(folder, output):
-    """Six swept sines: 50 counts three times, then 75 counts three times."""
-    records = []
-    for amplitude in (50, 75):
-        for repeat in (1, 2, 3):
-            path = folder / "slfr_krauss_2009" / f"swept_sine_amp{amplitude}_rep{repeat}.csv"
-            records.append(
-                Record.from_file(
-                    path, inputs=["v_drive_counts"], outputs=[output], time="t_s", references=["u_ref_rad"]
-                )
-            )
-    return records
+def percent(y, residual):
+    return 100 * (1 - np.linalg.norm(residual) / np.linalg.norm(y - y.mean()))
+
+
+@pytest.fixture(scope="module")
+def robot_arm(flexlink_data):
+    path = flexlink_data / "daisy_robot_arm" / "robot_arm.csv"
+    return Record.from_file(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
+
+
+def robot_arm_options(n_pairs):
+    """Pairs and a direct term; the record starts in mid-sweep. Three starts miss the best order 10."""
+    return IdentOptions(n_real=0, n_pairs=n_pairs, feedthrough=True, estimate_initial_state=True, starts=8)
+
+
+# Second half predicted with its own initial state, and run through from rest over both halves. Measured
+# 96.444/96.900/97.124/97.458 and 94.16/94.88/94.59/94.47 (benchmarks/daisy_arm.py). The second half is the
+# mirrored first half, so this is no independent validation.
+@pytest.mark.parametrize(("n_pairs", "reach"), [(2, 96.4), (3, 96.89), (4, 97.1), (5, 97.4)])
+def test_robot_arm_fitted_on_the_first_half_predicts_the_second(robot_arm, n_pairs, reach):
+    half = robot_arm.slice(512, 1024)
+    model = identify([robot_arm.slice(0, 512)], robot_arm_options(n_pairs)).model
+    y = half.output[:, 0]
+    residual = y - model.simulate(half.input[:, 0])
+    free = free_response(model.poles, 512)
+    residual = residual - free @ np.linalg.lstsq(free, residual, rcond=None)[0]
+    assert percent(y, residual) >= reach
+    through = robot_arm.output[:, 0] - model.simulate(robot_arm.input[:, 0])
+    assert percent(y, through[512:]) >= 94
+
+
+# One sweep goes down and one up within the first half: nothing is repeated between them. Measured 96.0/95.1
+# and 97.0/95.3.
+@pytest.mark.parametrize("n_pairs", [2, 3])
+def test_robot_arm_fitted_on_the_sweep_down_predicts_the_sweep_up_and_back(robot_arm, n_pairs):
+    down, up = robot_arm.slice(0, 256), robot_arm.slice(256, 512)
+    for part, fresh in ((down, up), (up, down)):
+        model = identify([part], robot_arm_options(n_pairs)).model
+        assert fit_on_fresh_data(model, fresh, estimate_offset=False).fit_percent > 94.5
+
+
+def test_robot_arm_known_at_every_second_line_is_known_between_them(robot_arm):
+    u, y = (np.fft.rfft(signal[:, 0])[1:] for signal in (robot_arm.input, robot_arm.output))
+    omega = 2 * np.pi * np.arange(1, u.size + 1) / robot_arm.n_samples
+    odd = np.abs(u[::2])
+    excited = 2 * np.flatnonzero(odd > 0.05 * odd.max())  # odd harmonics only
+    used, left = excited[::2], excited[1::2]
+    covariance = (1e-6 / np.abs(u[used]) ** 2)[:, None, None] * np.eye(2)
+    frf = FrequencyUncertainty(omega[used], y[used] / u[used], covariance, 1.0)
+    model = identify_frf(frf, IdentOptions(n_real=0, n_pairs=2, feedthrough=True)).model
+    error = y[left] - model.frequency_response(omega[left]) * u[left]
+    # Lines 0.0245 rad/sample apart, modes of half width 0.002 and 0.004. Measured 95.4 %.
+    assert 100 * (1 - np.linalg.norm(error) / np.linalg.norm(y[left])) > 94.5
+
+
+def test_robot_arm_needs_the_direct_term(robot_arm):
+    half = robot_arm.slice(0, 512)
+    fits = [
+        identify([half], IdentOptions(n_real=0, n_pairs=2, feedthrough=direct)).fit_percent[0]
+        for direct in (True, False)
+    ]
+    assert fits[0] > 97
+    assert fits[1] < fits[0] - 1
+
+
+@pytest.fixture(scope="module")
+def sweeps(flexlink_data):
+    folder = flexlink_data / "slfr_krauss_2009"
+    return [
+        Record.from_file(
+            folder / f"swept_sine_amp{amplitude}_rep{repeat}.csv",
+            ["v_drive_counts"],
+            ["theta_rad", "accel_counts"],
+            time="t_s",
+            references=["u_ref_rad"],
+        )
+        for amplitude in (50, 75)
+        for repeat in (1, 2, 3)
+    ]
+
+
+def empirical_response(sweeps, output):
+    """Cross spectra with the reference over cross spectra with the reference, all six sweeps: 0.05 Hz
+    apart."""
+    over, under = 0, 0
+    for record in sweeps:
+        r = record.reference[:, 0]
+        setting = {"fs": 500, "nperseg": 10000, "window": "boxcar"}
+        frequency, cross = scipy.signal.csd(r, record.siso("v_drive_counts", output).output[:, 0], **setting)
+        over = over + cross
+        under = under + scipy.signal.csd(r, record.input[:, 0], **setting)[1]
+    return frequency, over / under
+
+
+def channel(sweeps, output):
+    return [record.siso("v_drive_counts", output) for record in sweeps]
+
+
+def banded(sweeps, output, low_hz, high_hz):
+    return [
+        band_limited(record, 2 * np.pi * low_hz, 2 * np.pi * high_hz, skip_s=0.5)
+        for record in channel(sweeps, output)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("output", "low_hz", "error_in_bands"),
+    # Measured: theta 0.05, 0.05, 0.06; accel 0.07, 0.10, 0.05. Friction makes the low bands depend on
+    # amplitude.
+    [("theta_rad", 4.0, {(3.2, 8): 0.08, (8, 16): 0.08, (16, 17.3): 0.1}),
+     ("accel_counts", 1.5, {(2.3, 8): 0.12, (8, 16): 0.15, (17.3, 18.5): 0.1})],
+)  # fmt: skip
+def test_krauss_arm_has_its_two_modes_in_both_channels(sweeps, output, low_hz, error_in_bands):
+    options = IdentOptions(n_real=2, n_pairs=2, estimate_initial_state=False)
+    model = identify(banded(sweeps, output, low_hz, 30.0), options).model
+    hertz = np.sort(model.poles.omega_rad_s(0.002)) / 2 / np.pi
+    # The hub turns, held only by the motor: the first mode is pulled up from its clamped 2.5 Hz and damped.
+    assert 2.7 < hertz[0] < 3.3
+    assert hertz[1] == pytest.approx(17.9, abs=0.2)
+    frequency, response = empirical_response(sweeps, output)
+    for (low, high), limit in error_in_bands.items():
+        here = (frequency > low) & (frequency < high)
+        error = np.abs(model.frequency_response(2 * np.pi * frequency[here]) / response[here] - 1)
+        assert np.median(error) < limit
+
+
+def test_krauss_arm_warns_of_the_band_that_was_not_excited(sweeps):
+    options = IdentOptions(n_real=2, n_pairs=1, estimate_initial_state=False)
+    result = identify([sweeps[0].siso("v_drive_counts", "accel_counts")], options)
+    assert any(warning.kind is FindingKind.WEAK_INPUT for warning in result.warnings)
+
+
+def test_emps_time_stamps_jitter_within_the_tolerance(flexlink_data):
+    record = Record.from_file(
+        flexlink_data / "emps" / "emps_train.csv", ["force_N"], ["q_meas_m"], time="t_s"
+    )
+    assert record.dt_s == pytest.approx(1e-3, rel=1e-6)
+    assert record.n_samples == 24841
 
 
 @pytest.mark.slow
-def test_single_link_feedback_is_exact(flexlink_data):
-    check = check_feedback(sweeps(flexlink_data, "theta_rad"), tolerance=1e-3)
+def test_single_link_feedback_is_exact(sweeps):
+    check = check_feedback(channel(sweeps, "theta_rad"), tolerance=1e-3)
     assert check.exact
     assert check.reference_gain == pytest.approx(COUNTS_PER_RAD, rel=1e-5)
     assert check.feedback_gain == pytest.approx(COUNTS_PER_RAD, rel=1e-5)
@@ -54,10 +184,10 @@ CHANNELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("output", CHANNELS)
-def test_single_link_bounds_hold_the_record_left_out(flexlink_data, output):
-    channel = CHANNELS[output]
+def test_single_link_bounds_hold_the_record_left_out(sweeps, output):
+    setting = CHANNELS[output]
     options = IdentOptions(
-        integrators=channel["integrators"],
+        integrators=setting["integrators"],
         feedthrough=True,
         n_real=1,
         n_pairs=2,
@@ -66,7 +196,7 @@ def test_single_link_bounds_hold_the_record_left_out(flexlink_data, output):
         omega_max_rad_s=260.0,
     )
     bounds = EmbeddingOptions(fir_length=60, coloured_noise=True, max_ar_order=20)
-    records = sweeps(flexlink_data, output)
+    records = channel(sweeps, output)
     stage = two_stage([band_limited(r, 0.8 * HZ, 30 * HZ) for r in records], options, bounds)
     assert min(stage.fit_percent) > 94
 
@@ -79,7 +209,7 @@ def test_single_link_bounds_hold_the_record_left_out(flexlink_data, output):
 
     means = [mean(records[:3]), mean(records[3:])]
     weighted = [
-        band_limited(r, channel["low"] * HZ, 30 * HZ, filter_order=channel["filter_order"]) for r in means
+        band_limited(r, setting["low"] * HZ, 30 * HZ, filter_order=setting["filter_order"]) for r in means
     ]
     model = identify(weighted, options).model
     # Published clamped mode at 17.96 Hz; the hub channel sees it through a few encoder counts only.
@@ -108,14 +238,8 @@ def test_single_link_bounds_hold_the_record_left_out(flexlink_data, output):
 
 
 @pytest.mark.slow
-def test_robot_arm_fits_its_mirrored_half(flexlink_data):
-    whole = Record.from_file(
-        flexlink_data / "daisy_robot_arm" / "robot_arm.csv",
-        inputs=["u_reaction_torque"],
-        outputs=["y_acceleration"],
-        dt_s=1.0,
-    )
-    halves = [whole.slice(0, 512), whole.slice(512, 1024)]
+def test_robot_arm_fits_its_mirrored_half(robot_arm):
+    halves = [robot_arm.slice(0, 512), robot_arm.slice(512, 1024)]
     result = identify(halves[:1], IdentOptions(n_real=0, n_pairs=2, feedthrough=True))
     # ARX needs order 8 for 94.9 % here; 96.4 % measured with order 4.
     assert fit_on_fresh_data(result.model, halves[1]).fit_percent > 95.5

@@ -52,7 +52,7 @@ def ellipses(dt_s=0.005):
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(model=models())
 def test_round_trips_keep_every_bit(model):
     assert same(model, ModelFile.from_json(ModelFile(model).to_json()).model)

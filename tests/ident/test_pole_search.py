@@ -4,7 +4,7 @@ import typing
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.basis.coordinates import search_space
@@ -19,7 +19,6 @@ from tests.ident.benchmark_plants import as_record, p1, p2
 DIRECT = [name for name in typing.get_args(Algorithm) if "DIRECT" in name]
 
 
-@settings(deadline=None)  # the first example may compile
 @given(st.lists(st.floats(0, 1), min_size=6, max_size=6), st.sampled_from(["log", "raw"]))
 def test_points_of_the_cube_are_ordered_poles_inside_the_circle(unit, coordinates):
     space = search_space(2, 2, 1000, 0.005, IdentOptions(coordinates=coordinates))

@@ -2,13 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.basis.poles import Poles
 
 
-@settings(deadline=None)
 @given(
     omega=st.floats(0.01, 500),
     zeta=st.floats(1e-4, 0.97),
