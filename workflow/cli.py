@@ -7,7 +7,6 @@ result is not certified or misses its specification (the report is written all t
 from __future__ import annotations
 
 import inspect
-import json
 import os
 import shlex
 import sys
@@ -447,9 +446,9 @@ def _degree(text: str | None) -> int | str | None:
 
 def print_json(document: Mapping[str, Any]) -> None:
     """A document, and nothing else, on standard output."""
-    from workflow.engine.storage import strict_json
+    from workflow.engine.codec import plain_text
 
-    sys.stdout.write(json.dumps(strict_json(document), allow_nan=False, ensure_ascii=False, indent=1) + "\n")
+    sys.stdout.write(plain_text(document))
 
 
 def _leave(certified: bool, verdict: str) -> None:

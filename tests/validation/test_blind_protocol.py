@@ -20,7 +20,7 @@ from validation.blind.protocol import run_blind
 from validation.blind.rigs import TOLERANCES, draw_rig, draw_tolerances, rig_toml, stated
 from validation.blind.seal import COMMITMENT, close_seal, open_seal
 from validation.blind.truth import LISTED, UNLISTED
-from validation.blind.worker import BlindCase
+from validation.blind.worker import BlindCase, failed
 from workflow.engine.errors import InputError
 from workflow.engine.executor import LocalProcesses
 from workflow.engine.storage import read_json
@@ -260,8 +260,9 @@ def test_a_diagnosis_that_fails_counts_as_a_wrong_answer(tmp_path):
     folder = tmp_path / "case_0001"
     folder.mkdir()
     (folder / "case.toml").write_text("case = 3\n")
-    with LocalProcesses(1) as processes:
-        ((_, document),) = processes.run([BlindCase(folder, tmp_path / "sealed")])
+    with closing(LocalProcesses(1)) as processes:
+        ((_, failure),) = processes.run([BlindCase(folder, tmp_path / "sealed")])
+    document = failed("case_0001", failure.reason)
     assert document["verdict"] == "failed"
     assert "case.toml" in document["reason"]
 

@@ -7,6 +7,7 @@ import re
 import signal
 import time
 import tomllib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,9 +21,9 @@ from workflow.config.run_config import SimulatedSource
 from workflow.diagnose import command, outputs
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.command import diagnose_cases
-from workflow.diagnose.outputs import Options, files_of
+from workflow.diagnose.outputs import Work
 from workflow.engine.errors import InputError, StageError
-from workflow.engine.executor import LocalProcesses
+from workflow.engine.executor import LocalProcesses, attempt
 from workflow.figures.style import Picture
 from workflow.report import rendering
 
@@ -40,8 +41,8 @@ QUESTIONS = (
 
 def made(folder, engine, *, rig=None, controller=False):
     """Files of one case, computed here."""
-    options = Options(controller)
-    return files_of(load_case(folder, rig), options, "code", engine=engine, report=lambda f, m: None)
+    files, _ = Work(load_case(folder, rig), controller, "code", engine).run(lambda f, m: None)
+    return files
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +196,7 @@ def here(monkeypatch):
     class Here(LocalProcesses):
         def run(self, tasks, watch):
             for index, one in enumerate(tasks):
-                yield index, one.run(lambda f, m, index=index: watch(index, f, m))
+                yield index, attempt(partial(one.run, partial(watch, index)))
 
     monkeypatch.setattr(command, "LocalProcesses", Here)
     monkeypatch.setattr(outputs, "case_page", lambda content, report: "<html></html>\n")
@@ -336,7 +337,7 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
     found = diagnose_cases(cases, out, jobs=2, controller=False, engine=engine)
     assert found.exit_code == 1
     assert [document["case"] for document in found.documents] == ["two"]
-    assert "died" in found.failures[0].reason
+    assert "died" in found.failures[0][1].reason
 
 
 def _wait_for(path, process, seconds=300.0):

@@ -14,6 +14,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +31,14 @@ from validation.blind.seal import (
     private_directory,
     write_private,
 )
-from validation.blind.worker import BlindCase, diagnose_folder
+from validation.blind.worker import BlindCase, diagnose_folder, failed
+from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
-from workflow.engine.executor import LocalProcesses
+from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.storage import (
     read_json,
     sha256_of_file,
-    strict_json,
     write_bytes,
     write_json,
     write_text,
@@ -107,7 +108,7 @@ def run_blind(
     document = _scored(predictions, labels)
     document["commitment"] = read_json(out / COMMITMENT)["sha256"]
     document["settings"] = read_json(out / "blind.json")
-    write_text(out / "scores.json", json.dumps(strict_json(document), indent=1, allow_nan=False) + "\n")
+    write_text(out / "scores.json", plain_text(document))
     write_text(out / "scores.txt", text(document["diagnosis"], document))
     write_bytes(out / "confusion.png", confusion_figure(document["diagnosis"]))
     return summary(document, out)
@@ -177,8 +178,9 @@ def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, pro
     todo = [name for name in names if not (folder / f"{name}.json").is_file()]
     done = len(names) - len(todo)
     work = [BlindCase(out / "cases" / name, out.resolve(), diagnose) for name in todo]
-    with LocalProcesses(jobs, preload=["validation.blind.worker"]) as processes:
-        for index, document in processes.run(work):
+    with closing(LocalProcesses(jobs, preload=["validation.blind.worker"])) as processes:
+        for index, found in processes.run(work):
+            document = failed(todo[index], found.reason) if isinstance(found, Failure) else found
             write_json(folder / f"{todo[index]}.json", document)
             done += 1
             progress.update("diagnosis", done / len(names), f"{done} of {len(names)}")

@@ -6,7 +6,6 @@ the run with its sealed labels, nor start a process that could.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
@@ -20,8 +19,8 @@ from typing import Any
 from diagnosis.diagnosis import diagnose
 from validation.blind.baselines import baselines
 from workflow.diagnose.case_files import load_case
-from workflow.diagnose.document import document_of, json_text
-from workflow.engine.errors import one_line
+from workflow.diagnose.document import document_of
+from workflow.engine import codec
 from workflow.engine.executor import Report
 
 _PATH_EVENTS = (
@@ -64,7 +63,7 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
     document["cpu_s"] = time.process_time() - start
     document["baselines"] = baselines(loaded.case)
     document["baselines_cpu_s"] = time.process_time() - start - document["cpu_s"]
-    plain: dict[str, Any] = json.loads(json_text(document))
+    plain: dict[str, Any] = codec.plain(document)
     return plain
 
 
@@ -77,24 +76,16 @@ class BlindCase:
     diagnose: Callable[[Path], dict[str, Any]] = diagnose_folder
 
     def run(self, report: Report) -> dict[str, Any]:
-        """The answer; whatever goes wrong is one too, and counts as wrong."""
+        """The answer."""
         # Under a neutral path: not even the name of the run is in what is diagnosed.
         with tempfile.TemporaryDirectory() as room:
             copy = Path(room) / self.folder.name
             shutil.copytree(self.folder, copy)
             keep_out(self.sealed)
-            try:
-                return self.diagnose(copy)
-            except Exception as error:
-                return self.failed(f"{type(error).__name__}: {one_line(error)}")
+            return self.diagnose(copy)
 
-    def failed(self, reason: str) -> dict[str, Any]:
-        """An answer with the verdict "failed"."""
-        return {
-            "case": self.folder.name,
-            "verdict": "failed",
-            "effects": [],
-            "combination": [],
-            "gap_after": None,
-            "reason": reason,
-        }
+
+def failed(case: str, reason: str) -> dict[str, Any]:
+    """The answer of a case without one: it counts as wrong."""
+    nothing = {"effects": [], "combination": [], "gap_after": None}
+    return {"case": case, "verdict": "failed", **nothing, "reason": reason}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -26,6 +25,7 @@ from validation.paper.quotes import REPORTED
 from validation.paper.settings import PaperSettings
 from validation.paper.table import csv_text, rows_of
 from workflow.engine import storage
+from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import package_versions
@@ -107,8 +107,7 @@ def redraw_paper(
     for number, picture in pictures.items():
         storage.write_bytes(store.path / f"figure-{number}.{picture.kind}", picture.content)
     storage.write_text(store.path / TABLE_CSV, csv_text(rows))
-    text = json.dumps(storage.strict_json(document), allow_nan=False, ensure_ascii=False, indent=1)
-    storage.write_text(store.path / TABLE_JSON, f"{text}\n")
+    storage.write_text(store.path / TABLE_JSON, plain_text(document))
     storage.write_text(store.manifest_path, page)
     progress.finish("page", time.monotonic() - started, taken_up=False)
     return _summary(store.path, document)

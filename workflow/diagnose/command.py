@@ -12,11 +12,10 @@ from typing import Any
 
 from workflow.diagnose.case_files import LoadedCase, load_case, refuse_equal_names
 from workflow.diagnose.directory import DiagnosisDirectory, diagnosis_digest
-from workflow.diagnose.document import json_text
-from workflow.diagnose.outputs import Engine, Options, made_from
+from workflow.diagnose.outputs import Engine, Work
 from workflow.diagnose.overview import closure_words, overview_page, short_answer
-from workflow.diagnose.processes import Finished, Work
 from workflow.diagnose.words import parameter_words, probability_words, times_noise
+from workflow.engine import codec
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL,
@@ -26,35 +25,27 @@ from workflow.engine.errors import (
     StageError,
     one_line,
 )
-from workflow.engine.executor import LocalProcesses
+from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress, Silence
 from workflow.tasks.summary import Row, RunSummary, Section
 from workflow.text.formats import listing
 
+_Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A case without an answer."""
-
-    case: str
-    reason: str
-    bad_input: bool
 
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisRun:
-    """What a call left behind: the JSON answers in the order asked for, what failed, and the exit code."""
+    """What a call left behind: the JSON answers in the order asked for, cases without one, the exit code."""
 
     documents: tuple[Mapping[str, Any], ...]
-    failures: tuple[Failure, ...]
+    failures: tuple[_Failed, ...]
     summary: RunSummary
 
     @property
     def exit_code(self) -> int:
         """Internal error over bad input over a fit that did not converge over success."""
-        if any(not failure.bad_input for failure in self.failures):
+        if any(not failure.bad_input for _, failure in self.failures):
             return EXIT_INTERNAL
         if self.failures:
             return EXIT_BAD_INPUT
@@ -63,7 +54,7 @@ class DiagnosisRun:
 
     def complaints(self) -> list[str]:
         """One line for every case that failed or whose fit did not converge."""
-        lines = [f"{failure.case}: {one_line(failure.reason)}" for failure in self.failures]
+        lines = [f"{case}: {one_line(failure.reason)}" for case, failure in self.failures]
         return lines + [
             f"{document['case']}: the fit did not converge, no cause is named"
             for document in self.documents
@@ -73,7 +64,7 @@ class DiagnosisRun:
     def to_document(self) -> dict[str, Any]:
         return {
             "cases": list(self.documents),
-            "failed": [{"case": failure.case, "reason": failure.reason} for failure in self.failures],
+            "failed": [{"case": case, "reason": failure.reason} for case, failure in self.failures],
             "report": self.summary.report_path,
         }
 
@@ -105,104 +96,92 @@ def diagnose_cases(
             "--resume and --replace contradict each other: continue the diagnosis or start it afresh"
         )
     loaded, unreadable = _load(places, rig)
-    options, code = Options(controller), diagnosis_digest()
+    code = diagnosis_digest()
+    work = [Work(one, controller, code, engine or Engine()) for one in loaded]
     directory = DiagnosisDirectory.begin(
         out,
         inputs={one.case.name: one.input_sha256 for one in loaded},
-        options=options.document(),
+        options={"controller": controller},
         resume=resume,
         replace=replace,
     )
     with directory.locked():
-        documents, failures = _compute(
-            directory, loaded, options, code, engine or Engine(), jobs or os.cpu_count() or 1, progress
-        )
+        documents, failures = _compute(directory, work, jobs or os.cpu_count() or 1, progress)
         failures = [*unreadable, *failures]
         if len(places) == 1 and failures:
             directory.discard_if_empty()
-            raise (InputError if failures[0].bad_input else StageError)(failures[0].reason)
+            failure = failures[0][1]
+            raise (InputError if failure.bad_input else StageError)(failure.reason)
         page = out / f"{loaded[0].case.name}.html"
         if len(places) > 1:
             page = out / "index.html"
             progress.start("overview")
-            reasons = {failure.case: failure.reason for failure in failures}
+            reasons = {case: failure.reason for case, failure in failures}
             directory.write("index.html", overview_page(documents, reasons).encode())
             progress.finish("overview", 0.0, taken_up=False)
     return DiagnosisRun(tuple(documents), tuple(failures), _summary(documents, failures, page))
 
 
-def _load(places: Sequence[Path], rig: str | None) -> tuple[list[LoadedCase], list[Failure]]:
+def _load(places: Sequence[Path], rig: str | None) -> tuple[list[LoadedCase], list[_Failed]]:
     loaded, failures = [], []
     for place in places:
         try:
             loaded.append(load_case(place, rig))
         except InputError as error:
-            failures.append(Failure(place.resolve().name, str(error), bad_input=True))
+            failures.append((place.resolve().name, Failure(str(error), bad_input=True)))
     if not loaded:
         more = f" (and {len(failures) - 1} more cases cannot be read)" if len(failures) > 1 else ""
-        raise InputError(failures[0].reason + more)
+        raise InputError(failures[0][1].reason + more)
     refuse_equal_names([one.case.name for one in loaded])
     return loaded, failures
 
 
 def _compute(
-    directory: DiagnosisDirectory,
-    loaded: Sequence[LoadedCase],
-    options: Options,
-    code: str,
-    engine: Engine,
-    jobs: int,
-    progress: Progress,
-) -> tuple[list[dict[str, Any]], list[Failure]]:
-    answers: dict[str, dict[str, Any]] = {}
-    for one in loaded:
-        known = directory.finished(one.case.name, made_from(one, options, code))
-        if known is not None:
-            answers[one.case.name] = known
-    todo = [one for one in loaded if one.case.name not in answers]
+    directory: DiagnosisDirectory, work: Sequence[Work], jobs: int, progress: Progress
+) -> tuple[list[dict[str, Any]], list[_Failed]]:
+    order = [one.loaded.case.name for one in work]
+    there = {name: directory.finished(name, one.made_from) for name, one in zip(order, work, strict=True)}
+    answers = {name: known for name, known in there.items() if known is not None}
+    todo = {name: one for name, one in zip(order, work, strict=True) if name not in answers}
+    names, several = list(todo), len(work) > 1
     width = max(1, min(jobs, len(todo)))
-    several = len(loaded) > 1
     progress.plan(
         [("cases", _CASE_S * len(todo) / width), *((("overview", _OVERVIEW_S),) if several else ())]
     )
     progress.start("cases")
     started = time.monotonic()
-    shares = dict.fromkeys(range(len(todo)), 0.0)
+    shares = [0.0] * len(todo)
     timings = directory.timings()
-    failures: list[Failure] = []
+    failures: dict[str, Failure] = {}
 
     def watch(index: int, fraction: float, message: str) -> None:
         shares[index] = fraction
-        name = todo[index].case.name
-        done = len(loaded) - len(todo) + sum(share >= 1.0 for share in shares.values())
-        words = f"{done} of {len(loaded)} done, {name}: {message}" if several else message
-        progress.update("cases", sum(shares.values()) / len(todo), words)
+        done = len(answers) + len(failures)
+        words = f"{done} of {len(work)} done, {names[index]}: {message}" if several else message
+        progress.update("cases", sum(shares) / len(todo), words)
 
-    work = [Work(one, options, code, engine) for one in todo]
-    processes = LocalProcesses(width, preload=["workflow.diagnose.processes"])
-    for index, finished in processes.run(work, watch):
-        name = todo[index].case.name
-        if finished.failure is not None:
-            failures.append(Failure(name, finished.failure, finished.bad_input))
+    processes = LocalProcesses(width, preload=["workflow.diagnose.outputs"])
+    for index, found in processes.run(list(todo.values()), watch):
+        name = names[index]
+        if isinstance(found, Failure):
+            failures[name] = found
         else:
-            directory.save(name, finished.files)
-            answers[name] = json.loads(finished.files[f"{name}.json"])
-            timings[name] = _timing(finished)
-            directory.write("timings.json", json_text(timings).encode())
+            files, cpu_s = found
+            directory.save(name, files)
+            answers[name] = json.loads(files[f"{name}.json"])
+            timings[name] = {"cpu_s": round(cpu_s, 3)}
+            directory.write("timings.json", codec.plain_text(timings).encode())
         watch(index, 1.0, "done")
     progress.finish("cases", time.monotonic() - started, taken_up=not todo)
-    order = [one.case.name for one in loaded]
-    failures.sort(key=lambda failure: order.index(failure.case))
-    return [answers[name] for name in order if name in answers], failures
+    return (
+        [answers[name] for name in order if name in answers],
+        [(name, failures[name]) for name in order if name in failures],
+    )
 
 
-def _timing(finished: Finished) -> dict[str, float]:
-    return {"cpu_s": round(finished.cpu_s, 3)}
-
-
-def _summary(documents: Sequence[Mapping[str, Any]], failures: Sequence[Failure], page: Path) -> RunSummary:
+def _summary(documents: Sequence[Mapping[str, Any]], failures: Sequence[_Failed], page: Path) -> RunSummary:
     sections = [Section(str(document["case"]), tuple(_rows(document))) for document in documents]
-    sections += [Section(f.case, (Row("failed", one_line(f.reason)),)) for f in failures]
+    sections += [Section(case, (Row("failed", one_line(failure.reason)),)) for case, failure in failures]
     answers = len(documents)
     return RunSummary(
         title="Gap diagnosis",

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
-
-import numpy as np
 
 from diagnosis.diagnosis import Diagnosis
 from diagnosis.where.findings import Where
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck
 from workflow.diagnose.following import Following
-from workflow.engine import storage
+from workflow.engine import codec
 
 FORMAT = "flexlink-diagnosis-1"
 LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
@@ -36,18 +31,18 @@ def document_of(
     the main cause (they sum to one), `presence` of being there at all. gap_* are the pooled root mean square
     of (measured - model)/noise over the held-out experiments.
     """
-    return {
+    document = {
         "format": FORMAT,
         "case": loaded.case.name,
         "verdict": found.verdict,
         "detail_verdict": found.detail_verdict,
-        "effects": [asdict(effect) for effect in found.effects],
-        "combination": list(found.combination),
-        "ambiguous_with": list(found.ambiguous_with),
+        "effects": found.effects,
+        "combination": found.combination,
+        "ambiguous_with": found.ambiguous_with,
         "probability": found.probability,
-        "probabilities": dict(found.probabilities),
+        "probabilities": found.probabilities,
         "sets": [
-            {"effects": list(names), "probability": p}
+            {"effects": names, "probability": p}
             for names, p in sorted(found.sets.items(), key=lambda item: -item[1])
             if p >= LEAST_SHOWN
         ],
@@ -58,10 +53,10 @@ def document_of(
         "held_out_decided": found.held_out_decided,
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "gap_closed": found.gap_closed,
-        "gap_closed_interval": list(found.gap_closed_interval),
+        "gap_closed_interval": found.gap_closed_interval,
         "gap_by_experiment": found.gap_by_experiment,
         **_beside(where, remains, coming, check, no_check),
-        "deviations": dict(found.deviations),
+        "deviations": found.deviations,
         "repair": {
             "values": {
                 key: {"stated": loaded.case.rig.value(key), "repaired": found.rig.value(key)}
@@ -73,6 +68,8 @@ def document_of(
         "rig_file": loaded.rig_file,
         "simulations": found.simulations,
     }
+    plain: dict[str, Any] = codec.plain(document)
+    return plain
 
 
 def _beside(
@@ -83,27 +80,10 @@ def _beside(
     no_check: str,
 ) -> dict[str, Any]:
     """What was looked at besides the cause."""
-    document: dict[str, Any] = {}
-    for key, place in (("where", where), ("remains", remains)):
-        if place is not None:
-            document[key] = asdict(place)
+    places = {"where": where, "remains": remains}
+    document: dict[str, Any] = {key: place for key, place in places.items() if place is not None}
     if coming is not None:
-        proposal = {} if coming.proposal is None else asdict(coming.proposal)
-        document["next_experiment"] = {"advice": coming.advice, **proposal}
+        document["next_experiment"] = {"advice": coming.advice, **codec.plain(coming.proposal or {})}
     if check is not None or no_check:
         document["controller"] = {"skipped": no_check} if check is None else check.document()
     return document
-
-
-def json_text(document: Mapping[str, Any]) -> str:
-    """Strict JSON (nan and infinity as null); equal documents give equal bytes."""
-    plain = storage.strict_json(json.loads(json.dumps(document, default=_number)))
-    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} has no place in a JSON document")

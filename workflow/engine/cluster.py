@@ -10,18 +10,17 @@ import uuid
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from importlib import import_module
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from workflow.engine.errors import InputError, StageError, one_line
-from workflow.engine.executor import R, Task, Watch
+from workflow.engine.executor import Failure, R, Task, Watch, attempt
 
 CONNECT_S = 10.0
 WITHOUT_WORKERS_S = 60.0
-_LOST_S = 5.0  # how long a broken connection may stay so before the scheduler counts as lost
 _LOOK_S = 0.05
 _ASK_S = 2.0
 
@@ -29,11 +28,11 @@ _ASK_S = 2.0
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def run_on_worker(task: Task[R]) -> R:
+def run_on_worker(task: Task[R]) -> R | Failure:
     """One task at a time in each worker, one thread each."""
     with _ONE_AT_A_TIME, threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return task.run(lambda fraction, message: None)
+        return attempt(lambda: task.run(lambda fraction, message: None))
 
 
 async def _call(distributed: Any, address: str) -> None:
@@ -43,7 +42,7 @@ async def _call(distributed: Any, address: str) -> None:
 
 
 class DaskCluster:
-    """The workers behind a scheduler's address. Use as a context manager.
+    """The workers behind a scheduler's address. `close` hangs up.
 
     A worker that dies is the scheduler's business: its task goes to another one. A scheduler that dies ends
     the work with one line.
@@ -85,51 +84,39 @@ class DaskCluster:
         try:
             self._client.wait_for_workers(1, timeout=WITHOUT_WORKERS_S)
         except (TimeoutError, OSError) as error:
-            self.__exit__(None, None, None)
+            self.close()
             raise InputError(
                 f"--scheduler {address}: no worker within {WITHOUT_WORKERS_S:.0f} s; start one with "
                 f"`dask worker {address}`"
             ) from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
+    def close(self) -> None:
+        """Leave the cluster and its workers as they are."""
+        with suppress(OSError, TimeoutError, RuntimeError):  # gone already
             self._client.close(timeout=2)
-        except (OSError, TimeoutError, RuntimeError):
-            pass  # gone already
-        finally:
-            self._restore()
+        self._restore()
 
     @property
     def width(self) -> int:
         """How many tasks run at once, as far as is known."""
         return max(1, self._workers() or 1)
 
-    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R]]:
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
         """Position and result of every task, as they finish. Raises StageError when the scheduler is lost."""
         name = uuid.uuid4().hex  # results of other work on the same cluster are not ours
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # a large plant travels with its task: nothing is lost with a worker
+            # A large plant travels with its task: nothing is lost with a worker.
+            warnings.simplefilter("ignore")
             futures = {
                 self._client.submit(run_on_worker, task, key=f"flexlink-{name}-{index}", pure=False): index
                 for index, task in enumerate(tasks)
             }
-        alive = staffed = looked = time.monotonic()
+        staffed = looked = time.monotonic()
         while futures:
-            # Looked at rather than waited for: waiting would not notice that the scheduler is gone.
+            # A client that loses its scheduler cancels them all.
             finished = [future for future in futures if future.done()]
             if not finished:
                 time.sleep(_LOOK_S)
-            if self._client.status == "running":
-                alive = time.monotonic()
-            elif time.monotonic() - alive > _LOST_S or self._client.status == "closed":
-                raise self._lost()
             if time.monotonic() - looked > _ASK_S:
                 looked = time.monotonic()
                 staffed = staffed if self._workers() == 0 else looked
@@ -139,23 +126,20 @@ class DaskCluster:
                         "--resume continues the study"
                     )
             for future in finished:
-                if future.status == "cancelled":
-                    raise self._lost()
-                index = futures.pop(future)
-                yield index, self._result(future, tasks[index])
+                yield futures.pop(future), self._result(future)
 
-    def _result(self, future: Any, task: Task[R]) -> R:
+    def _result(self, future: Any) -> Any:
         try:
-            done: R = future.result(timeout=CONNECT_S)
+            return future.result(timeout=CONNECT_S)
         except self._distributed.KilledWorker:
-            return task.failed("every worker computing it died (out of memory?)")
+            return Failure("every worker computing it died (out of memory?)")
         except (self._distributed.client.FutureCancelledError, TimeoutError, OSError):
-            raise self._lost() from None
+            raise StageError(
+                f"the Dask scheduler at {self.address} was lost; --resume continues the study"
+            ) from None
         except Exception as error:
-            # A task catches everything of its own: this is a worker that cannot even load it.
-            reason = f"{type(error).__name__}: {one_line(error)}"
-            return task.failed(f"the worker cannot run flexlink ({reason})")
-        return done
+            # What goes wrong in a task is its result: this is a worker that cannot even load it.
+            return Failure(f"the worker cannot run flexlink ({type(error).__name__}: {one_line(error)})")
 
     def _workers(self) -> int | None:
         """How many workers the scheduler knows; None when it does not say."""
@@ -163,9 +147,6 @@ class DaskCluster:
             return len(self._client.scheduler_info(n_workers=-1)["workers"])
         except (OSError, TimeoutError, RuntimeError, KeyError):  # KeyError: while the connection is broken
             return None
-
-    def _lost(self) -> StageError:
-        return StageError(f"the Dask scheduler at {self.address} was lost; --resume continues the study")
 
     def _restore(self) -> None:
         self._settings.__exit__(None, None, None)

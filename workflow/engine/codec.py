@@ -27,7 +27,7 @@ T = TypeVar("T")
 AnyArray = npt.NDArray[Any]
 
 DOCUMENT = "_document"
-_ARRAY, _FLOAT, _COMPLEX, _TYPE = "$array", "$float", "$complex", "$type"
+_TAGS = _ARRAY, _FLOAT, _COMPLEX, _TYPE = "$array", "$float", "$complex", "$type"
 _UNIONS = (Union, types.UnionType)
 
 
@@ -90,6 +90,11 @@ def plain(value: Any, *, arrays: bool = True) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+def plain_text(value: Any) -> str:
+    """`plain` as strict JSON; equal values give equal text."""
+    return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
 @cache
 def stored_fields(kind: type) -> dict[str, Any]:
     """Name and annotation of the fields of a dataclass that are data."""
@@ -131,9 +136,9 @@ def _pack(value: Any, at: str, arrays: dict[str, AnyArray]) -> Any:
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Mapping):
-        if any(not isinstance(key, str) or key.startswith("$") for key in value):
+        if any(not isinstance(key, str) or key in _TAGS for key in value):
             raise TypeError(
-                f"{at}: keys must be strings that do not begin with '$'; got {sorted(map(str, value))}"
+                f"{at}: keys must be strings, and none of {', '.join(_TAGS)}; got {sorted(map(str, value))}"
             )
         return {key: _pack(item, _join(at, key), arrays) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
-from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Protocol, TypeVar
 
+from workflow.engine.errors import InputError, StageError, one_line
 from workflow.engine.threads import one_thread_each
 
 R_co = TypeVar("R_co", covariant=True)
@@ -32,14 +32,29 @@ Watch = Callable[[int, float, str], None]
 MOST_ATTEMPTS = 3
 
 
+@dataclass(frozen=True)
+class Failure:
+    """Why there is no result, in one line; bad_input: what the user gave is at fault, not the computation."""
+
+    reason: str
+    bad_input: bool = False
+
+
+def attempt(do: Callable[[], R]) -> R | Failure:
+    """The result, or what went wrong, whatever it was."""
+    try:
+        return do()
+    except (InputError, StageError) as error:
+        return Failure(str(error), bad_input=isinstance(error, InputError))
+    except Exception as error:
+        return Failure(f"internal error: {type(error).__name__}: {one_line(error)}")
+
+
 class Task(Protocol[R_co]):
     """What can be done elsewhere: a value that can be sent there."""
 
     def run(self, report: Report) -> R_co:
-        """The result; whatever goes wrong inside is part of it."""
-
-    def failed(self, reason: str) -> R_co:
-        """The result where nobody could compute it."""
+        """The result."""
 
 
 class Executor(Protocol):
@@ -49,24 +64,13 @@ class Executor(Protocol):
     def width(self) -> int:
         """How many tasks run at once."""
 
-    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R]]:
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
         """Position and result of every task. watch: told position, share done and a word, where that is
         known."""
 
 
-@dataclass(frozen=True)
-class _Step:
-    fraction: float
-    message: str
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer(Generic[R]):
-    result: R
-
-
 class LocalProcesses:
-    """Up to `jobs` processes of this machine, one thread each. Use as a context manager.
+    """Up to `jobs` processes of this machine, one thread each. `close` ends them.
 
     A process that dies (out of memory, a crash in compiled code) leaves its task to a new one, which from the
     second time on has the machine for itself; after three times it is the task's failure. preload: modules
@@ -86,19 +90,11 @@ class LocalProcesses:
             self._context = multiprocessing.get_context("spawn")
         self._running: dict[Connection, tuple[int, BaseProcess]] = {}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._end()
-
     @property
     def width(self) -> int:
         return self._jobs
 
-    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R]]:
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
         """Position and result of every task, as they finish."""
         attempts = [0] * len(tasks)
         waiting = deque(range(len(tasks)))
@@ -110,25 +106,26 @@ class LocalProcesses:
                     self._start(index, tasks[index])
                 for connection in [one for one in wait(list(self._running)) if isinstance(one, Connection)]:
                     index, process = self._running[connection]
+                    share: float | None = None
                     said: Any = None
                     with suppress(EOFError, OSError):
-                        said = connection.recv()
-                    if isinstance(said, _Step):
+                        share, said = connection.recv()
+                    if share is not None:
                         if watch is not None:
-                            watch(index, said.fraction, said.message)
+                            watch(index, share, said)
                         continue
                     del self._running[connection]
                     connection.close()
                     process.join()
-                    if isinstance(said, _Answer):
-                        yield index, said.result
+                    if said is not None:
+                        yield index, said
                     elif attempts[index] < MOST_ATTEMPTS:
                         waiting.append(index)
                     else:
                         reason = f"the process computing it died {attempts[index]} times (out of memory?)"
-                        yield index, tasks[index].failed(reason)
+                        yield index, Failure(reason)
         finally:
-            self._end()
+            self.close()
 
     def _has_room(self, attempts: Sequence[int], index: int) -> bool:
         """A task whose process died runs alone, so that there is as much memory for it as can be."""
@@ -143,7 +140,8 @@ class LocalProcesses:
         theirs.close()
         self._running[ours] = (index, process)
 
-    def _end(self) -> None:
+    def close(self) -> None:
+        """End whatever is still running."""
         for connection, (_, process) in self._running.items():
             process.terminate()
             process.join()
@@ -156,15 +154,16 @@ def _work(connection: Connection, task: Task[Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, args=(connection,), daemon=True).start()
 
-    def send(message: object) -> None:
+    def send(share: float | None, said: object) -> None:
+        """A share done with a word, or None with the result."""
         try:
-            connection.send(message)
+            connection.send((share, said))
         except OSError:
             os._exit(1)  # nobody waits any more
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        send(_Answer(task.run(lambda fraction, message: send(_Step(fraction, message)))))
+        send(None, attempt(lambda: task.run(send)))
 
 
 def _leave_with_parent(connection: Connection) -> None:

@@ -16,7 +16,7 @@ it). File and hash appear in one rename, so there is no instant at which one is 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -110,7 +110,7 @@ class RunDirectory(Store):
 
     def _check_same(self, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
         RunDirectory.open(self.path)
-        changed = first_difference(storage.read_json(self.path / "config.json"), _plain(config))
+        changed = first_difference(storage.read_json(self.path / "config.json"), config)
         if changed:
             raise InputError(
                 f"{self.path}: cannot resume, the configuration changed at {changed}; choose another --out"
@@ -145,6 +145,10 @@ class RunDirectory(Store):
             if path.is_file():
                 return path
         return None
+
+    def stage_files(self, names: Iterable[str]) -> dict[str, bytes]:
+        """Contents of stage files by file name; stages that are not there are left out."""
+        return {path.name: path.read_bytes() for path in map(self.stage_file, names) if path is not None}
 
     def stage_digest(self, name: str) -> str:
         """SHA-256 of a finished stage's file: the input hash of the stages after it builds on this."""
@@ -231,7 +235,7 @@ def package_versions() -> dict[str, str]:
 
 def hash_of(document: Mapping[str, Any]) -> str:
     """SHA-256 of a JSON-able document, independent of the order of its keys."""
-    text = json.dumps(_plain(document), sort_keys=True, ensure_ascii=False)
+    text = json.dumps(codec.pack(document)[0], sort_keys=True, ensure_ascii=False)
     return storage.sha256_of_bytes(text.encode("utf-8"))
 
 
@@ -265,10 +269,6 @@ def _recorded_hash(path: Path) -> str | None:
         return str(storage.read_npz(path, only=_INPUT_HASH)[_INPUT_HASH])
     except InputError:
         return None  # damaged from outside: treat as not done
-
-
-def _plain(document: Any) -> Any:
-    return storage.encode(document)
 
 
 def _short(value: Any) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
 import os
 import zipfile
 import zlib
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from workflow.engine import codec
 from workflow.engine.errors import InputError, describe_os_error
 
 TEMPORARY_SUFFIX = ".part"
@@ -74,7 +74,8 @@ def write_text(path: Path, content: str) -> None:
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Atomic JSON, strict: non-finite floats become `{"$float": "inf"}` and come back as floats."""
-    write_text(path, json.dumps(encode(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    tagged, _ = codec.pack(document)
+    write_text(path, json.dumps(tagged, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_text(path: Path) -> str:
@@ -90,13 +91,11 @@ def read_text(path: Path) -> str:
 def read_json(path: Path) -> dict[str, Any]:
     """The document written by `write_json`. Raises InputError naming the file."""
     try:
-        document = json.loads(read_text(path), object_hook=decode)
-    except InputError:
-        raise
-    except ValueError as error:
+        document = codec.unpack(dict, json.loads(read_text(path)), {})
+    except codec.CodecError as error:
+        raise InputError(f"{path}: {error}") from error
+    except json.JSONDecodeError as error:
         raise InputError(f"{path}: not valid JSON: {error}") from error
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
     return document
 
 
@@ -186,38 +185,3 @@ def _flush_directory(directory: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def strict_json(value: Any) -> Any:
-    """For readers other than us: the same document with nan and infinity as null."""
-    if isinstance(value, Mapping):
-        return {str(key): strict_json(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [strict_json(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def encode(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): encode(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [encode(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return encode(value.tolist())
-    if isinstance(value, np.generic):
-        return encode(value.item())
-    if isinstance(value, complex):
-        return {"$complex": [encode(value.real), encode(value.imag)]}
-    if isinstance(value, float) and not math.isfinite(value):
-        return {"$float": repr(value)}
-    return value
-
-
-def decode(document: dict[str, Any]) -> Any:
-    if document.keys() == {"$float"}:
-        return float(document["$float"])
-    if document.keys() == {"$complex"}:
-        return complex(*document["$complex"])
-    return document

@@ -65,7 +65,7 @@ class StudyDirectory(Store):
         if replace:
             study._refuse_own_base(base)
         if study.prepare(resume=resume, replace=replace):
-            changed = first_difference(storage.read_json(study.manifest_path), storage.encode(document))
+            changed = first_difference(storage.read_json(study.manifest_path), document)
             if changed:
                 raise InputError(
                     f"{path}: cannot resume, the base changed at {changed}; choose another --out or start "
@@ -138,12 +138,7 @@ class StudyDirectory(Store):
 
     def plant_files(self, point: Point) -> dict[str, bytes]:
         """The stage files of the plant that a point shares, by file name."""
-        return stage_files(self.plant(point), [stage.name for stage in PLANT_STAGES])
-
-
-def stage_files(run: RunDirectory, names: list[str] | tuple[str, ...]) -> dict[str, bytes]:
-    """Stage files of a run by file name; stages that are not there are left out."""
-    return {path.name: path.read_bytes() for path in map(run.stage_file, names) if path is not None}
+        return self.plant(point).stage_files(stage.name for stage in PLANT_STAGES)
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-from workflow.engine import storage
+from workflow.engine import codec, storage
 from workflow.engine.cluster import DaskCluster
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
-from workflow.engine.executor import Executor, LocalProcesses
+from workflow.engine.executor import Executor, Failure, LocalProcesses
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.columns import COLUMNS
-from workflow.study.directory import StudyDirectory, stage_files
+from workflow.study.directory import StudyDirectory
 from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point, PointMaker, load_base
 from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_without_run
 from workflow.study.search import Grid, ParzenSearch, Strategy
@@ -70,10 +69,10 @@ def run_study(
     processes = jobs or os.cpu_count() or 1
     # A cluster that does not answer is found out before anything is written.
     with ExitStack() as stack:
-        here = stack.enter_context(LocalProcesses(processes, preload=["workflow.study.task"]))
+        here = stack.enter_context(closing(LocalProcesses(processes, preload=["workflow.study.task"])))
         executor: Executor = here
         if scheduler is not None:
-            executor = stack.enter_context(DaskCluster(scheduler))
+            executor = stack.enter_context(closing(DaskCluster(scheduler)))
         directory = StudyDirectory.begin(out, text=text, base=base, resume=resume, replace=replace)
         with directory.locked():
             work = _Work(directory, base, executor, here, progress)
@@ -164,9 +163,11 @@ class _Work:
             tasks.append(_task(group, given, [stage.name for stage in POINT_STAGES]))
         for index, results in self._executor.run(tasks):
             fresh = []
-            for point, done in zip(members[index], results, strict=True):
-                if done.failure is not None:
-                    rows[point.name] = row_without_run(point, "failed", done.failure)
+            group = members[index]
+            each = (results,) * len(group) if isinstance(results, Failure) else results
+            for point, done in zip(group, each, strict=True):
+                if isinstance(done, Failure):
+                    rows[point.name] = row_without_run(point, "failed", done.reason)
                 else:
                     self._directory.save_point(point, done)
                     rows[point.name] = row_of(point, self._directory.point(point))
@@ -184,10 +185,11 @@ class _Work:
             there = {name.partition(".")[0] for name in given}
             lacking = [stage.name for stage in PLANT_STAGES if stage.name not in there]
             tasks.append(_task([point], given, lacking))
-        for index, (done,) in self._here.run(tasks):
+        for index, results in self._here.run(tasks):
             point, given = wanted[index]
-            if done.failure is not None:
-                self._broken_plants[point.plant_key] = done.failure
+            done = results if isinstance(results, Failure) else results[0]
+            if isinstance(done, Failure):
+                self._broken_plants[point.plant_key] = done.reason
             else:
                 self._directory.save_plant(point, given, done)
 
@@ -203,10 +205,10 @@ class _Work:
                 if stage.settings(point.config) != stage.settings(base_point.config):
                     break
                 shared.append(stage.name)
-        return stage_files(self._directory.plant(base_point), shared)
+        return self._directory.plant(base_point).stage_files(shared)
 
     def _from_run(self, point: Point) -> Mapping[str, bytes]:
-        return {} if self._base.run is None else stage_files(self._base.run, point.given)
+        return {} if self._base.run is None else self._base.run.stage_files(point.given)
 
     def _report(self, rows: Any) -> None:
         for row in rows:
@@ -251,8 +253,7 @@ def _write_up(
         "points": [row.to_document() for row in rows],
     }
     storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, fronts))
-    table = json.dumps(storage.strict_json(storage.encode(document)), indent=1, ensure_ascii=False)
-    storage.write_text(directory.path / "table.json", table + "\n")
+    storage.write_text(directory.path / "table.json", codec.plain_text(document))
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
     view = StudyView(study, text, where, rows, fronts, _units(directory, rows))
     page = study_page(title, view)
