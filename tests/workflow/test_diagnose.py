@@ -284,7 +284,7 @@ def test_another_code_version_is_done_again(cases, tmp_path, here, monkeypatch):
     out, seen = tmp_path / "out", tmp_path / "seen"
     engine = KnownAnswer((FRICTION,), seen=seen)
     diagnose_cases(cases[:1], out, controller=False, engine=engine)
-    monkeypatch.setattr(command, "diagnosis_digest", lambda: "another")
+    monkeypatch.setattr(command, "code_digest", lambda *rooms, **more: "another")
     found = diagnose_cases(cases[:1], out, controller=False, resume=True, engine=engine)
     assert seen.read_text() == "one\none\n"
     assert found.documents[0]["made_from"]["code_sha256"] == "another"

@@ -40,7 +40,6 @@ from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
 from workflow.study.task import Job, Task
-from workflow.study.toml_text import toml_text
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -75,38 +74,10 @@ def test_keys_that_lead_nowhere(key, complaint):
         with_values({"a": {"b": [{}], "n": 3}}, {key: 1})
 
 
-def _without_none(value):
-    if isinstance(value, dict):
-        return {key: _without_none(item) for key, item in value.items() if item is not None}
-    return [_without_none(item) for item in value] if isinstance(value, list) else value
-
-
-_SCALARS = st.one_of(
-    st.booleans(),
-    st.integers(-(2**60), 2**60),
-    st.floats(allow_nan=False),
-    st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=8),
-)
-_VALUES = st.recursive(
-    _SCALARS | st.none(),
-    lambda inner: (
-        st.lists(inner.filter(lambda v: v is not None), max_size=3)
-        | st.dictionaries(st.text(st.characters(codec="ascii"), max_size=6), inner, max_size=3)
-    ),
-    max_leaves=8,
-)
-
-
-@given(document=st.dictionaries(st.text(max_size=6), _VALUES, max_size=4))
-def test_toml_comes_back_as_it_was(document):
-    # Read by the standard library, which shares no code with the writer.
-    assert tomllib.loads(toml_text(document)) == _without_none(document)
-
-
 @pytest.mark.parametrize("name", ["default", "fast"])
 def test_configurations_come_back_from_toml(name):
     config, _ = built_in_config() if name == "default" else load_config(FAST_ARM)
-    document = tomllib.loads(toml_text(config.to_document()))
+    document = tomllib.loads(config.to_toml())
     assert check(RunConfig, document, source="again", context={"may_be_gone": True}) == config
 
 

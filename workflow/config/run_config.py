@@ -10,6 +10,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import tomlkit
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from control_design.specification import Specification
@@ -363,6 +364,10 @@ class RunConfig(Section):
     def to_document(self) -> dict[str, Any]:
         """JSON-able, every default filled in; `from_document` gives back an equal configuration."""
         return self.model_dump(mode="json")
+
+    def to_toml(self) -> str:
+        """As a user would write it; what has no value is left out."""
+        return tomlkit.dumps(self.model_dump(mode="json", exclude_none=True))
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], *, source: str) -> RunConfig:

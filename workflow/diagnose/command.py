@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from workflow.diagnose.case_files import LoadedCase, load_case, refuse_equal_names
-from workflow.diagnose.directory import DiagnosisDirectory, diagnosis_digest
+from workflow.diagnose.directory import DiagnosisDirectory
 from workflow.diagnose.outputs import Engine, Work
 from workflow.diagnose.overview import closure_words, overview_page, short_answer
 from workflow.diagnose.words import parameter_words, probability_words, times_noise
 from workflow.engine import codec
+from workflow.engine.code_version import code_digest
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERNAL,
@@ -96,7 +97,7 @@ def diagnose_cases(
             "--resume and --replace contradict each other: continue the diagnosis or start it afresh"
         )
     loaded, unreadable = _load(places, rig)
-    code = diagnosis_digest()
+    code = code_digest("diagnosis", drawing=True)
     work = [Work(one, controller, code, engine or Engine()) for one in loaded]
     directory = DiagnosisDirectory.begin(
         out,

@@ -13,16 +13,13 @@ made from the same inputs by the same code, is done.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from workflow.engine import storage
-from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import first_difference
 from workflow.engine.store import Store
@@ -30,16 +27,6 @@ from workflow.engine.store import Store
 LAYOUT_VERSION = 1
 MANIFEST = "diagnose.json"
 _ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv")
-
-
-@cache
-def diagnosis_digest() -> str:
-    """SHA-256 over all code that an answer and its page depend on."""
-    root = Path(__file__).resolve().parents[2]
-    digest = hashlib.sha256(code_digest(drawing=True).encode())
-    for path in sorted((root / "diagnosis").rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -95,12 +82,8 @@ class DiagnosisDirectory(Store):
 
     def finished(self, case: str, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
         """The answer to a case if it is there, whole and made from this; else None."""
-        path = self.path / f"{case}.json"
-        try:
-            document = json.loads(path.read_bytes())
-        except (OSError, ValueError):
-            return None
-        if not isinstance(document, dict) or document.get("made_from") != made_from:
+        document = self._document(f"{case}.json")
+        if document.get("made_from") != made_from:
             return None
         for name, digest in document.get("files", {}).items():
             file = self.path / name
@@ -109,12 +92,15 @@ class DiagnosisDirectory(Store):
         return document
 
     def timings(self) -> dict[str, Any]:
-        """Seconds per case so far; nothing where the file is not there or cannot be read."""
+        """Seconds per case so far."""
+        return self._document("timings.json")
+
+    def _document(self, name: str) -> dict[str, Any]:
+        """A JSON file of ours; empty where it is not there or cannot be read."""
         try:
-            found = json.loads((self.path / "timings.json").read_bytes())
-        except (OSError, ValueError):
+            return storage.read_json(self.path / name)
+        except InputError:
             return {}
-        return found if isinstance(found, dict) else {}
 
     def discard_if_empty(self) -> None:
         """Take back what `begin` wrote if there is no answer: a corrected case may come. Hold the lock."""

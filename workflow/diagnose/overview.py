@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from plant.effects import in_words
@@ -12,31 +11,11 @@ from workflow.report.rendering import render_page
 from workflow.text.formats import MISSING, listing, number
 
 
-@dataclass(frozen=True)
-class CaseAnswer:
-    """One case: verdict, answer in a few words with its probability, gaps over noise, share closed."""
-
-    name: str
-    verdict: str
-    answer: str
-    probability: float
-    gap_before: float
-    gap_after: float
-    noise_floor: float
-    closed: str
-
-
 def overview_page(documents: Sequence[Mapping[str, Any]], failed: Mapping[str, str]) -> str:
     """documents: the JSON answers; failed: case -> reason."""
-    taken = ("verdict", "probability", "gap_before", "gap_after", "noise_floor")
     cases = [
-        CaseAnswer(
-            name=d["case"],
-            answer=short_answer(d),
-            closed=closure_words(d),
-            **{key: d[key] for key in taken},
-        )
-        for d in documents
+        {**answer, "name": answer["case"], "answer": short_answer(answer), "closed": closure_words(answer)}
+        for answer in documents
     ]
     page = "diagnosis/overview.html.j2"
     return render_page(page, filters=FILTERS.items(), title="Gap diagnosis", cases=cases, failed=failed).html

@@ -12,18 +12,16 @@ _ONLY_DRAWING = ("workflow/figures", "workflow/report", "workflow/text")
 
 
 @cache
-def code_digest(*, drawing: bool = False) -> str:
-    """SHA-256 over the rooms' Python files, paths and contents (with `drawing` also what only draws)."""
+def code_digest(*more: str, drawing: bool = False) -> str:
+    """SHA-256 over the Python files of the rooms and of `more` rooms, paths and contents (with `drawing` also
+    what only draws)."""
     root = Path(__file__).resolve().parents[2]
-    digest = hashlib.sha256()
-    for room in _ROOMS:
-        for path in sorted((root / room).rglob("*.py")):
-            name = path.relative_to(root).as_posix()
-            if drawing or not name.startswith(_ONLY_DRAWING):
-                digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    paths = [path for room in (*_ROOMS, *more) for path in sorted((root / room).rglob("*.py"))]
     if drawing:
-        templates = root / "workflow" / "templates"
-        for path in sorted(path for path in templates.rglob("*") if path.is_file()):
-            name = path.relative_to(templates).as_posix()
+        paths += sorted(path for path in (root / "workflow/templates").rglob("*") if path.is_file())
+    digest = hashlib.sha256()
+    for path in paths:
+        name = path.relative_to(root).as_posix()
+        if drawing or not name.startswith(_ONLY_DRAWING):
             digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

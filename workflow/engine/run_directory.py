@@ -164,9 +164,10 @@ class RunDirectory(Store):
 
     def save_stage(self, name: str, result: Any, input_hash: str) -> Path:
         """Write a stage's result atomically, replacing what was there under either suffix."""
-        return self.write_stage(name, *stage_bytes(result, input_hash))
+        content, suffix = stage_bytes(result, input_hash)
+        return self.write_stage(name, suffix, content)
 
-    def write_stage(self, name: str, content: bytes, suffix: str) -> Path:
+    def write_stage(self, name: str, suffix: str, content: bytes) -> Path:
         """The same from the file's content, which another process made."""
         path = self.stages_path / f"{name}{suffix}"
         storage.write_bytes(path, content)

@@ -17,22 +17,20 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, first_difference
 from workflow.engine.store import Store
 from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point
 from workflow.study.task import Done
-from workflow.study.toml_text import toml_text
 from workflow.tasks.pipeline import stage_input_hash
 from workflow.tasks.results import RunResults
 from workflow.tasks.stages import Stage
 from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1
+_PLANT = tuple(stage.name for stage in PLANT_STAGES)
 
 
 @dataclass(frozen=True)
@@ -108,19 +106,12 @@ class StudyDirectory(Store):
 
     def has_plant(self, point: Point) -> bool:
         """Whether the plant of a point is there, made from what it would be made from now."""
-        assert point.config is not None
-        run, source = self.plant(point), point.inputs or {}
-        return _matches(run, point.config, source, PLANT_STAGES, skip=point.given)
+        return _matches(self.plant(point), point, PLANT_STAGES, skip=point.given)
 
     def has_point(self, point: Point) -> bool:
         """Whether a point is finished, with the plant that stands in the study."""
-        assert point.config is not None
-        run, plant = self.point(point), self.plant(point)
-        same = all(
-            _digest(run, stage) is not None and _digest(run, stage) == _digest(plant, stage)
-            for stage in PLANT_STAGES
-        )
-        return same and _matches(run, point.config, point.inputs or {}, POINT_STAGES)
+        run = self.point(point)
+        return _matches(run, point, POINT_STAGES) and run.stage_files(_PLANT) == self.plant_files(point)
 
     def save_plant(self, point: Point, given: Mapping[str, bytes], done: Done) -> None:
         """Keep records, model and ellipses."""
@@ -132,56 +123,38 @@ class StudyDirectory(Store):
         """Keep a finished point, with the plant's stages beside its own: a run like any other."""
         run = self.point(point)
         _write(run, point, self.plant_files(point), done)
-        assert point.config is not None
         certified = summarise(RunResults(run), point.config).certified
         run.record_status("complete" if certified else "complete, not certified")
 
     def plant_files(self, point: Point) -> dict[str, bytes]:
         """The stage files of the plant that a point shares, by file name."""
-        return self.plant(point).stage_files(stage.name for stage in PLANT_STAGES)
+        return self.plant(point).stage_files(_PLANT)
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:
-    assert point.config is not None
-    document: dict[str, Any] = point.config.to_document()
     begun = RunDirectory.begin(
         run.path,
-        config_text=f"# {point.name}\n\n{toml_text(document)}",
-        config=document,
+        config_text=f"# {point.name}\n\n{point.config.to_toml()}",
+        config=point.config.to_document(),
         seed=point.config.run.seed,
-        inputs=point.inputs or {},
+        inputs=point.inputs,
         resume=True,
     )
-    for name, content in {**given, **done.files}.items():
-        storage.write_bytes(begun.stages_path / name, content)
-        # A stage may change its kind of file: a closed loop that was skipped has no arrays.
-        stem, suffix = os.path.splitext(name)
-        other = begun.stages_path / f"{stem}{'.npz' if suffix == '.json' else '.json'}"
-        other.unlink(missing_ok=True)
+    for name, file in {**given, **done.files}.items():
+        begun.write_stage(*os.path.splitext(name), file)
     for name, seconds in done.seconds.items():
         begun.record_stage(name, seconds, done.hashes[name])
 
 
-def _matches(
-    run: RunDirectory,
-    config: RunConfig,
-    inputs: Mapping[str, str],
-    stages: tuple[Stage, ...],
-    skip: tuple[str, ...] = (),
-) -> bool:
-    if not run.manifest_path.is_file():
-        return False
-    for stage in stages:
-        if _digest(run, stage) is None:
-            return False
-        if stage.name in skip:
-            continue
-        if any(run.stage_file(name) is None for name in stage.after):
-            return False
-        if not run.is_done(stage.name, stage_input_hash(stage, config, run, inputs)):
-            return False
-    return True
-
-
-def _digest(run: RunDirectory, stage: Stage) -> str | None:
-    return None if run.stage_file(stage.name) is None else run.stage_digest(stage.name)
+def _matches(run: RunDirectory, point: Point, stages: tuple[Stage, ...], skip: tuple[str, ...] = ()) -> bool:
+    """Whether the stages are there, made from what they would be made from now (but for those to skip)."""
+    needed = {name for stage in stages for name in (stage.name, *stage.after)}
+    return (
+        run.manifest_path.is_file()
+        and all(run.stage_file(name) is not None for name in needed)
+        and all(
+            run.is_done(stage.name, stage_input_hash(stage, point.config, run, point.inputs))
+            for stage in stages
+            if stage.name not in skip
+        )
+    )

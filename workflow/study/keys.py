@@ -40,33 +40,20 @@ def with_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[
     """
     changed = copy.deepcopy(dict(document))
     for key, value in values.items():
-        _set(changed, parse_key(key), copy.deepcopy(value), key)
-    return changed
-
-
-def _set(document: dict[str, Any], path: Path, value: Any, key: str) -> None:
-    here: Any = document
-    for position, part in enumerate(path):
-        where = _dotted(path[:position])
-        last = position == len(path) - 1
-        if isinstance(part, int):
-            if not isinstance(here, list):
-                raise ValueError(f"{key}: {where} is no list")
-            if part >= len(here):
-                raise ValueError(f"{key}: {where} has {len(here)} entries, counted from 0")
-            if last:
-                here[part] = value
-        else:
-            if not isinstance(here, dict):
+        path, where = parse_key(key), ""
+        here: Any = changed
+        for part, last in zip(path, [*[False] * (len(path) - 1), True], strict=True):
+            if isinstance(part, int):
+                if not isinstance(here, list):
+                    raise ValueError(f"{key}: {where} is no list")
+                if part >= len(here):
+                    raise ValueError(f"{key}: {where} has {len(here)} entries, counted from 0")
+            elif not isinstance(here, dict):
                 raise ValueError(f"{key}: {where} is no table")
-            if last:
-                here[part] = value
             elif here.get(part) is None:
                 here[part] = {}
-        if not last:
+            if last:
+                here[part] = copy.deepcopy(value)
             here = here[part]
-
-
-def _dotted(path: Path) -> str:
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
-    return text.removeprefix(".")
+            where = f"{where}[{part}]" if isinstance(part, int) else f"{where}.{part}".removeprefix(".")
+    return changed

@@ -47,22 +47,34 @@ class Base:
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
-    """One combination of values.
-
-    config None: the combination contradicts itself, `refusal` says how. Points of equal `plant_key` share
-    records, model and ellipses; of equal `design_key` the controller as well.
-    """
+class Combination:
+    """One value per axis."""
 
     number: int
     name: str
     values: Mapping[str, Any]
-    config: RunConfig | None
-    refusal: str | None = None
-    inputs: Mapping[str, str] | None = None
-    plant_key: str = ""
-    design_key: str = ""
-    given: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Contradiction(Combination):
+    """A combination that contradicts itself; `refusal` says how."""
+
+    refusal: str
+
+
+@dataclass(frozen=True, eq=False)
+class Point(Combination):
+    """A combination that can be computed.
+
+    Points of equal `plant_key` share records, model and ellipses; of equal `design_key` the controller as
+    well. given: stages taken over from the base where that is a run.
+    """
+
+    config: RunConfig
+    inputs: Mapping[str, str]
+    plant_key: str
+    design_key: str
+    given: tuple[str, ...]
 
 
 def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
@@ -105,8 +117,8 @@ class PointMaker:
         for index, axis in enumerate(self._axes):
             self._refuse_bad_values(index, axis)
 
-    def make(self, values: Mapping[str, Any]) -> Point:
-        """The point of these values, one per axis. A contradiction is a result and stands in `refusal`."""
+    def make(self, values: Mapping[str, Any]) -> Point | Contradiction:
+        """The point of these values, one per axis. That they contradict one another is a result too."""
         self._made += 1
         source = "the configuration contradicts itself"
         try:
@@ -115,9 +127,9 @@ class PointMaker:
             )
         except InputError as error:
             name = self._name(values, hash_of({"base": self._document, "values": values}))
-            return Point(self._made, name, dict(values), None, refusal=str(error))
+            return Contradiction(self._made, name, dict(values), str(error))
         inputs = self._base.inputs if self._base.run is not None else _input_hashes(config)
-        given = self._given(config)
+        given = () if self._original is None else shared_stages(config, self._original)
         plant_key = hash_of(
             {
                 "given": {name: self._digests[name] for name in given},
@@ -130,9 +142,9 @@ class PointMaker:
             {"plant": plant_key, "seed": config.run.seed, "settings": POINT_STAGES[0].settings(config)}
         )
         name = self._name(values, hash_of({"plant": plant_key, "config": config.to_document()}))
-        return Point(self._made, name, dict(values), config, None, inputs, plant_key, design_key, given)
+        return Point(self._made, name, dict(values), config, inputs, plant_key, design_key, given)
 
-    def grid(self) -> list[Point]:
+    def grid(self) -> list[Point | Contradiction]:
         """Every combination, the last axis fastest."""
         keys = [axis.key for axis in self._axes]
         combinations = itertools.product(*(axis.grid() for axis in self._axes))
@@ -141,18 +153,9 @@ class PointMaker:
     def base_point(self) -> Point:
         """The base itself, whose plant the others begin with; it is no point of the study."""
         self._made -= 1
-        return self.make({})
-
-    def _given(self, config: RunConfig) -> tuple[str, ...]:
-        """Stages taken over from a given run: those before the first whose settings differ there."""
-        if self._original is None:
-            return ()
-        given = []
-        for stage in PLANT_STAGES:
-            if hash_of(stage.settings(config)) != hash_of(stage.settings(self._original)):
-                break
-            given.append(stage.name)
-        return tuple(given)
+        point = self.make({})
+        assert isinstance(point, Point)  # the base was checked when it was loaded
+        return point
 
     def _name(self, values: Mapping[str, Any], digest: str) -> str:
         labels = {axis.key: axis.name for axis in self._axes}
@@ -179,6 +182,14 @@ class PointMaker:
             except ValueError:
                 pass
             _checked(self._document, {axis.key: value}, source, self._base.folder, gone=gone)
+
+
+def shared_stages(one: RunConfig, other: RunConfig) -> tuple[str, ...]:
+    """Stages of the plant before the first whose settings differ."""
+    same = itertools.takewhile(
+        lambda stage: hash_of(stage.settings(one)) == hash_of(stage.settings(other)), PLANT_STAGES
+    )
+    return tuple(stage.name for stage in same)
 
 
 def short(value: Any) -> str:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import pandas as pd
+
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.columns import COLUMNS, Number, numbers_of
-from workflow.study.points import Point, short
+from workflow.study.points import Combination, Point, short
 from workflow.study.settings import Axis, ParetoPlot
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import verdict_of
@@ -35,21 +35,9 @@ class PointRow:
         """Certified, and every run in closed loop settles."""
         return self.state == "certified"
 
-    def to_document(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "number": self.number,
-            "name": self.name,
-            "values": dict(self.values),
-            "state": self.state,
-            "why": self.why,
-            "numbers": dict(self.numbers),
-        }
-
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
-    assert point.config is not None
     results, specification = RunResults(run), point.config.specification
     design, certify, loop = results.design, results.certify, results.closed_loop
     achievable = results.achievable_performance
@@ -75,8 +63,8 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     return PointRow(point.number, point.name, point.values, state, why, numbers)
 
 
-def row_without_run(point: Point, state: State, why: str) -> PointRow:
-    """The row of a point that contradicts itself or failed."""
+def row_without_run(point: Combination, state: State, why: str) -> PointRow:
+    """The row of a combination that contradicts itself, or of a point that failed."""
     return PointRow(point.number, point.name, point.values, state, why, dict.fromkeys(COLUMNS))
 
 
@@ -85,21 +73,24 @@ def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Seq
 
     front: numbers of the points on each Pareto front; a column each.
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    keys = [axis.key for axis in axes]
-    fronts = [f"front_{index + 1}" for index in range(len(front))]
-    writer.writerow(["number", "name", *keys, "state", *COLUMNS, *fronts, "why"])
-    for row in rows:
-        numbers = ["" if row.numbers[name] is None else repr(row.numbers[name]) for name in COLUMNS]
-        asked = [_cell(row.values[key]) for key in keys]
-        on = ["yes" if row.number in members else "no" for members in front]
-        writer.writerow([row.number, row.name, *asked, row.state, *numbers, *on, row.why])
-    return stream.getvalue()
+    records = [
+        {
+            "number": row.number,
+            "name": row.name,
+            **{axis.key: _cell(row.values[axis.key]) for axis in axes},
+            "state": row.state,
+            **row.numbers,
+            **{f"front_{k}": "yes" if row.number in on else "no" for k, on in enumerate(front, 1)},
+            "why": row.why,
+        }
+        for row in rows
+    ]
+    # As objects: a whole number stays one beside a cell without a number.
+    return str(pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n"))
 
 
-def _cell(value: Any) -> str:
-    return repr(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else short(value)
+def _cell(value: Any) -> Any:
+    return value if isinstance(value, (int, float)) else short(value)
 
 
 def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:

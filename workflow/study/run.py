@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from workflow.engine import codec, storage
 from workflow.engine.cluster import DaskCluster
@@ -18,13 +18,23 @@ from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.columns import COLUMNS
 from workflow.study.directory import StudyDirectory
-from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point, PointMaker, load_base
+from workflow.study.points import (
+    PLANT_STAGES,
+    POINT_STAGES,
+    Base,
+    Contradiction,
+    Point,
+    PointMaker,
+    load_base,
+    shared_stages,
+)
 from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_without_run
 from workflow.study.search import Grid, ParzenSearch, Strategy
 from workflow.study.settings import StudyConfig, load_study
-from workflow.study.task import Job, Task
+from workflow.study.task import Done, Job, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
+from workflow.tasks.stages import Stage
 from workflow.tasks.summary import RunSummary
 
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
@@ -132,23 +142,25 @@ class _Work:
     def _make_base_plant(self, base_point: Point) -> bool:
         if self._directory.has_plant(base_point):
             return True
-        self._plants([(base_point, self._from_run(base_point))])
+        given = {} if self._base.run is None else self._base.run.stage_files(base_point.given)
+        self._plants([(base_point, given)])
         reason = self._broken_plants.get(base_point.plant_key)
         if reason is not None:
             raise InputError(f"the base cannot be identified: {reason}")
         return False
 
-    def _batch(self, points: Sequence[Point], base_point: Point) -> list[PointRow]:
+    def _batch(self, points: Sequence[Point | Contradiction], base_point: Point) -> list[PointRow]:
         """The points of a batch: what is finished is taken up, what shares a controller goes together."""
-        rows: dict[str, PointRow] = {}
-        valid = [point for point in points if point.config is not None]
-        for point in points:
-            if point.config is None:
-                rows[point.name] = row_without_run(point, "impossible", str(point.refusal))
+        rows = {
+            point.name: row_without_run(point, "impossible", point.refusal)
+            for point in points
+            if isinstance(point, Contradiction)
+        }
+        valid = {point.name: point for point in points if isinstance(point, Point)}.values()
         lacking = {point.plant_key: point for point in valid if not self._directory.has_plant(point)}
         self._plants([(point, self._given(point, base_point)) for point in lacking.values()])
         groups: dict[str, list[Point]] = {}
-        for point in {point.name: point for point in valid}.values():
+        for point in valid:
             if point.plant_key in self._broken_plants:
                 rows[point.name] = row_without_run(point, "failed", self._broken_plants[point.plant_key])
             elif self._directory.has_point(point):
@@ -157,60 +169,45 @@ class _Work:
             else:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
-        tasks, members = [], list(groups.values())
-        for group in members:
-            given = self._directory.plant_files(group[0])
-            tasks.append(_task(group, given, [stage.name for stage in POINT_STAGES]))
-        for index, results in self._executor.run(tasks):
-            fresh = []
-            group = members[index]
-            each = (results,) * len(group) if isinstance(results, Failure) else results
-            for point, done in zip(group, each, strict=True):
+        work = [
+            _task(group, self._directory.plant_files(group[0]), POINT_STAGES) for group in groups.values()
+        ]
+        for found in _done(self._executor, list(groups.values()), work):
+            for point, done in found:
                 if isinstance(done, Failure):
                     rows[point.name] = row_without_run(point, "failed", done.reason)
                 else:
                     self._directory.save_point(point, done)
                     rows[point.name] = row_of(point, self._directory.point(point))
-                fresh.append(rows[point.name])
-            self._report(fresh)
+            self._report([rows[point.name] for point, _ in found])
         # The same point may be asked for twice by a search: each time under its own number.
-        return [_numbered(rows[point.name], point.number) for point in points]
+        return [replace(rows[point.name], number=point.number) for point in points]
 
     def _plants(self, wanted: Sequence[tuple[Point, Mapping[str, bytes]]]) -> None:
         """Records, models and ellipses, on this machine: the logs are here."""
         if not wanted:
             return
-        tasks = []
+        work = []
         for point, given in wanted:
             there = {name.partition(".")[0] for name in given}
-            lacking = [stage.name for stage in PLANT_STAGES if stage.name not in there]
-            tasks.append(_task([point], given, lacking))
-        for index, results in self._here.run(tasks):
-            point, given = wanted[index]
-            done = results if isinstance(results, Failure) else results[0]
+            work.append(_task([point], given, [stage for stage in PLANT_STAGES if stage.name not in there]))
+        given_of = {point.name: given for point, given in wanted}
+        for ((point, done),) in _done(self._here, [[point] for point, _ in wanted], work):
             if isinstance(done, Failure):
                 self._broken_plants[point.plant_key] = done.reason
             else:
-                self._directory.save_plant(point, given, done)
+                self._directory.save_plant(point, given_of[point.name], done)
 
     def _given(self, point: Point, base_point: Point) -> Mapping[str, bytes]:
         """What a plant begins with: stages of a given run, else those it shares with the base's plant."""
         if self._base.run is not None:
-            return self._from_run(point)
-        assert point.config is not None
-        assert base_point.config is not None
-        shared = []
-        if point.config.run.seed == base_point.config.run.seed and point.inputs == base_point.inputs:
-            for stage in PLANT_STAGES:
-                if stage.settings(point.config) != stage.settings(base_point.config):
-                    break
-                shared.append(stage.name)
+            return self._base.run.stage_files(point.given)
+        if point.config.run.seed != base_point.config.run.seed or point.inputs != base_point.inputs:
+            return {}
+        shared = shared_stages(point.config, base_point.config)
         return self._directory.plant(base_point).stage_files(shared)
 
-    def _from_run(self, point: Point) -> Mapping[str, bytes]:
-        return {} if self._base.run is None else self._base.run.stage_files(point.given)
-
-    def _report(self, rows: Any) -> None:
+    def _report(self, rows: Iterable[PointRow]) -> None:
         for row in rows:
             self._finished += 1
             self._good += row.good
@@ -220,16 +217,19 @@ class _Work:
         self._progress.update("points", min(share, 1.0), message)
 
 
-def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[str]) -> Task:
-    jobs = []
-    for point in points:
-        assert point.config is not None
-        jobs.append(Job(point.name, point.config.to_document(), point.inputs or {}))
-    return Task(tuple(jobs), given, tuple(stages), code_digest())
+def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[Stage]) -> Task:
+    jobs = tuple(Job(point.name, point.config.to_document(), point.inputs) for point in points)
+    return Task(jobs, given, tuple(stage.name for stage in stages), code_digest())
 
 
-def _numbered(row: PointRow, number: int) -> PointRow:
-    return PointRow(number, row.name, row.values, row.state, row.why, row.numbers)
+def _done(
+    executor: Executor, groups: Sequence[Sequence[Point]], tasks: Sequence[Task]
+) -> Iterator[list[tuple[Point, Done | Failure]]]:
+    """What became of the points of each task, as they finish."""
+    for index, found in executor.run(tasks):
+        points = groups[index]
+        each = [found] * len(points) if isinstance(found, Failure) else found
+        yield list(zip(points, each, strict=True))
 
 
 def _write_up(
@@ -240,18 +240,20 @@ def _write_up(
 
     fronts = [pareto_front(rows, plot) for plot in study.pareto]
     title = study.study.title or base.config.run.title or base.config.run.name
-    document = {
-        "title": title,
-        "columns": {
-            name: {"label": column.label, "unit": column.unit, "better": column.better}
-            for name, column in COLUMNS.items()
-        },
-        "fronts": [
-            {"x": plot.x, "y": plot.y, "points": front}
-            for plot, front in zip(study.pareto, fronts, strict=True)
-        ],
-        "points": [row.to_document() for row in rows],
-    }
+    document = codec.plain(
+        {
+            "title": title,
+            "columns": {
+                name: {"label": column.label, "unit": column.unit, "better": column.better}
+                for name, column in COLUMNS.items()
+            },
+            "fronts": [
+                {"x": plot.x, "y": plot.y, "points": front}
+                for plot, front in zip(study.pareto, fronts, strict=True)
+            ],
+            "points": rows,
+        }
+    )
     storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, fronts))
     storage.write_text(directory.path / "table.json", codec.plain_text(document))
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
-from workflow.study.points import Point, PointMaker
+from workflow.study.points import Contradiction, Point, PointMaker
 from workflow.study.rows import PointRow
 from workflow.study.settings import Axis, StudyConfig, tidy
 
@@ -22,7 +22,7 @@ class Strategy(Protocol):
     def count(self) -> int:
         """Points in all."""
 
-    def batches(self) -> Iterator[list[Point]]:
+    def batches(self) -> Iterator[list[Point | Contradiction]]:
         """The points, in an order that does not depend on who computes them."""
 
     def learn(self, rows: Sequence[PointRow]) -> None:
@@ -39,7 +39,7 @@ class Grid:
     def count(self) -> int:
         return len(self._points)
 
-    def batches(self) -> Iterator[list[Point]]:
+    def batches(self) -> Iterator[list[Point | Contradiction]]:
         yield self._points
 
     def learn(self, rows: Sequence[PointRow]) -> None:
@@ -67,8 +67,7 @@ class ParzenSearch:
         self._study, self._maker = study, maker
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         words = hashlib.sha256(f"search\0{seed}".encode()).digest()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Optuna announces which of its options are new
+        with warnings.catch_warnings(action="ignore"):  # Optuna announces which of its options are new
             sampler = optuna.samplers.TPESampler(
                 seed=int.from_bytes(words[:4], "little"),
                 n_startup_trials=study.search.startup_trials,
@@ -89,12 +88,11 @@ class ParzenSearch:
     def count(self) -> int:
         return self._study.search.trials
 
-    def batches(self) -> Iterator[list[Point]]:
+    def batches(self) -> Iterator[list[Point | Contradiction]]:
         left = self.count
         while left > 0:
             size = min(left, self._study.search.batch)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"):
                 self._asked = [self._search.ask() for _ in range(size)]
                 values = [
                     {axis.key: _suggest(trial, axis) for axis in self._study.axes} for trial in self._asked
@@ -106,8 +104,7 @@ class ParzenSearch:
         for trial, row in zip(self._asked, rows, strict=True):
             goals = [row.numbers.get(name) for name in self._study.search.objectives]
             trial.set_user_attr("violation", 0.0 if row.good else _excess(row.numbers))
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"):
                 if None in goals:
                     self._search.tell(trial, state=self._optuna.trial.TrialState.FAIL)
                 else:
