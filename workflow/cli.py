@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -36,6 +36,9 @@ from workflow.engine.errors import (
 )
 from workflow.engine.threads import one_thread_unless_told
 
+if TYPE_CHECKING:
+    from workflow.tasks.summary import RunSummary
+
 app = typer.Typer(
     name="flexlink",
     help="From a flexible-link arm and its logs to a robust controller with a certificate.",
@@ -47,6 +50,10 @@ app = typer.Typer(
     "runs/first",
 )
 
+Jobs = Annotated[
+    int | None,
+    typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -89,15 +96,12 @@ def run(
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config)
     from workflow.commands.run import run_from_files
-    from workflow.console import TerminalProgress, print_summary
+    from workflow.console import TerminalProgress
 
     with TerminalProgress() as progress:
         summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
-    if as_json:
-        print_json(summary.to_document())
-    else:
-        print_summary(summary)
-    _leave(summary.certified, summary.verdict)
+    _show(summary, as_json)
+    _leave(summary)
 
 
 @app.command(short_help="Simulate experiments and write them as CSV.")
@@ -236,7 +240,7 @@ def identify(
     from ident.basis.options import IdentOptions
     from workflow.commands.identify import identify_logs
     from workflow.config.settings import check
-    from workflow.console import TerminalProgress, print_summary
+    from workflow.console import TerminalProgress
 
     chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "noise": noise}
     chosen |= {"omega_min_rad_s": omega_min, "omega_max_rad_s": omega_max}
@@ -270,7 +274,7 @@ def identify(
         document = summary.to_document()
         print_json({key: document[key] for key in ("title", "verdict", "report", "numbers", "table")})
     else:
-        print_summary(summary)
+        _show(summary, as_json)
         for name, path in (("model", export), ("model for flexlink design", out)):
             if path is not None:
                 typer.echo(f"{name}: {path}")
@@ -312,14 +316,10 @@ def design(
     """Design and certify one controller for one or several plants, identified here or brought along."""
     need(*source, specification)
     from workflow.commands.design import design_controller
-    from workflow.console import print_summary
 
     summary = design_controller(source, specification, out=out, seed=seed)
-    if as_json:
-        print_json(summary.to_document())
-    else:
-        print_summary(summary)
-    _leave(summary.certified, summary.verdict)
+    _show(summary, as_json)
+    _leave(summary)
 
 
 @app.command(short_help="Write report.html of a run anew.")
@@ -329,24 +329,17 @@ def report(
 ) -> None:
     """Write report.html of a run directory anew and print its table."""
     from workflow.commands.run import rebuild_report
-    from workflow.console import print_summary
     from workflow.engine.run_directory import RunDirectory
 
     summary = rebuild_report(RunDirectory.open(directory))
-    if as_json:
-        print_json(summary.to_document())
-    else:
-        print_summary(summary)
+    _show(summary, as_json)
 
 
 @app.command(short_help="Many designs for one plant: table, Pareto plot.")
 def study(
     config: Annotated[Path, typer.Option(help="TOML file of the study (see examples/study.toml).")],
     out: Annotated[Path, typer.Option(help="Directory of the study, new or empty.")],
-    jobs: Annotated[
-        int | None,
-        typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
-    ] = None,
+    jobs: Jobs = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
@@ -364,18 +357,15 @@ def study(
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
     need(config)
-    from workflow.console import TerminalProgress, print_summary
+    from workflow.console import TerminalProgress
     from workflow.study.run import run_study
 
     with TerminalProgress() as progress:
         summary = run_study(
             config, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
         )
-    if as_json:
-        print_json(summary.to_document())
-    else:
-        print_summary(summary)
-    _leave(summary.certified, summary.verdict)
+    _show(summary, as_json)
+    _leave(summary)
 
 
 @app.command(short_help="Why machine and model differ: cause, size, closure.")
@@ -396,10 +386,7 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
-    ] = None,
+    jobs: Jobs = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the diagnosis in --out; finished cases are taken up.")
     ] = False,
@@ -415,7 +402,7 @@ def diagnose(
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
     if not any(place.exists() for place in case):
         need(*case)
-    from workflow.console import TerminalProgress, print_summary
+    from workflow.console import TerminalProgress
     from workflow.diagnose.command import diagnose_cases
 
     with TerminalProgress() as progress:
@@ -432,9 +419,9 @@ def diagnose(
     if as_json:
         print_json(found.to_document())
     else:
-        print_summary(found.summary)
+        _show(found.summary, as_json)
     for line in found.complaints():
-        print(f"flexlink: {line}", file=sys.stderr)  # noqa: T201
+        _complain(line, found.exit_code)
     if found.exit_code != EXIT_OK:
         raise typer.Exit(found.exit_code)
 
@@ -451,10 +438,18 @@ def print_json(document: Mapping[str, Any]) -> None:
     sys.stdout.write(plain_text(document))
 
 
-def _leave(certified: bool, verdict: str) -> None:
-    if not certified:
-        print(f"flexlink: {one_line(verdict)}", file=sys.stderr)  # noqa: T201
-        raise typer.Exit(EXIT_NOT_CERTIFIED)
+def _show(summary: RunSummary, as_json: bool) -> None:
+    from workflow.console import print_summary
+
+    if as_json:
+        print_json(summary.to_document())
+    else:
+        print_summary(summary)
+
+
+def _leave(summary: RunSummary) -> None:
+    if not summary.certified:
+        raise typer.Exit(_complain(summary.verdict, EXIT_NOT_CERTIFIED))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -530,7 +525,7 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
 
 
 def _warn(message: Warning | str, *about: object, **more: object) -> None:
-    print(f"flexlink: {one_line(message)}", file=sys.stderr)  # noqa: T201
+    _complain(str(message), EXIT_OK)
 
 
 def _explain(error: Exception) -> tuple[str, int]:

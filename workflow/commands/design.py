@@ -66,21 +66,15 @@ class _Asked:
             if run is None:
                 raise InputError(f"{paths[0]} holds no specification: give --spec FILE")
             specification = run.specification
-        if run is None:
-            return cls(
-                specification,
-                file.synthesis or SynthesisOptions(),
-                file.certificate or CertificateOptions.model_validate({}),
-                file.achievable_performance or AchievableOptions.model_validate({}),
-                file.reference_filter,
-            )
+        # A design file without [reference_filter] asks for none; it has no other way to.
+        filtered = run if run is not None and file.path is None else file
         return cls(
             specification,
-            file.synthesis or run.synthesis,
-            file.certificate or run.certificate,
-            file.achievable_performance or run.achievable_performance,
-            # A design file without [reference_filter] asks for none; it has no other way to.
-            run.reference_filter if file.path is None else file.reference_filter,
+            file.synthesis or (run.synthesis if run else SynthesisOptions()),
+            file.certificate or (run.certificate if run else CertificateOptions.model_validate({})),
+            file.achievable_performance
+            or (run.achievable_performance if run else AchievableOptions.model_validate({})),
+            filtered.reference_filter,
         )
 
 

@@ -6,20 +6,19 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from control_design.convex.reference_filter import ReferenceFilterOptions
 from control_design.convex.youla import YoulaOptions
 from control_design.specification import RationalWeight
+from workflow.config.settings import Section
 
 FEWEST_DRAWS = 100
 _LASTING = 100.0  # how much more than a passing error one weighs that lasts
 
 
-class CertificateOptions(BaseModel):
+class CertificateOptions(Section):
     """[certificate]: what is said of whole responses, of which the ellipses know one frequency at a time."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     joint_coverage: float = Field(
         0.95, gt=0, lt=1, description="share of whole responses for which the worst case shall hold"

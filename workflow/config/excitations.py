@@ -7,16 +7,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from plant import excitation
+from workflow.config.settings import Section
 
 Real = npt.NDArray[np.float64]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Table(Section):
     @abstractmethod
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
         """Voltage (T,). Raises ValueError where the numbers do not fit together."""

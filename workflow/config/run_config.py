@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import tomlkit
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from control_design.specification import Specification
 from control_design.synthesis.synthesis import SynthesisOptions
@@ -24,16 +24,10 @@ from workflow.config.design_options import (
 )
 from workflow.config.excitations import Excitation
 from workflow.config.rig_settings import EffectTable, RigChoice
-from workflow.config.settings import InputPath, check, read_toml
+from workflow.config.settings import InputPath, Section, check, read_toml, repeated
 
 Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
-
-
-class Section(BaseModel):
-    """Unknown keys are refused by name; nothing changes after loading; nan and inf are no settings."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class RunSection(Section):
@@ -44,10 +38,6 @@ class RunSection(Section):
         "", description="headline of the report; the name if empty"
     )
     seed: int = Field(2006, ge=0, description="root of every random stream of the run")
-
-
-# -- where records come from
-# -----------------------------------------------------------------------------------
 
 
 class SimulatedRecord(Section):
@@ -131,10 +121,6 @@ class FileSource(Section):
 
 
 Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
-
-
-# -- what is made of them
-# --------------------------------------------------------------------------------------
 
 
 class UncertaintyOptions(EmbeddingOptions):
@@ -279,9 +265,8 @@ class RunConfig(Section):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
         labels = [channel.label for channel in self.channels]
-        for label in labels:
-            if labels.count(label) > 1:
-                raise ValueError(f"two channels are called {label!r}: give them different names")
+        if (label := repeated(labels)) is not None:
+            raise ValueError(f"two channels are called {label!r}: give them different names")
         control = [label for index, label in enumerate(labels) if self.purpose_of(index) == "control"]
         if len(control) != 1:
             raise ValueError(
@@ -289,10 +274,8 @@ class RunConfig(Section):
             )
         if len({channel.input for channel in self.channels}) > 1:
             raise ValueError("all channels must have the same input: the controller drives one actuator")
-        names = self.record_names
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"two records are called {name!r}: give them different names")
+        if (name := repeated(self.record_names)) is not None:
+            raise ValueError(f"two records are called {name!r}: give them different names")
         self._refuse_the_same_rows_twice()
         if not any(record.role == "estimation" for record in self.source.records):
             raise ValueError("no record has role 'estimation': there is nothing to identify from")

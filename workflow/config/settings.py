@@ -6,29 +6,37 @@ import difflib
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ValidationError, ValidationInfo
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails
 
 from workflow.config.renamed_keys import with_current_keys
-from workflow.engine.errors import InputError
+from workflow.engine import storage
+from workflow.engine.errors import InputError, shortened
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
+T = TypeVar("T")
 
 _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
+class Section(BaseModel):
+    """Unknown keys are refused by name; nothing changes after loading; nan and inf are no settings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def repeated(values: Sequence[T]) -> T | None:
+    """The first that is there more than once, if any."""
+    return next((value for value in values if values.count(value) > 1), None)
+
+
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # editors on Windows like to put a mark in front
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+    text = storage.read_text(path)
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -69,9 +77,9 @@ def _first_converted(given: Any, found: Any, where: str = "") -> str | None:
             if complaint:
                 return complaint
     elif isinstance(found, bool) and not isinstance(given, bool):
-        return f"{where}: input should be true or false, got {_short(given)}"
+        return f"{where}: input should be true or false, got {shortened(given)}"
     elif isinstance(found, (int, float)) and not isinstance(found, bool) and isinstance(given, (bool, str)):
-        return f"{where}: input should be a number, got {_short(given)}"
+        return f"{where}: input should be a number, got {shortened(given)}"
     return None
 
 
@@ -104,16 +112,11 @@ def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
     if kind == "value_error":
         return where + message
     message = message[:1].lower() + message[1:]
-    return f"{where}{message}, got {_short(detail['input'])}"
+    return f"{where}{message}, got {shortened(detail['input'])}"
 
 
 def _bare(text: object) -> str:
     return str(text).strip("'")
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _walk(model: type[BaseModel], location: Iterable[int | str]) -> tuple[str, list[str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -15,8 +15,7 @@ from diagnosis.machine.case import Case, Experiment
 from ident.data.record import Record
 from plant.effects import EFFECTS
 from plant.rig import Rig
-from workflow.config.run_config import Section
-from workflow.config.settings import check, expand, read_toml
+from workflow.config.settings import Section, check, expand, read_toml
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
@@ -155,15 +154,6 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
         suspected=settings.suspected,
         input_sha256=hash_of({"name": name, **hashes}),
     )
-
-
-def refuse_equal_names(names: Sequence[str]) -> None:
-    """Raises InputError where two cases would write the same files."""
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(
-                f"two cases are called {name!r}: give one another name in its {CASE_FILE} (key 'case')"
-            )
 
 
 def _rig(path: Path) -> Rig:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from workflow.diagnose.case_files import LoadedCase, load_case, refuse_equal_names
+from workflow.config.settings import repeated
+from workflow.diagnose.case_files import CASE_FILE, LoadedCase, load_case
 from workflow.diagnose.directory import DiagnosisDirectory
 from workflow.diagnose.outputs import Engine, Work
 from workflow.diagnose.overview import closure_words, overview_page, short_answer
@@ -133,7 +134,10 @@ def _load(places: Sequence[Path], rig: str | None) -> tuple[list[LoadedCase], li
     if not loaded:
         more = f" (and {len(failures) - 1} more cases cannot be read)" if len(failures) > 1 else ""
         raise InputError(failures[0][1].reason + more)
-    refuse_equal_names([one.case.name for one in loaded])
+    if (name := repeated([one.case.name for one in loaded])) is not None:
+        raise InputError(
+            f"two cases are called {name!r}: give one another name in its {CASE_FILE} (key 'case')"
+        )
     return loaded, failures
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import control
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+from scipy.signal import cont2discrete
 
 from plant.effects import Effect, make_machine
 from plant.machine import VoltagePath
@@ -56,28 +56,22 @@ def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> contr
     first, early = _held(a, b, late)
     second, now = _held(a, b, dt_s - late)
     past = whole + int(late > 0)
-    size = n + past
-    A, B = np.zeros((size, size)), np.zeros((size, 1))
-    A[:n, :n] = second @ first
-    # columns[k]: effect of the voltage commanded k samples ago.
-    columns = [np.zeros((n, 1)) for _ in range(past + 1)]
-    columns[whole] += now
+    # columns[:, k]: effect of the voltage commanded k samples ago.
+    columns = np.zeros((n, past + 1))
+    columns[:, whole] += now[:, 0]
     if late > 0:
-        columns[whole + 1] += second @ early
-    B[:n] = columns[0]
-    for k in range(1, past + 1):
-        A[:n, n + k - 1 : n + k] = columns[k]
+        columns[:, whole + 1] += (second @ early)[:, 0]
+    A, B = np.zeros((n + past, n + past)), np.zeros((n + past, 1))
+    A[:n, :n], A[:n, n:], B[:n] = second @ first, columns[:, 1:], columns[:, :1]
     if past:
         B[n] = 1.0
-        A[n + 1 :, n : size - 1] = np.eye(past - 1)
+        A[n + 1 :, n:-1] = np.eye(past - 1)
     C = np.hstack([c, np.zeros((c.shape[0], past))])
     return control.ss(A, B, C, np.zeros((c.shape[0], 1)), dt_s)
 
 
 def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:
     """e^(a t) and the integral of e^(a s) b over (0, t)."""
-    n, m = b.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n], block[:n, n:] = a, b
-    block = expm(block * time_s)
-    return block[:n, :n], block[:n, n:]
+    none = np.zeros((1, len(a))), np.zeros((1, b.shape[1]))
+    step, held, *_ = cont2discrete((a, b, *none), time_s, "zoh")
+    return step, held

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import tomlkit
+
 from plant.effects import Effect
 from plant.rig import Rig
 
@@ -28,11 +30,6 @@ def rig_text(
 
 def effects_text(case: str, effects: Sequence[Effect]) -> str:
     """The effects as [[effects]] tables, in the spelling of [[source.effects]] in a run configuration."""
-    lines = [
-        f"# {case}: effects found by flexlink diagnose; in a run configuration they go under "
-        "[[source.effects]]"
-    ]
-    for effect in effects:
-        lines += ["", "[[effects]]", f'name = "{effect.id}"']
-        lines += [f"{name} = {value!r}" for name, value in effect.parameters().items()]
-    return "\n".join(lines) + "\n"
+    tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in effects]})
+    place = "in a run configuration they go under [[source.effects]]"
+    return f"# {case}: effects found by flexlink diagnose; {place}\n\n{tables}"

@@ -23,6 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
+from workflow.engine.errors import shortened
+
 T = TypeVar("T")
 AnyArray = npt.NDArray[Any]
 
@@ -274,5 +276,4 @@ def _member(union: Any, document: Any, at: str) -> Any:
 
 def _expect(fits: bool, document: Any, at: str, wanted: str) -> None:
     if not fits:
-        text = repr(document)
-        raise CodecError(f"{at}: expected {wanted}, got {text if len(text) <= 60 else text[:57] + '...'}")
+        raise CodecError(f"{at}: expected {wanted}, got {shortened(document)}")

@@ -23,6 +23,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
+def shortened(value: object) -> str:
+    """How a value is written, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
 class InputError(ValueError):
     """Something the user gave (file, key, path, column) cannot be used; the message is one line."""
 

@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from workflow.engine import codec, storage
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import InputError, naming, shortened
 from workflow.engine.store import Store
 
 LAYOUT_VERSION = 3  # 3: results by codec
@@ -246,9 +246,9 @@ def first_difference(old: Any, new: Any, where: str = "") -> str | None:
         for key in [*old, *(key for key in new if key not in old)]:
             inner = f"{where}.{key}" if where else str(key)
             if key not in new:
-                return f"{inner} (was {_short(old[key])}, now absent)"
+                return f"{inner} (was {shortened(old[key])}, now absent)"
             if key not in old:
-                return f"{inner} (was absent, now {_short(new[key])})"
+                return f"{inner} (was absent, now {shortened(new[key])})"
             found = first_difference(old[key], new[key], inner)
             if found:
                 return found
@@ -260,7 +260,7 @@ def first_difference(old: Any, new: Any, where: str = "") -> str | None:
                 return found
         return None
     # repr tells 1 from 1.0 and True, and nan from nan is no difference.
-    return None if repr(old) == repr(new) else f"{where} (was {_short(old)}, now {_short(new)})"
+    return None if repr(old) == repr(new) else f"{where} (was {shortened(old)}, now {shortened(new)})"
 
 
 def _recorded_hash(path: Path) -> str | None:
@@ -270,11 +270,6 @@ def _recorded_hash(path: Path) -> str | None:
         return str(storage.read_npz(path, only=_INPUT_HASH)[_INPUT_HASH])
     except InputError:
         return None  # damaged from outside: treat as not done
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _now() -> str:

@@ -81,7 +81,7 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 def read_text(path: Path) -> str:
     """UTF-8 text of a file. Raises InputError naming it."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # editors on Windows like to put a mark in front
     except OSError as error:
         raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
     except UnicodeDecodeError as error:

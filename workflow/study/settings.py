@@ -12,8 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from workflow.config.renamed_keys import current_key
-from workflow.config.run_config import Section
-from workflow.config.settings import check, expand, read_toml
+from workflow.config.settings import Section, check, expand, read_toml, repeated
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
 from workflow.study.keys import last_name, parse_key
@@ -62,9 +61,7 @@ class Axis(Section):
         if self.values is not None:
             if self.points is not None or self.log:
                 raise ValueError("points and log go with from and to")
-            texts = [repr(value) for value in self.values]
-            twice = next((text for text in texts if texts.count(text) > 1), None)
-            if twice is not None:
+            if (twice := repeated([repr(value) for value in self.values])) is not None:
                 raise ValueError(f"the value {twice} is listed twice")
         elif self.from_ is None or self.to is None:
             raise ValueError("a range needs from and to")
@@ -169,9 +166,8 @@ class StudyConfig(Section):
             ("keys", [axis.key for axis in self.axes]),
             ("labels", [axis.name for axis in self.axes]),
         ):
-            for name in names:
-                if names.count(name) > 1:
-                    raise ValueError(f"two axes have the same {kind[:-1]} {name!r}: give different {kind}")
+            if (name := repeated(names)) is not None:
+                raise ValueError(f"two axes have the same {kind[:-1]} {name!r}: give different {kind}")
         if self.study.seed is not None and any(axis.key == "run.seed" for axis in self.axes):
             raise ValueError("study.seed and an axis over run.seed contradict each other")
         if self.search.method == "grid":

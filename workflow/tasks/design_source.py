@@ -35,8 +35,8 @@ from workflow.config.design_options import (
     CertificateOptions,
     ReferenceFilterSettings,
 )
-from workflow.config.run_config import RunConfig, Section
-from workflow.config.settings import InputPath, ModelT, check, read_toml
+from workflow.config.run_config import RunConfig
+from workflow.config.settings import InputPath, ModelT, Section, check, read_toml
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory

@@ -17,8 +17,8 @@ from ident.checks.plausible_modes import LARGEST_DAMPING
 from plant import parse_effect
 from plant.effects import make_machine
 from plant.modal import default_n_modes, equations_of_motion
-from workflow.config.run_config import Section, SimulatedSource
-from workflow.config.settings import check
+from workflow.config.run_config import SimulatedSource
+from workflow.config.settings import Section, check
 from workflow.engine.errors import InputError
 from workflow.tasks.results import IdentifiedChannel
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, rig_of
