@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import tomllib
+from contextlib import closing
 
 import numpy as np
 import pytest

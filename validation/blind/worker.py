@@ -87,5 +87,5 @@ class BlindCase:
 
 def failed(case: str, reason: str) -> dict[str, Any]:
     """The answer of a case without one: it counts as wrong."""
-    nothing = {"effects": [], "combination": [], "gap_after": None}
+    nothing: dict[str, Any] = {"effects": [], "combination": [], "gap_after": None}
     return {"case": case, "verdict": "failed", **nothing, "reason": reason}
