@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -84,36 +84,41 @@ class Invalidation:
     """Comparison of a predicted and a measured response, both with covariances.
 
     distance (F,): length of the difference in units of the ellipse of both covariances together at `level` (1
-    = on its boundary); probability (F,) of a difference as large if the prediction holds; n_outside
-    frequencies lie outside, worst_omega_rad_s is the least probable; joint_probability is that of the least
-    probable one among F independent frequencies; invalidated when it is below 1 - level; no more than
-    n_expected_outside lie outside by chance, at that level.
+    = on its boundary).
     """
 
     omega_rad_s: RealArray
     distance: RealArray
-    probability: RealArray
     level: float
-    n_outside: int
-    worst_omega_rad_s: float
-    joint_probability: float
-    invalidated: bool
-    n_expected_outside: int
 
     def __post_init__(self) -> None:
-        lock(self, "omega_rad_s", "distance", "probability")
+        lock(self, "omega_rad_s", "distance")
+
+    @property
+    def probability(self) -> RealArray:
+        """(F,) of a difference as large if the prediction holds."""
+        return np.asarray(chi2.sf((self.distance * chi2_radius(self.level)) ** 2, 2))
+
+    @property
+    def joint_probability(self) -> float:
+        """That of the least probable difference among F independent frequencies."""
+        least = min(float(self.probability.min()), 1 - 1e-16)
+        return float(-np.expm1(self.distance.size * np.log1p(-least)))
 
     @property
     def finding(self) -> Finding:
+        """Invalidated where the joint probability is below 1 - level; by chance no more than `expected`
+        frequencies lie outside, at that level."""
+        n = self.distance.size
         return finding(
             FindingKind.INVALIDATION,
-            invalidated=self.invalidated,
+            invalidated=self.joint_probability < 1 - self.level,
             level=self.level,
-            n=self.distance.size,
-            outside=self.n_outside,
-            expected=self.n_expected_outside,
-            worst_rad_s=self.worst_omega_rad_s,
-            worst_distance=float(self.distance.max()),
+            n=n,
+            outside=int(np.count_nonzero(self.distance > 1)),
+            expected=int(binom.ppf(self.level, n, 1 - self.level)),
+            worst_rad_s=self.omega_rad_s[np.argmax(self.distance)],
+            worst_distance=self.distance.max(),
         )
 
 
@@ -125,31 +130,8 @@ def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) 
     """
     if not np.array_equal(predicted.omega_rad_s, measured.omega_rad_s):
         raise ValueError("predicted and measured responses are on different frequency grids")
-    both = FrequencyUncertainty(
-        predicted.omega_rad_s,
-        predicted.centre,
-        predicted.covariance + measured.covariance,
-        predicted.dt_s,
-        predicted.level,
-    )
-    distance = both.normalised_distance(measured.centre)
-    probability = chi2.sf((distance * chi2_radius(both.level)) ** 2, 2)
-    worst = int(np.argmax(distance))
-    n, outside = distance.size, int(np.count_nonzero(distance > 1))
-    joint = float(-np.expm1(n * np.log1p(-min(float(probability[worst]), 1 - 1e-16))))
-    invalidated = joint < 1 - both.level
-    expected = int(binom.ppf(both.level, n, 1 - both.level))
-    return Invalidation(
-        both.omega_rad_s,
-        distance,
-        np.asarray(probability),
-        both.level,
-        outside,
-        float(both.omega_rad_s[worst]),
-        joint,
-        bool(invalidated),
-        expected,
-    )
+    both = replace(predicted, covariance=predicted.covariance + measured.covariance)
+    return Invalidation(both.omega_rad_s, both.normalised_distance(measured.centre), both.level)
 
 
 @dataclass(frozen=True)
