@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,13 +61,16 @@ class Obstacle(Enum):
 class AllFrequencies:
     """What was proved for every frequency from 0 to Nyquist, ends included, on one plant.
 
-    obstacle: why nothing was proved; None: no ellipse reaches -1 anywhere and the winding of 1 + K c is the
-    one of a stable loop. bounds: upper bound of each weighted worst case (inf: none found), gamma the largest
-    of them. distance: lower bound of dist(-1, K E). half_turns: of 1 + K c from 0+ to Nyquist, in units of
-    pi, exact by the intervals (0 without a proof).
+    possible: the uncertainty can be bounded between frequencies. proved: no ellipse reaches -1 anywhere and
+    the winding of 1 + K c is the one of a stable loop. obstacle: why nothing was proved. bounds: upper bound
+    of each weighted worst case (inf: none found), gamma the largest of them. distance: lower bound of
+    dist(-1, K E). half_turns: of 1 + K c from 0+ to Nyquist, in units of pi, exact by the intervals (0
+    without a proof).
     """
 
-    obstacle: Obstacle | None
+    possible: bool
+    proved: bool
+    obstacle: Obstacle | None = None
     obstacle_at: float | None = None
     gamma: float = np.inf
     bounds: dict[str, float] = field(default_factory=dict)
@@ -74,14 +78,11 @@ class AllFrequencies:
     half_turns: float = 0.0
     intervals: int = 0
 
-    @property
-    def proved(self) -> bool:
-        return self.obstacle is None
-
-    @property
-    def possible(self) -> bool:
-        """Whether the uncertainty can be bounded between frequencies."""
-        return self.obstacle in (None, Obstacle.NOT_STABLE, Obstacle.NO_DISTANCE, Obstacle.WINDING)
+    @classmethod
+    def ended_by(cls, obstacle: Obstacle, at: float | None = None, **found: Any) -> AllFrequencies:
+        """Nothing proved, and why."""
+        tried = obstacle in (Obstacle.NOT_STABLE, Obstacle.NO_DISTANCE, Obstacle.WINDING)
+        return cls(tried, False, obstacle, at, **found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,14 +291,14 @@ def bound_all_frequencies(
     members = expandable(plant.channel, plant.n_integrators, between_own_points)
     if members is None:
         known = plant.own_grid is not None
-        return AllFrequencies(Obstacle.OWN_FREQUENCIES if known else Obstacle.NO_DERIVATIVES)
+        return AllFrequencies.ended_by(Obstacle.OWN_FREQUENCIES if known else Obstacle.NO_DERIVATIVES)
     asked: list[_Asked] = []
     for requirement in specification.weighted(plant):
         channel = None
         if requirement.channel is not None:
             channel = expandable(requirement.channel, 0, between_own_points)
             if channel is None:
-                return AllFrequencies(Obstacle.OWN_PERFORMANCE_FREQUENCIES)
+                return AllFrequencies.ended_by(Obstacle.OWN_PERFORMANCE_FREQUENCIES)
         asked.append(
             _Asked(requirement, RationalResponse.from_weight(requirement.weight, plant.dt_s), channel)
         )
@@ -319,7 +320,7 @@ def bound_all_frequencies(
     )
     difference = _model_error(loop, controller, edges[1:])
     if difference > _MODEL_ERROR:
-        return AllFrequencies(Obstacle.INEXACT, difference)
+        return AllFrequencies.ended_by(Obstacle.INEXACT, difference)
     targets = {}
     for each in loop.asked:
         most = worst.peak(each.requirement.name)[0]
@@ -408,7 +409,7 @@ def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -
     distance = float(np.min(distances))
     if distance <= 0:
         omega = float(centre[order][np.argmin(distances)])
-        return AllFrequencies(Obstacle.NO_DISTANCE, omega, bounds=bounds, intervals=used)
+        return AllFrequencies.ended_by(Obstacle.NO_DISTANCE, omega, bounds=bounds, intervals=used)
     # Within an interval 1 + L stays in a half-plane, so the principal value of the turn from its start to its
     # end is the turn; at a joint the two estimates of one value differ by less than a quarter turn each.
     turn = float(np.sum(np.angle(end / start)) + np.sum(np.angle(start[1:] / end[:-1])))
@@ -416,5 +417,7 @@ def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -
     turn += float(np.angle(start[0] * np.sign(start[0].real)) - np.angle(end[-1] * np.sign(end[-1].real)))
     turns = float(np.round(turn / np.pi))
     half_turns = turns - integrators / 2.0 + 0.0  # no minus sign on zero
-    obstacle = None if turns == unstable + integrators else Obstacle.WINDING
-    return AllFrequencies(obstacle, None, max(bounds.values()), bounds, distance, half_turns, used)
+    stable = turns == unstable + integrators
+    obstacle = None if stable else Obstacle.WINDING
+    largest = max(bounds.values())
+    return AllFrequencies(True, stable, obstacle, None, largest, bounds, distance, half_turns, used)

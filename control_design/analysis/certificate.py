@@ -208,7 +208,7 @@ def _check_plant(
             between_own_points=between_own_points,
         )
     else:
-        proof = AllFrequencies(Obstacle.NOT_STABLE)
+        proof = AllFrequencies.ended_by(Obstacle.NOT_STABLE)
     verdict = PlantVerdict(
         plant=plant.name,
         stable=stable,
