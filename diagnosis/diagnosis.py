@@ -349,9 +349,14 @@ def _named(
     rounding: Rounding | None,
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
-    samples = float(np.mean([len(record.output) for record in model.case.estimation]))
+    case = model.case
+    samples = float(np.mean([len(record.output) for record in case.estimation]))
+
+    def held_out_gap(end: Fit) -> float:
+        return _held_out(case, model.by_experiment(end.deviations, end.effects, case.held_out))
+
     entries = []
-    for name in model.case.machine.weighing.listed:
+    for name in case.machine.weighing.listed:
         holding = [h for h in hypotheses if name in h.names]
         parameters: dict[str, float] = {}
         intervals: dict[str, tuple[float, float]] = {}
@@ -361,10 +366,10 @@ def _named(
             k = end.names.index(name)
             parameters = end.candidates[k].parameters(end.coordinates[k])
             intervals = _intervals(end, k, samples, rng)
-            gap = pooled_rms(model.whitened(end.deviations, end.effects, model.case.held_out))
+            gap = held_out_gap(end)
         elif rounding is not None and name == rounding.name:
             parameters, intervals = rounding.effect.parameters(), rounding.intervals
-            gap = pooled_rms(model.whitened(last.deviations, last.effects, model.case.held_out))
+            gap = held_out_gap(last)
         entries.append(
             NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
         )

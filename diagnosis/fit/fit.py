@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine, Weighing
-from diagnosis.machine.quantisation_grid import log_normal_mass
 from plant.effects.search_space import Candidate
 
 # Steps of difference quotients along the deviations. Where contacts switch, a small step measures which way
@@ -285,4 +285,5 @@ def _inside(x: float, slope: float, spread: float, low: float, high: float) -> f
     # log(Phi(b) - Phi(a)), from the tail that keeps digits.
     if a > 0:
         a, b = -b, -a
-    return float(shift + log_normal_mass(a, b))
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return float(shift + upper + np.log1p(-np.exp(min(lower - upper, -1e-300))))

@@ -40,17 +40,14 @@ class ResidualModel:
         whole = np.concatenate([self._weighed(simulator, experiment).ravel() for experiment in experiments])
         return whole if self.scale == 1.0 else whole / self.scale
 
-    def whitened(
-        self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine]
-    ) -> Real:
-        """(measured - model)/noise (N,) of the given experiments, whatever they weigh in a fit."""
+    def by_experiment(
+        self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
+    ) -> dict[str, Real]:
+        """(measured - model)/noise (T, Y) of the given experiments (default: all), whatever they weigh in a
+        fit."""
         simulator = self.nominal.at(deviations).simulator(effects)
-        return np.concatenate([self._one(simulator, e).ravel() for e in experiments])
-
-    def by_experiment(self, deviations: Real, effects: Sequence[Any]) -> dict[str, Real]:
-        """Residuals (T, Y) of every experiment."""
-        simulator = self.nominal.at(deviations).simulator(effects)
-        return {e.name: self._one(simulator, e) for e in self.case.experiments}
+        experiments = self.case.experiments if experiments is None else experiments
+        return {e.name: self._one(simulator, e) for e in experiments}
 
     def _weighed(self, simulator: Simulator, experiment: RecordOfMachine) -> Real:
         e = self._one(simulator, experiment)

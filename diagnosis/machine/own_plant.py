@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -122,6 +122,9 @@ class PlantEffect:
     grows: bool = True
     dependence: Dependence = "smooth"
     group: str = ""
+    # Which of its own parameters an effect multiplies nobody said.
+    multiplies: ClassVar[str | None] = None
+    harmonic: ClassVar[Harmonic | None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", tuple(self.parameters))
@@ -149,15 +152,6 @@ class PlantEffect:
     @property
     def id(self) -> str:
         return self.name
-
-    @property
-    def multiplies(self) -> str | None:
-        """None: which of its own parameters an effect multiplies nobody said."""
-        return None
-
-    @property
-    def harmonic(self) -> Harmonic | None:
-        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,12 +74,12 @@ def cell_residual(measured: Real, model: Real, step: float, noise: float) -> Rea
     half = 0.5 * step / noise
     # Mirrored so that both ends lie left of the far tail.
     a, b = -np.abs(e) - half, -np.abs(e) + half
-    log_cell = log_normal_mass(a, b)
-    log_best = float(log_normal_mass(np.array([-half]), np.array([half]))[0])
+    log_cell = _log_difference(a, b)
+    log_best = float(_log_difference(np.array([-half]), np.array([half]))[0])
     return np.asarray(np.sign(e) * np.sqrt(np.maximum(2 * (log_best - log_cell), 0.0)))
 
 
-def log_normal_mass(a: Real | float, b: Real | float) -> Real:
-    """log(Phi(b) - Phi(a)) for a < b, to many digits where a is below zero."""
+def _log_difference(a: Real, b: Real) -> Real:
+    """log(Phi(b) - Phi(a)) for a < b, a below zero."""
     upper, lower = log_ndtr(b), log_ndtr(a)
     return np.asarray(upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-300))))

@@ -1,4 +1,4 @@
-"""The recorded cases of an independent finite-element rig, read without the project's own readers."""
+"""Cases of independent rigs: recorded ones, read without the project's own readers, and simulated ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import tomllib
 import numpy as np
 
 from diagnosis import Case, Experiment
-from plant import Rig
+from plant import Rig, prbs
+from validation.blind.rigs import rig_toml
+from validation.blind.truth import Truth
 
 
 def recorded_case(folder, rig="rig.toml"):
@@ -21,3 +23,20 @@ def recorded_case(folder, rig="rig.toml"):
 
 def answer(folder):
     return tomllib.loads((folder / "answer.toml").read_text(encoding="utf-8"))
+
+
+def simulated_case(folder, table, records, rng, *, samples=900, register=7, stated=None, tolerances=None):
+    """A case by the blind protocol's simulator, which shares no code with the model that is diagnosed.
+
+    records: role, effects, samples each value of the voltage is held, largest voltage; stated: the rig's
+    values as its makers know them, where they are not the true ones in `table`.
+    """
+    file = folder / "rig.toml"
+    file.write_text(rig_toml(table if stated is None else stated, tolerances or {}), encoding="utf-8")
+    experiments = []
+    for k, (role, effects, hold, amplitude_V) in enumerate(records):
+        machine = Truth(table, effects)
+        voltage = prbs(register, hold, amplitude_V, samples, rng)
+        measured = machine.record(voltage).measured(rng.standard_normal((samples, 2)) * machine.noise)
+        experiments.append(Experiment(f"{k}", role, voltage, measured, "prbs"))
+    return Case("simulated", Rig.from_toml(file), tuple(experiments))

@@ -5,30 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from diagnosis import Case, Experiment
-from plant import Rig, multisine, multisine_lines, prbs, simulate
+from plant import multisine, multisine_lines, paper_link, prbs, simulate
 
-RIG = Rig.model_validate(
+RIG = paper_link().perturbed(
     {
-        "link": {
-            "length_m": 0.6,
-            "width_m": 0.025,
-            "thickness_m": 0.0011,
-            "density_kg_m3": 7850.0,
-            "youngs_modulus_Pa": 2e11,
-            "kelvin_voigt_s": 0.0018,
-        },
-        "hub": {"inertia_kg_m2": 0.007, "radius_m": 0.05, "viscous_friction_Nms": 0.006},
-        "motor": {
-            "torque_constant_Nm_A": 0.024,
-            "back_emf_Vs_rad": 0.024,
-            "resistance_ohm": 2.6,
-            "gear_ratio": 20.0,
-        },
-        "payload": {"mass_kg": 0.0},
-        "sensors": {"hub_angle_noise_rad": 0.001, "tip_noise_m": 0.0008},
-        "sampling": {"dt_s": 0.005},
+        "link.length_m": 0.6,
+        "link.width_m": 0.025,
+        "link.thickness_m": 0.0011,
+        "link.density_kg_m3": 7850.0,
+        "link.youngs_modulus_Pa": 2e11,
+        "link.kelvin_voigt_s": 0.0018,
+        "hub.inertia_kg_m2": 0.007,
+        "hub.radius_m": 0.05,
+        "hub.viscous_friction_Nms": 0.006,
+        "motor.torque_constant_Nm_A": 0.024,
+        "motor.back_emf_Vs_rad": 0.024,
+        "motor.resistance_ohm": 2.6,
+        "motor.gear_ratio": 20.0,
+        "sensors.tip_noise_m": 0.0008,
     }
 )
+NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
 DT = RIG.sampling.dt_s
 PERIOD = 700
 
@@ -47,7 +44,6 @@ def inputs():
 
 def made(residuals):
     """The case whose records are the model plus these residuals (name -> (T, 2)) times the noise."""
-    noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
     return Case(
         "synthetic",
         RIG,
@@ -56,7 +52,7 @@ def made(residuals):
                 name,
                 "held_out" if name == "fresh" else "estimation",
                 voltage,
-                MODEL[name] + residuals[name] * noise,
+                MODEL[name] + residuals[name] * NOISE,
                 "multisine" if name == "multisine" else "prbs",
             )
             for name, voltage in inputs().items()

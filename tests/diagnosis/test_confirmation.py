@@ -5,28 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis import Case, Experiment, diagnose
-from plant import Rig, prbs
-from validation.blind.rigs import draw_rig, rig_toml
-from validation.blind.truth import Truth
+from diagnosis import diagnose
+from tests.diagnosis.recorded import simulated_case
+from validation.blind.rigs import draw_rig
 
 
 def _case(folder, effects, held_out=None, held_out_V=0.7):
     """Small motions to fit, larger ones held out; held_out: effects there, if not the same."""
+    records = [
+        ("estimation", effects, 8, 0.2),
+        ("estimation", effects, 15, 0.2),
+        ("held_out", effects if held_out is None else held_out, 20, held_out_V),
+    ]
     table = draw_rig(np.random.default_rng(3))
-    file = folder / "rig.toml"
-    file.write_text(rig_toml(table), encoding="utf-8")
-    rng = np.random.default_rng(4)
-    experiments = []
-    for k, (role, amplitude_V, hold) in enumerate(
-        [("estimation", 0.2, 8), ("estimation", 0.2, 15), ("held_out", held_out_V, 20)]
-    ):
-        there = effects if role == "estimation" or held_out is None else held_out
-        machine = Truth(table, there)
-        voltage = prbs(7, hold, amplitude_V, 700, rng)
-        measured = machine.record(voltage).measured(rng.standard_normal((700, 2)) * machine.noise)
-        experiments.append(Experiment(f"{k}", role, voltage, measured, "prbs"))
-    return Case("small-and-large", Rig.from_toml(file), tuple(experiments))
+    return simulated_case(folder, table, records, np.random.default_rng(4), samples=700)
 
 
 def _estimation_gap(found):

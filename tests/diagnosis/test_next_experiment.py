@@ -28,9 +28,8 @@ from plant.effects import (
     TipPayload,
     ViscousFriction,
 )
-from tests.diagnosis.synthetic_residuals import DT, RIG, inputs, made, white
+from tests.diagnosis.synthetic_residuals import DT, NOISE, RIG, inputs, made, white
 
-NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
 TOLERANT = RIG.model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05, "motor.resistance_ohm": 0.03}})
 
 

@@ -5,30 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis import Case, Experiment
 from diagnosis.evidence.hypotheses import disagreement_gain
 from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
-from plant import Rig, prbs
-from validation.blind.rigs import draw_rig, rig_toml
-from validation.blind.truth import Truth
+from tests.diagnosis.recorded import simulated_case
+from validation.blind.rigs import draw_rig
 
 
 def _near_the_truth(folder, effect, values, *, seed, off=1.0):
     """A fit that knows the machine, but for parameters that are off by a factor; two records."""
-    table = draw_rig(np.random.default_rng(seed))
-    file = folder / "rig.toml"
-    file.write_text(rig_toml(table), encoding="utf-8")
+    effects = [{"name": effect, **{key: off * v for key, v in values.items()}}]
+    records = [(role, effects, 8, 0.25) for role in ("estimation", "held_out")]
     rng = np.random.default_rng(seed)
-    records = []
-    for role in ("estimation", "held_out"):
-        machine = Truth(table, [{"name": effect, **{key: off * v for key, v in values.items()}}])
-        voltage = prbs(7, 8, 0.25, 900, rng)
-        measured = machine.record(voltage).measured(rng.standard_normal((900, 2)) * machine.noise)
-        records.append(Experiment(role, role, voltage, measured, "prbs"))
-    case = Case("drift", Rig.from_toml(file), tuple(records))
+    case = simulated_case(folder, draw_rig(np.random.default_rng(seed)), records, rng)
     candidate = next(c for c in case.machine.candidates(case.experiments) if c.effect == effect)
     x = np.array([axis.coordinate(values[axis.parameter]) for axis in candidate.axes])
     model = ResidualModel(case)
@@ -48,7 +39,7 @@ def test_a_machine_that_is_off_by_a_hair_leaves_no_more(tmp_path, seed, off):
     assert np.mean(end.residuals**2) - 1 < np.mean(spread) + chance
     assert 0.8 < np.mean(e**2) < 1 + chance
     if seed == 0:
-        # Here a thousandth of the play makes a gap of a third of the noise: not to be called a cause.
+        # Here a thousandth of the gap makes a gap of a third of the noise: not to be called a cause.
         assert np.mean(end.residuals**2) > 1.1
         assert drift.log_gain > 100
 

@@ -23,9 +23,7 @@ from plant.effects import (
     TipPayload,
 )
 from tests.diagnosis.recorded import recorded_case
-from tests.diagnosis.synthetic_residuals import DT, MODEL, PERIOD, RIG, inputs, made, white
-
-NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
+from tests.diagnosis.synthetic_residuals import DT, MODEL, NOISE, PERIOD, RIG, inputs, made, white
 
 
 def _sum(a, b):
@@ -301,12 +299,8 @@ def test_residuals_that_do_not_fit_the_case_are_refused(change, message):
     change(residuals)
     with pytest.raises(ValueError, match=message):
         where(case, residuals)
-
-
-def test_level_must_be_a_chance():
-    residuals = white(np.random.default_rng(2))
     with pytest.raises(ValueError, match="level must lie between 0 and 1"):
-        where(made(residuals), residuals, level=1.5)
+        where(case, white(np.random.default_rng(2)), level=1.5)
 
 
 def _recorded(gap_cases, name):

@@ -39,33 +39,21 @@ def test_a_torque_above_break_away_moves_the_arm(friction):
     assert simulate(RIG, voltage, [friction]).hub_angle_rad[-1] > 1e-3
 
 
-def test_steady_speed_is_what_is_left_of_the_torque():
+@pytest.mark.parametrize(
+    ("friction", "level"), [(COULOMB, LEVEL), (STRIBECK, 0.2)], ids=["coulomb", "stribeck"]
+)
+def test_steady_speed_is_what_is_left_of_the_torque(friction, level):
     volts = 3.0
     brake = RIG.hub.viscous_friction_Nms + RIG.motor.back_emf_damping_Nms
-    angle = simulate(RIG, np.full(4000, volts), [COULOMB]).hub_angle_rad
+    angle = simulate(RIG, np.full(4000, volts), [friction]).hub_angle_rad
     speed = (angle[-1] - angle[-201]) / (200 * RIG.sampling.dt_s)
-    assert speed == pytest.approx((volts * STALL - LEVEL) / brake, rel=1e-9)
-
-
-def test_stribeck_friction_falls_to_the_coulomb_level_at_speed():
-    volts = 3.0
-    brake = RIG.hub.viscous_friction_Nms + RIG.motor.back_emf_damping_Nms
-    angle = simulate(RIG, np.full(4000, volts), [STRIBECK]).hub_angle_rad
-    speed = (angle[-1] - angle[-201]) / (200 * RIG.sampling.dt_s)
-    # exp(-2.8 / 0.05) is nothing.
-    assert speed == pytest.approx((volts * STALL - 0.2) / brake, rel=1e-9)
+    # Stribeck's is Coulomb's at speed: exp(-2.8 / 0.05) is nothing.
+    assert speed == pytest.approx((volts * STALL - level) / brake, rel=1e-9)
 
 
 def test_stribeck_friction_without_a_fall_is_coulomb_friction():
     voltage = prbs(7, 5, 1.5, 600)
-    same = parse_effect(
-        {
-            "name": "stribeck_friction",
-            "static_torque_Nm": LEVEL,
-            "coulomb_torque_Nm": LEVEL,
-            "stribeck_velocity_rad_s": 0.05,
-        }
-    )
+    same = STRIBECK.model_copy(update={"coulomb_torque_Nm": LEVEL})
     np.testing.assert_array_equal(
         simulate(RIG, voltage, [same]).output, simulate(RIG, voltage, [COULOMB]).output
     )
@@ -96,16 +84,6 @@ def test_with_the_hub_stuck_the_link_rings_as_if_clamped():
     # the most.
     assert abs(pole.imag) == pytest.approx(clamped * np.sqrt(1 - zeta**2), rel=1e-3)
     assert -pole.real == pytest.approx(zeta * clamped, rel=5e-3)
-
-
-@pytest.mark.parametrize("friction", [COULOMB, STRIBECK], ids=["coulomb", "stribeck"])
-def test_a_ten_times_finer_step_changes_nothing_that_matters(friction):
-    voltage = prbs(8, 4, 2.0, 1200, np.random.default_rng(0))
-    coarse = simulate(RIG, voltage, [friction]).output
-    fine = simulate(RIG, voltage, [friction], substep_s=6.25e-5).output
-    error = np.sqrt(np.mean((coarse - fine) ** 2, axis=0) / np.mean(fine**2, axis=0))
-    # Measured 2e-8 (Coulomb) and 1e-7 (Stribeck); the elastic pre-sliding keeps the force continuous.
-    assert np.all(error < 1e-6)
 
 
 def test_stick_survives_closed_loop_stepping():
