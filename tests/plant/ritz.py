@@ -1,6 +1,6 @@
 """An arm written down independently of the package, for comparison.
 
-Polynomial Ritz functions instead of eigenfunctions, the extra angles of compliance, base and play as
+Polynomial Ritz functions instead of eigenfunctions, the extra angles of compliance, base and backlash as
 coordinates relative to the hub, the energies of the rig description by quadrature, and general-purpose
 integrators. Shares no code with `plant` but the record of nominal parameters.
 """
@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 
 class RitzArm:
-    """States (coordinates, speeds, voltage lag, sensor lag); coordinates hub, base, play, twist, q_1..q_P."""
+    """States: coordinates (hub, base, backlash, twist, q_1..q_P), speeds, voltage lag, sensor lag."""
 
     def __init__(
         self,
@@ -23,7 +23,7 @@ class RitzArm:
         n=7,
         joint=None,
         base=None,
-        play=False,
+        backlash=False,
         ripple=None,
         cubic=0.0,
         gravity=0.0,
@@ -44,7 +44,7 @@ class RitzArm:
             for k in range(n)
         ]
         self.n = 4 + n
-        hub_, base_, play_, twist_ = np.eye(self.n)[:4]
+        hub_, base_, backlash_, twist_ = np.eye(self.n)[:4]
 
         def displacement(at):
             return np.concatenate([[r + at, 0, 0, r + at], [s(at) for s in shapes]])
@@ -55,20 +55,20 @@ class RitzArm:
         at_nodes = np.array([displacement(at) for at in x])
         self.tip = displacement(length)
         mass = m * (at_nodes.T * w) @ at_nodes + mp * np.outer(self.tip, self.tip)
-        motor_side = 0.3 if play else 0.0
+        motor_side = 0.3 if backlash else 0.0
         inertia = hub.inertia_kg_m2
         mass += inertia * (1 - motor_side) * np.outer(hub_, hub_)
-        mass += inertia * motor_side * np.outer(hub_ + play_, hub_ + play_)
+        mass += inertia * motor_side * np.outer(hub_ + backlash_, hub_ + backlash_)
         curvature = np.zeros((x.size, self.n))
         curvature[:, 4:] = field(2)
         bending = stiffness * (curvature.T * w) @ curvature
         stiff, damp = bending.copy(), link.kelvin_voigt_s * bending
-        self.shaft = hub_ + (play_ if play else 0) - (base_ if base else 0)
+        self.shaft = hub_ + (backlash_ if backlash else 0) - (base_ if base else 0)
         self.gain = motor.gear_ratio * motor.torque_constant_Nm_A / motor.resistance_ohm
         damp += (hub.viscous_friction_Nms + self.gain * motor.gear_ratio * motor.back_emf_Vs_rad) * np.outer(
             self.shaft, self.shaft
         )
-        keep = [True, bool(base), play, bool(joint)] + [True] * n
+        keep = [True, bool(base), backlash, bool(joint)] + [True] * n
         if joint:
             stiff, damp = (
                 stiff + joint[0] * np.outer(twist_, twist_),
@@ -79,7 +79,9 @@ class RitzArm:
             mass += base[2] * np.outer(base_, base_)
         pick = np.eye(self.n)[:, keep]
         self.mass, self.damp, self.stiff = (pick.T @ a @ pick for a in (mass, damp, stiff))
-        self.tip, self.shaft, self.hub, self.play = (a @ pick for a in (self.tip, self.shaft, hub_, play_))
+        self.tip, self.shaft, self.hub, self.backlash = (
+            a @ pick for a in (self.tip, self.shaft, hub_, backlash_)
+        )
         self.encoder = (hub_ - (base_ if base else 0)) @ pick
         self.root = (hub_ + twist_) @ pick
         self.n = pick.shape[1]

@@ -91,7 +91,7 @@ class ElasticSlider:
 
 
 class Contact:
-    """Play with a damped contact spring that only pushes."""
+    """Backlash with a damped contact spring that only pushes."""
 
     def __init__(self, arm, gap, inertia):
         self.arm, self.gap = arm, gap
@@ -99,11 +99,11 @@ class Contact:
         self.damping = 0.8 * np.sqrt(0.3 * inertia * self.stiffness)
 
     def __call__(self, coordinates, speeds):
-        angle, speed = self.arm.play @ coordinates, self.arm.play @ speeds
+        angle, speed = self.arm.backlash @ coordinates, self.arm.backlash @ speeds
         side = np.sign(angle)
         depth = abs(angle) - self.gap / 2
         push = max(self.stiffness * depth + self.damping * side * speed, 0.0) if depth > 0 else 0.0
-        return -self.arm.play * side * push
+        return -self.arm.backlash * side * push
 
 
 REVERSALS = np.array([2, 2, -2, -2, -2, 0.5, 0.5, 3, -1, 0, 0, 0], dtype=float)
@@ -140,7 +140,7 @@ def test_dry_friction_follows_the_stated_law(effect):
 
 def test_backlash_follows_the_stated_law():
     rig = _rig()
-    arm = RitzArm(rig, n=7, play=True)
+    arm = RitzArm(rig, n=7, backlash=True)
     expected = arm.fine_records(REVERSALS, DT_S, 1e-5, Contact(arm, 0.05, rig.hub.inertia_kg_m2))
     got = simulate(
         rig, REVERSALS, [parse_effect({"name": "backlash", "gap_rad": 0.05})], dt_s=DT_S, n_modes=8
