@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.stats import chi2
 
 from diagnosis.machine.case import Case
@@ -166,7 +166,9 @@ def _normal_equations(
         e = residuals[name]
         if route == "hub_torque":
             T = f.shape[0]
-            columns = fftconvolve(f.T[None], torque[:T].T[:, None], axes=-1)[:, :, :T]  # (2, K, T)
+            n = next_fast_len(2 * T - 1, real=True)
+            spectrum = rfft(f.T, n)[None] * rfft(torque[:T].T, n)[:, None]
+            columns = irfft(spectrum, n)[:, :, :T]  # (2, K, T)
             for s in range(columns.shape[0]):
                 gram += columns[s] @ columns[s].T
                 moment += columns[s] @ e[:, s]
