@@ -5,24 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis import Case, Experiment, diagnose
-from plant import Rig, prbs
-from validation.blind.rigs import draw_rig, rig_toml
-from validation.blind.truth import Truth
+from diagnosis import diagnose
+from plant import Rig
+from tests.diagnosis.recorded import simulated_case
+from validation.blind.rigs import draw_rig
 
 
-def _case(folder, effect, amplitude_V, hold):
+def _case(folder, effect, amplitude_V):
+    records = [(role, [effect], 8, amplitude_V) for role in ("estimation", "estimation", "held_out")]
     table = draw_rig(np.random.default_rng(3))
-    file = folder / "rig.toml"
-    file.write_text(rig_toml(table), encoding="utf-8")
-    rng = np.random.default_rng(4)
-    experiments = []
-    for k, role in enumerate(("estimation", "estimation", "held_out")):
-        machine = Truth(table, [effect])
-        voltage = prbs(7, hold, amplitude_V, 700, rng)
-        measured = machine.record(voltage).measured(rng.standard_normal((700, 2)) * machine.noise)
-        experiments.append(Experiment(f"{k}", role, voltage, measured, "prbs"))
-    return Case("hanging", Rig.from_toml(file), tuple(experiments))
+    return simulated_case(folder, table, records, np.random.default_rng(4), samples=700)
 
 
 def _as_gravity_would(folder, acceleration_m_s2):
@@ -35,9 +27,9 @@ def _as_gravity_would(folder, acceleration_m_s2):
 
 
 def _found(folder, cause, acceleration_m_s2, amplitude_V):
-    case = _case(folder, {"name": "gravity", "acceleration_m_s2": acceleration_m_s2}, amplitude_V, 8)
+    case = _case(folder, {"name": "gravity", "acceleration_m_s2": acceleration_m_s2}, amplitude_V)
     if cause == "spring":
-        case = _case(folder, _as_gravity_would(folder, acceleration_m_s2), amplitude_V, 8)
+        case = _case(folder, _as_gravity_would(folder, acceleration_m_s2), amplitude_V)
     return diagnose(case)
 
 
