@@ -21,6 +21,8 @@ frequency of the unstable draws in its own standard deviations.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from benchmarks.harness import Print, main, median_s
@@ -36,10 +38,8 @@ from control_design import (
 from control_design.analysis.joint_coverage import gamma_of_draws, joint_coverage
 from control_design.analysis.worst_case import worst_case, worst_of
 from control_design.plants.ellipses import scale_to_minus_one
-from control_design.plants.first_order import FirstOrder, Intervals
 from validation.example_plants import (
     LinkUncertainty,
-    ResponseRecord,
     Scenario,
     flexible_link,
     flexible_link_specification,
@@ -49,21 +49,6 @@ BRUTE = 400_000
 MANY = 20_000
 CALIBRATION_SEED, CHECK_SEED = 11, 12
 CHUNK = 250  # draws at a time in `gamma_of_draws`
-
-
-class Linear:
-    """The link's ellipses without its parameters: draws are Gaussian on the generators."""
-
-    def __init__(self, link: LinkUncertainty) -> None:
-        self._link = link
-
-    def at(self, omega_rad_s: np.ndarray, level: float) -> ResponseRecord:
-        """As the link."""
-        return self._link.at(omega_rad_s, level)
-
-    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
-        """As the link."""
-        return self._link.first_order(intervals, cleared)
 
 
 def brute_force(controller: Controller, plant: UncertainPlant, specification: Specification) -> float:
@@ -79,8 +64,7 @@ def brute_force(controller: Controller, plant: UncertainPlant, specification: Sp
 
 def bound_seconds(controller: Controller, plant: UncertainPlant, specification: Specification) -> float:
     """CPU seconds of the bound alone: `certify` less `certify` with an uncertainty that allows no bound."""
-    hidden = type("Hidden", (), {"at": plant.uncertainty.at})()
-    without = UncertainPlant(plant.name, plant.nominal, hidden)
+    without = UncertainPlant(plant.name, plant.nominal, SimpleNamespace(at=plant.uncertainty.at))
     return certify_seconds(controller, plant, specification) - certify_seconds(
         controller, without, specification
     )
@@ -163,7 +147,11 @@ def run(out: Print, *, draws: int = 3000, scenarios: tuple[Scenario, ...] = ("A"
     out("draws              certified  level %  holds in % stable %  worst case  holds in % in all ell. %")
     for scenario, controller in controllers.items():
         plant, specification = flexible_link(scenario), flexible_link_specification(5)
-        linear = UncertainPlant("linear", plant.nominal, Linear(LinkUncertainty(scenario)))
+        # The link's ellipses without its parameters: draws are Gaussian on the generators.
+        link = LinkUncertainty(scenario)
+        linear = UncertainPlant(
+            "linear", plant.nominal, SimpleNamespace(at=link.at, first_order=link.first_order)
+        )
         out(joint_line(f"{scenario}, parameters", controller, plant, specification, draws))
         out(joint_line(f"{scenario}, linear", controller, linear, specification, draws))
     for seed in (0, 1, 3):

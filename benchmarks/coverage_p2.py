@@ -17,13 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.harness import Print, main, reading, timed
-from benchmarks.p2_plants import DT_S, Run, Setting, draw
+from benchmarks.p2_plants import DT_S, Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.posterior import ResponsePosterior
 from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
 from ident.uncertainty.nominal import nominal_near
+from tests.ident.benchmark_plants import Truth
 
 OMEGA = np.geomspace(0.3, 300.0, 150)
 BANDS = ((0.3, 1), (1, 5), (5, 13), (13, 19), (19, 55), (55, 85), (66, 72), (85, 150), (150, 190), (190, 301))
@@ -37,7 +38,6 @@ class Case:
 
     title: str
     setting: Setting
-    methods: tuple[str, ...] = ("tangent",)
     coverage: tuple[float, float] | None = None
     overall: float | None = None
     worst: float | None = None
@@ -46,45 +46,22 @@ class Case:
     coloured_noise: bool = False
 
 
+FIXED, FIVE = "fixed plant, N = {}, {} dB", "five modes (also 48 and 75 Hz), N = {}, {} dB"
+RANDOM = "random plants, N = {}, {} dB"
 CASES = {
-    "main": Case(
-        "fixed plant, N = 2000, 35 dB",
-        Setting(),
-        (
-            "tangent",
-            "no missed mode",
-            "order-4 nominal",
-            "order-4 nominal, placed",
-            "classical, n = 4",
-            "covariance, n = 4",
-        ),
-        coverage=(92, 98),
-        worst=88,
-        is_main=True,
-    ),
-    "random": Case(
-        "random plants, N = 2000, 35 dB", Setting(random_plant=True), ("tangent", "no missed mode"), (91, 99)
-    ),
-    "random-1000": Case(
-        "random plants, N = 1000, 30 dB",
-        Setting(1000, 30.0, random_plant=True),
-        ("tangent", "no missed mode"),
-        (87, 100),
-    ),
-    "fixed-1000": Case(
-        "fixed plant, N = 1000, 30 dB", Setting(1000, 30.0), ("tangent", "no missed mode"), (87, 100)
-    ),
-    "fixed-1000-40": Case("fixed plant, N = 1000, 40 dB", Setting(1000, 40.0), reported_only=True),
-    "fixed-4000-40": Case("fixed plant, N = 4000, 40 dB", Setting(4000, 40.0), reported_only=True),
-    "five": Case("five modes (also 48 and 75 Hz), N = 2000, 35 dB", Setting(n_modes=5), reported_only=True),
-    "five-4000-40": Case(
-        "five modes (also 48 and 75 Hz), N = 4000, 40 dB", Setting(4000, 40.0, n_modes=5), reported_only=True
-    ),
+    "main": Case(FIXED.format(2000, 35), Setting(), (92, 98), worst=88, is_main=True),
+    "random": Case(RANDOM.format(2000, 35), Setting(random_plant=True), (91, 99)),
+    "random-1000": Case(RANDOM.format(1000, 30), Setting(1000, 30.0, random_plant=True), (87, 100)),
+    "fixed-1000": Case(FIXED.format(1000, 30), Setting(1000, 30.0), (87, 100)),
+    "fixed-1000-40": Case(FIXED.format(1000, 40), Setting(1000, 40.0), reported_only=True),
+    "fixed-4000-40": Case(FIXED.format(4000, 40), Setting(4000, 40.0), reported_only=True),
+    "five": Case(FIVE.format(2000, 35), Setting(n_modes=5), reported_only=True),
+    "five-4000-40": Case(FIVE.format(4000, 40), Setting(4000, 40.0, n_modes=5), reported_only=True),
     "initial-state": Case(
-        "fixed plant, N = 2000, 35 dB, record cut out of a longer run", Setting(from_rest=False), overall=93
+        FIXED.format(2000, 35) + ", record cut out of a longer run", Setting(from_rest=False), overall=93
     ),
     "ar1": Case(
-        "fixed plant, N = 2000, 35 dB, AR(1) noise with pole 0.9 (coloured_noise on)",
+        FIXED.format(2000, 35) + ", AR(1) noise with pole 0.9 (coloured_noise on)",
         Setting(noise_pole=0.9),
         overall=90,
         coloured_noise=True,
@@ -114,7 +91,7 @@ class RunOutcome:
     by_method: dict[str, Outcome]
 
 
-def covariance_alone(run: Run, model: GobfModel) -> ResponsePosterior:
+def covariance_alone(run: Truth, model: GobfModel) -> ResponsePosterior:
     """Least squares on the poles as if they were known: s2 (Phi^T Phi)^-1 and nothing else."""
     columns = regressor(model.poles, run.record.input[:, 0])
     q, r = np.linalg.qr(np.column_stack([columns, np.ones(columns.shape[0])]))
@@ -126,7 +103,7 @@ def covariance_alone(run: Run, model: GobfModel) -> ResponsePosterior:
     return ResponsePosterior(model.poles, (inverse @ inner)[:order], s * inverse[:order], DT_S)
 
 
-def judge(run: Run, ellipses: FrequencyUncertainty, truth: np.ndarray, cpu_s: float) -> Outcome:
+def judge(run: Truth, ellipses: FrequencyUncertainty, truth: np.ndarray, cpu_s: float) -> Outcome:
     axes = ellipses.ellipse()
     distance = ellipses.normalised_distance(truth)
     error = np.abs(truth - ellipses.centre)
@@ -160,31 +137,26 @@ def one_run(name: str, seed: int) -> RunOutcome:
     """Draw, identify, embed, judge; everything from one seed."""
     case = CASES[name]
     run = draw(case.setting, np.random.default_rng(seed))
-    truth = run.plant.response(OMEGA)
+    truth = run.response(OMEGA)
     model, cpu_identify_s = timed(lambda: identify([run.record]).model)
     options = EmbeddingOptions(coloured_noise=case.coloured_noise)
     alone = options.model_copy(update={"prior_missed_mode": 0.0})
     posterior, cpu_s = timed(lambda: tangent([run.record], model, options))
     ellipses = posterior.at(OMEGA, LEVEL)
-    found: dict[str, Outcome] = {}
-    low = None
-    for method in case.methods:
-        if method == "tangent":
-            found[method] = with_joint(judge(run, ellipses, truth, cpu_s), posterior, truth, seed)
-            continue
-        if method == "no missed mode":
-            other, cpu_s = timed(lambda: tangent([run.record], model, alone))
-            found[method] = with_joint(judge(run, other.at(OMEGA), truth, cpu_s), other, truth, seed)
-            continue
-        if low is None:
-            low = identify([run.record], IdentOptions(n_real=2, n_pairs=1)).model
-        if method.startswith("order-4 nominal"):
-            nominal = nominal_near(posterior, low.poles, OMEGA) if method.endswith("placed") else low
-            found[method] = disc_outcome(nominal.frequency_response(OMEGA), ellipses, truth)
-        elif method == "classical, n = 4":
-            found[method] = judge(run, classical([run.record], low).at(OMEGA), truth, np.nan)
-        else:
-            found[method] = judge(run, covariance_alone(run, low).at(OMEGA), truth, np.nan)
+    found = {"tangent": with_joint(judge(run, ellipses, truth, cpu_s), posterior, truth, seed)}
+    if case.coverage is not None:
+        other, cpu_s = timed(lambda: tangent([run.record], model, alone))
+        found["no missed mode"] = with_joint(judge(run, other.at(OMEGA), truth, cpu_s), other, truth, seed)
+    if case.is_main:
+        low = identify([run.record], IdentOptions(n_real=2, n_pairs=1)).model
+        for name, nominal in (("", low), (", placed", nominal_near(posterior, low.poles, OMEGA))):
+            response = nominal.frequency_response(OMEGA)
+            found[f"order-4 nominal{name}"] = disc_outcome(response, ellipses, truth)
+        for name, those in (
+            ("classical, n = 4", classical([run.record], low)),
+            ("covariance, n = 4", covariance_alone(run, low)),
+        ):
+            found[name] = judge(run, those.at(OMEGA), truth, np.nan)
     return RunOutcome(model.poles.pairs.size, cpu_identify_s, found)
 
 
@@ -209,7 +181,7 @@ def report(out: Print, case: Case, runs: Sequence[RunOutcome]) -> None:
     out(
         "    " + " " * 22 + "".join(f"{f'{low:g}-{min(high, 300):g}':>8}" for low, high in BANDS) + "   rad/s"
     )
-    for method in case.methods:
+    for method in runs[0].by_method:
         found = [run.by_method[method] for run in runs]
         inside = np.array([item.inside for item in found])
         coverage = per_band(100 * inside, np.mean)

@@ -78,6 +78,12 @@ class Score:
     radius: float
 
 
+def own_state_percent(model: Model, u: np.ndarray, y: np.ndarray) -> float:
+    """Fit of a free run whose initial state is estimated from the run itself."""
+    columns, rest = free_columns(model, y.size), y - model.simulate(u)
+    return percent(y, rest - columns @ np.linalg.lstsq(columns, rest, rcond=1e-10)[0])
+
+
 def score(model: Model, record: Record) -> Score:
     """All runs of one model; nan where an unstable one has no meaning."""
     u, y = record.input[:, 0], record.output[:, 0]
@@ -86,19 +92,12 @@ def score(model: Model, record: Record) -> Score:
         return Score(*([np.nan] * 6), radius)
     error = y - model.simulate(u)
     free = free_columns(model, y.size)
-
-    def fitted(part: slice) -> np.ndarray:
-        columns = free[: part.stop - part.start]
-        rest = y[part] - model.simulate(u[part])
-        return rest - columns @ np.linalg.lstsq(columns, rest, rcond=1e-10)[0]
-
-    halves = slice(0, HALF), slice(HALF, 2 * HALF)
     start = np.linalg.lstsq(free[:HALF], error[:HALF], rcond=1e-10)[0]
     periods = 12
     steady = y - model.simulate(np.tile(u, periods))[-y.size :]
     return Score(
-        percent(y[:HALF], fitted(halves[0])),
-        percent(y[HALF:], fitted(halves[1])),
+        own_state_percent(model, u[:HALF], y[:HALF]),
+        own_state_percent(model, u[HALF:], y[HALF:]),
         percent(y[HALF:], (error - free @ start)[HALF:]),
         percent(y[HALF:], error[HALF:]),
         percent(y, error),
@@ -205,13 +204,9 @@ def sweeps(record: Record, say: Print) -> None:
             values = []
             for part, fresh in ((down, up), (up, down)):
                 model = method(part, order)
-                if not largest_pole(model) < 1:
-                    values.append("unstable")
-                    continue
-                u, y = fresh.input[:, 0], fresh.output[:, 0]
-                error, columns = y - model.simulate(u), free_columns(model, y.size)
-                rest = error - columns @ np.linalg.lstsq(columns, error, rcond=1e-10)[0]
-                values.append(f"{percent(y, rest):.1f}")
+                stable = largest_pole(model) < 1
+                found = own_state_percent(model, fresh.input[:, 0], fresh.output[:, 0]) if stable else np.nan
+                values.append(f"{found:.1f}" if stable else "unstable")
             cells.append(f"{' / '.join(values):>22}")
         say(f"{name:<32}" + "".join(cells))
 

@@ -13,7 +13,7 @@ covariances; every structure fitted to one date and judged on the other.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -94,6 +94,13 @@ def relative_error(response: np.ndarray, frf: FrequencyUncertainty) -> float:
     return float(np.median(np.abs(response / frf.centre - 1)))
 
 
+def judged(
+    both: Sequence[FrequencyUncertainty], response: Callable[[FrequencyUncertainty], np.ndarray]
+) -> list[float]:
+    """Relative error of a response on the fitted and on the other date."""
+    return [relative_error(response(frf), frf) for frf in both]
+
+
 def levy(frf: FrequencyUncertainty, zeros: int, poles: int, iterations: int = 0) -> np.ndarray:
     """Coefficients [b_0 .. b_zeros, a_0 .. a_(poles - 1)] of B(s)/A(s), A monic, by linear least squares.
 
@@ -147,6 +154,9 @@ def orders(plant: FrfRepeats, dates: Sequence[str], say: Print) -> None:
             other = next(d for d in dates if d != date)
             start = levy(frf[date], 2, 4)
 
+            both = frf[date], frf[other]
+            scale = middle(frf[date])
+
             def weighted(theta: np.ndarray, at: FrequencyUncertainty = frf[date]) -> np.ndarray:
                 error = (rational(theta, 2, at, middle(at)) - at.centre) / deviation(at)
                 return np.concatenate([error.real, error.imag])
@@ -160,33 +170,17 @@ def orders(plant: FrfRepeats, dates: Sequence[str], say: Print) -> None:
                 ("2 zeros, 4 poles, Levy (linear least squares)", start),
                 ("2 zeros, 4 poles, nonlinear least squares", best),
             ):
-                errors = [
-                    relative_error(rational(theta, 2, frf[d], middle(frf[date])), frf[d])
-                    for d in (date, other)
-                ]
+                errors = judged(both, lambda at, t=theta, s=scale: rational(t, 2, at, s))
                 chi = float(np.sum(weighted(theta) ** 2))
                 lines.setdefault(name, []).append(cell(chi, None, errors))
-            structures: list[tuple[str, IdentOptions]] = [
-                (
-                    f"GOBF {r} real, {p} pairs",
-                    IdentOptions(integrators=1, n_real=r, n_pairs=p),
-                )
-                for r, p in ((1, 1), (2, 1), (1, 2), (2, 2), (2, 3), (2, 4))
-            ]
             free = identify_frf(frf[date], IdentOptions(integrators=1))
             table = {(step.n_real, step.n_pairs): step.criterion for step in free.order_table}
-            for name, options in structures:
-                found = identify_frf(frf[date], options)
-                errors = [
-                    relative_error(found.model.frequency_response(frf[d].omega_rad_s), frf[d])
-                    for d in (date, other)
-                ]
-                key = (options.n_real or 0, options.n_pairs or 0)
-                lines.setdefault(name, []).append(cell(found.rss, table.get(key), errors))
-            errors = [
-                relative_error(free.model.frequency_response(frf[d].omega_rad_s), frf[d])
-                for d in (date, other)
-            ]
+            for r, p in ((1, 1), (2, 1), (1, 2), (2, 2), (2, 3), (2, 4)):
+                found = identify_frf(frf[date], IdentOptions(integrators=1, n_real=r, n_pairs=p))
+                errors = judged(both, lambda at, m=found.model: m.frequency_response(at.omega_rad_s))
+                item = cell(found.rss, table.get((r, p)), errors)
+                lines.setdefault(f"GOBF {r} real, {p} pairs", []).append(item)
+            errors = judged(both, lambda at, m=free.model: m.frequency_response(at.omega_rad_s))
             shape = f"{free.model.poles.real.size - 1} real, {free.model.poles.pairs.size} pairs"
             chosen = min(table.values())
             lines.setdefault("GOBF, chosen by the data", []).append(cell(free.rss, chosen, errors, shape))

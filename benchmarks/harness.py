@@ -19,20 +19,15 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
 
+Print = Callable[..., None]  # tells a line, or an empty one
 R = TypeVar("R")
 C = TypeVar("C")
-
-
-class Print(Protocol):
-    """Tells a line."""
-
-    def __call__(self, line: str = "") -> None: ...
 
 
 class Results:
@@ -75,7 +70,8 @@ def main(
     parser.add_argument("--name", help="write benchmarks/results/NAME.txt, whatever the options")
     for name, default in defaults.items():
         parser.add_argument(f"--{name.replace('_', '-')}", **_kind(default))
-    options = vars(parser.parse_args(arguments))
+    given = vars(parser.parse_args(arguments))
+    options = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     target = options.pop("name") or (module if options == defaults else None)
     command = shlex.join(["python", "-m", f"benchmarks.{module}", *arguments])
     threads = os.environ.get("OMP_NUM_THREADS")
@@ -94,13 +90,8 @@ def _kind(default: Any) -> dict[str, Any]:
     if isinstance(default, bool):
         return {"action": argparse.BooleanOptionalAction, "default": default}
     if isinstance(default, tuple):
-        return {"nargs": "+", "action": _Tuple, "type": type(default[0]), "default": default}
+        return {"nargs": "+", "type": type(default[0]), "default": default}
     return {"type": str if default is None else type(default), "default": default}
-
-
-class _Tuple(argparse.Action):
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        setattr(namespace, self.dest, tuple(values))
 
 
 def _seeds(options: Mapping[str, Any]) -> str:

@@ -171,17 +171,7 @@ def draw(curves: dict[str, list[Point]]) -> None:
             color={"e": "C0", "A": "C1", "B": "C2"}[part[0]],
             label=f"order 6, {NAMES[part]}",
         )
-    axes.axvline(0.015, color="0.6", linewidth=0.8)
-    axes.text(
-        0.0153,
-        0.97,
-        "open loop",
-        fontsize=8,
-        color="0.4",
-        va="top",
-        rotation=90,
-        transform=axes.get_xaxis_transform(),
-    )
+    axes.axvline(0.015, color="0.6", linewidth=0.8, label="open loop")
     axes.set_xscale("log")
     axes.set_xlabel("least damping ratio of closed-loop poles, 10 to 22.5 rad/s [-]")
     axes.set_ylabel("largest max(|W1 S|, |W3 K S|) [-]")

@@ -8,15 +8,13 @@ output / standard deviation of the noise).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy import signal
 from scipy.linalg import block_diag
 
-from ident.data.record import Record
+from tests.ident.benchmark_plants import DT_S, Truth, as_record, run
 
-DT_S = 0.005
 # Three modes, then the two of the variant with five: frequency [Hz], damping ratio, gain.
 MODES = (
     (2.5, 0.015, -0.02),
@@ -41,62 +39,24 @@ class Setting:
     noise_pole: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Plant:
-    """Continuous-time poles and gains, all as in the module's formula."""
-
-    slow_per_s: float
-    fast_per_s: float
-    omega_rad_s: np.ndarray  # (M,)
-    zeta: np.ndarray  # (M,)
-    gain: np.ndarray  # (M,)
-
-    @cached_property
-    def discrete(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A, B, C after the hold; modal states, so that nothing is lost to companion forms."""
-        blocks = [np.array([[-self.slow_per_s]])]
-        drive, out = [1.0], [1.0]
-        for w, z, c in zip(self.omega_rad_s, self.zeta, self.gain, strict=True):
-            blocks.append(np.array([[0.0, w], [-w, -2 * z * w]]))
-            drive += [0.0, w]
-            out += [c, 0.0]
-        n = len(drive)
-        A = np.zeros((n + 1, n + 1))
-        A[:n, :n] = block_diag(*blocks)
-        A[:n, n] = drive
-        A[n, n] = -self.fast_per_s
-        B = np.zeros((n + 1, 1))
-        B[n] = self.fast_per_s
-        C = np.append(out, 0.0)[None, :]
-        A, B, C, *_ = signal.cont2discrete((A, B, C, np.zeros((1, 1))), DT_S)
-        return A, B, C
-
-    def run(self, u: np.ndarray) -> np.ndarray:
-        """Noise-free output (T,) from rest."""
-        A, B, C = self.discrete
-        x, y = np.zeros(A.shape[0]), np.empty(u.size)
-        for k, value in enumerate(u):
-            y[k] = C[0] @ x
-            x = A @ x + B[:, 0] * value
-        return y
-
-    def response(self, omega_rad_s: np.ndarray) -> np.ndarray:
-        """(F,) response of the sampled plant."""
-        A, B, C = self.discrete
-        z = np.exp(1j * omega_rad_s * DT_S)
-        return (C @ np.linalg.solve(z[:, None, None] * np.eye(A.shape[0]) - A, B.astype(complex)))[:, 0, 0]
+def system(slow_per_s: float, fast_per_s: float, omega_rad_s: np.ndarray, zeta: np.ndarray, gain: np.ndarray):
+    """A, B, C, D after the hold, modes (M,); modal states, so that nothing is lost to companion forms."""
+    blocks = [np.array([[-slow_per_s]])]
+    drive, out = [1.0], [1.0]
+    for w, z, c in zip(omega_rad_s, zeta, gain, strict=True):
+        blocks.append(np.array([[0.0, w], [-w, -2 * z * w]]))
+        drive += [0.0, w]
+        out += [c, 0.0]
+    n = len(drive)
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n] = block_diag(*blocks)
+    A[:n, n] = drive
+    A[n, n] = -fast_per_s
+    B = fast_per_s * np.eye(n + 1)[:, n:]
+    return signal.cont2discrete((A, B, np.append(out, 0.0)[None, :], np.zeros((1, 1))), DT_S)[:4]
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
-    """One plant, one input, one noise realisation."""
-
-    plant: Plant
-    record: Record
-    noise_std: float
-
-
-def draw(setting: Setting, rng: np.random.Generator) -> Run:
+def draw(setting: Setting, rng: np.random.Generator) -> Truth:
     """A run of this setting; everything random comes from rng."""
     modes = np.array(MODES[: setting.n_modes])
     hertz, zeta, gain = modes.T
@@ -107,14 +67,14 @@ def draw(setting: Setting, rng: np.random.Generator) -> Run:
         slow *= np.exp(rng.uniform(-0.5, 0.5))
         fast *= np.exp(rng.uniform(-0.3, 0.3))
         gain = gain * np.exp(np.concatenate([rng.uniform(-0.4, 0.4, 3), np.zeros(gain.size - 3)]))
-    plant = Plant(slow, fast, 2 * np.pi * hertz, zeta, gain)
+    plant = system(slow, fast, 2 * np.pi * hertz, zeta, gain)
     before = 0 if setting.from_rest else _BEFORE
     total = before + setting.n_samples
     u = np.repeat(rng.choice([-1.0, 1.0], total // 2 + 2), 2)[rng.integers(0, 2) :][:total]
-    clean = plant.run(u)[before:]
+    clean = run(plant, u)[before:]
     noise_std = float(np.sqrt(np.mean(clean**2)) * 10 ** (-setting.snr_db / 20))
     a = setting.noise_pole
     white = rng.standard_normal(setting.n_samples + 200)
     noise = signal.lfilter([np.sqrt(1 - a * a)], [1.0, -a], white)[200:]
-    y = clean + noise_std * noise
-    return Run(plant, Record("P2", u[before:, None], y[:, None], DT_S, ("u",), ("y",)), noise_std)
+    record = as_record(u[before:], clean + noise_std * noise, "P2")
+    return Truth(plant, record, clean, noise_std)

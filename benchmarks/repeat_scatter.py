@@ -13,7 +13,7 @@ opened point by point. Predicted from one date, held against the points and mean
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -118,13 +118,20 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
     say("\n" + reading("repeat_scatter_slfr"))
 
 
+def per_band(omega: np.ndarray, cell: Callable[[np.ndarray], str]) -> str:
+    """cell(frequencies of the band (F,) bool) for each of KYOTO_BANDS, a dash where there are none."""
+    bands = [(omega >= low) & (omega < high) for low, high in KYOTO_BANDS]
+    return "".join(f"{cell(here) if np.any(here) else '-':>9}" for here in bands)
+
+
 def share(inside: np.ndarray, omega: np.ndarray) -> str:
-    """Share inside per band of KYOTO_BANDS, one cell each."""
-    cells = []
-    for low, high in KYOTO_BANDS:
-        here = (omega >= low) & (omega < high)
-        cells.append(f"{inside[..., here].mean():>9.2f}" if np.any(here) else f"{'-':>9}")
-    return "".join(cells)
+    """Share inside per band, one cell each."""
+    return per_band(omega, lambda here: f"{inside[..., here].mean():.2f}")
+
+
+def row_median(runs: np.ndarray) -> np.ndarray:
+    """Median of real and imaginary parts over the runs: (R, F) -> (F,)."""
+    return np.asarray(np.median(runs.real, axis=0) + 1j * np.median(runs.imag, axis=0))
 
 
 def runs_of(points: FrfRepeats, omega: np.ndarray) -> np.ndarray:
@@ -136,7 +143,7 @@ def run_gain_std(points: FrfRepeats, omega: np.ndarray) -> float:
     """Relative standard deviation of the gain of a run, robust (median absolute deviation), median above 3
     rad/s."""
     runs = runs_of(points, omega)
-    centre = np.median(runs.real, axis=0) + 1j * np.median(runs.imag, axis=0)
+    centre = row_median(runs)
     along = (runs / centre).real
     deviation = 1.4826 * np.median(np.abs(along - np.median(along, axis=0)), axis=0)
     return float(np.median(deviation[omega > 3]))
@@ -194,11 +201,8 @@ def kyoto(path: Path, say: Print) -> None:
     for date in long:
         mapped = indirect(closed.only(date).mean(KYOTO_DT_S, outlier_threshold=OUTLIER), 1.0, 1.65)
         ratio = mapped.enclosing_radius() / means[date].enclosing_radius()
-        cells = []
-        for low, high in KYOTO_BANDS:
-            here = ratio[(omega >= low) & (omega < high)]
-            cells.append(f"{f'{np.median(here):.2f}/{here.max():.1f}':>9}")
-        say(f"{date:<46}{''.join(cells)}")
+        cells = per_band(omega, lambda here, r=ratio: f"{np.median(r[here]):.2f}/{r[here].max():.1f}")
+        say(f"{date:<46}{cells}")
     say("\n" + reading("repeat_scatter_kyoto"))
 
 
@@ -226,7 +230,7 @@ def dropped_points(plant: FrfRepeats, dates: Sequence[str], omega: np.ndarray, s
     """How many points the outlier rule drops, and how many gross ones it leaves."""
     for date in dates:
         runs = runs_of(plant.only(date), omega)
-        centre = np.median(runs.real, axis=0) + 1j * np.median(runs.imag, axis=0)
+        centre = row_median(runs)
         distance = np.abs(runs - centre)
         dropped = distance > OUTLIER * np.median(distance, axis=0) / 1.1774
         gross = np.abs(np.log(np.abs(runs) / np.abs(centre))) > np.log(2)
@@ -254,18 +258,13 @@ def scatter_ratios(
     for date in (first, second):
         points = plant.only(date)
         mean = points.mean(KYOTO_DT_S, outlier_threshold=OUTLIER)
-        spread = np.empty(omega.size)
-        for i, run in enumerate(runs_of(points, omega).T):
-            centre = np.median(run.real) + 1j * np.median(run.imag)
-            distance = np.abs(run - centre)
-            kept = run[distance <= OUTLIER * np.median(distance) / 1.1774]
-            spread[i] = np.sum(np.abs(kept - kept.mean()) ** 2) / (kept.size - 1)
+        runs = runs_of(points, omega)
+        distance = np.abs(runs - row_median(runs))
+        kept = np.where(distance <= OUTLIER * np.median(distance, axis=0) / 1.1774, runs, np.nan)
+        spread = np.nanvar(kept, axis=0, ddof=1)
         size.append(spread / np.abs(mean.centre) ** 2)
-    cells = []
-    for low, high in KYOTO_BANDS:
-        here = (omega >= low) & (omega < high)
-        cells.append(f"{np.sqrt(size[0][here].mean() / size[1][here].mean()):>9.2f}")
-    say(f"{f'{first} / {second}':<46}{''.join(cells)}")
+    cells = per_band(omega, lambda here: f"{np.sqrt(size[0][here].mean() / size[1][here].mean()):.2f}")
+    say(f"{f'{first} / {second}':<46}{cells}")
     freedom = counts[first] - 1, counts[second] - 1
     low, high = np.sqrt(f_distribution.ppf([0.025, 0.975], *freedom))
     say(
@@ -318,11 +317,7 @@ def parametric(
                     inside = together(ellipses, part)
                     say(f"{f'{date}{name} -> {other}':<46}{share(inside, omega[limited])}")
             relative = 100 * ellipses.enclosing_radius() / np.abs(ellipses.centre)
-            medians = [
-                np.median(relative[(omega[limited] >= a) & (omega[limited] < b)]) if a < 600 else np.nan
-                for a, b in KYOTO_BANDS
-            ]
-            cells = "".join(f"{'-' if np.isnan(m) else f'{m:.1f} %':>9}" for m in medians)
+            cells = per_band(omega[limited], lambda here, r=relative: f"{np.median(r[here]):.1f} %")
             say(f"{f'{date}{name}: median semi-axis / |G|':<46}{cells}")
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from scipy.optimize import differential_evolution, minimize
 
 from benchmarks.harness import Print, main, timed
@@ -50,8 +51,8 @@ def peaks(
     unstable."""
     count, order = denominator.shape[0], denominator.shape[1] - 1
     s = 1j * omega
-    n = _polyval(numerator, s)[:, None]
-    d = _polyval(denominator, s)[:, None]
+    n = polyval(s, numerator.T[::-1])[:, None]
+    d = polyval(s, denominator.T[::-1])[:, None]
     k = stiffness[None, :, None]
     open_part = s**2 * (s**2 + 2 * k) * d
     closed = open_part + k * n
@@ -166,14 +167,6 @@ def optimised(order: int, seed: int) -> Design:
     best = candidates[int(np.argmin(np.max(all_peaks(np.stack(candidates)), axis=1)))]
     numerator, denominator = design_of(best[None], order)
     return Design(numerator[0], denominator[0])
-
-
-def _polyval(coefficients: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Rows (P, n), highest power first, at s (F,): (P, F)."""
-    value = np.zeros((coefficients.shape[0], s.size), complex)
-    for column in coefficients.T:
-        value = value * s + column[:, None]
-    return value
 
 
 def _responses(design: Design, k: float, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

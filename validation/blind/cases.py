@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from validation.blind.exudyn_truth import SUPPORTED, ExudynTruth
 from validation.blind.inputs import Planned, plan_experiments
 from validation.blind.rigs import Rig, draw_rig, draw_tolerances, rounded, stated
 from validation.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, sizable
 from validation.blind.truth import LISTED, UNLISTED, Clean, Real, Truth
-
-if TYPE_CHECKING:
-    from validation.blind.exudyn_truth import ExudynTruth
 
 Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
 SORTS: tuple[Sort, ...] = ("none", "faint", "clear", "pair", "unlisted")
@@ -95,7 +93,8 @@ def make_case(
     Sizes are tuned with the built-in simulator either way; `simulator` makes the records. Raises ValueError
     if forty draws do not suffice.
     """
-    pool = _pool(sort, simulator)
+    listed = UNLISTED if sort == "unlisted" else LISTED
+    pool = tuple(name for name in listed if simulator == "ritz" or name in SUPPORTED)
     if first_effect and first_effect not in pool:
         first_effect = str(rng.choice(pool))
     for attempt in range(_TRIES):
@@ -127,24 +126,6 @@ def _seen_where_fitted(records: tuple[Record, ...]) -> bool:
         role = record.plan.role
         largest[role] = max(largest[role], float(np.max(record.ratio)))
     return largest["estimation"] >= _SHARE_IN_ESTIMATION * largest["held_out"]
-
-
-def _pool(sort: Sort, simulator: Simulator) -> tuple[str, ...]:
-    """Causes to choose from that the simulator can make."""
-    names = UNLISTED if sort == "unlisted" else LISTED
-    if simulator == "exudyn":
-        from validation.blind.exudyn_truth import SUPPORTED
-
-        return tuple(name for name in names if name in SUPPORTED)
-    return names
-
-
-def _machine(rig: Rig, effects: list[Table], simulator: Simulator) -> Truth | ExudynTruth:
-    if simulator == "exudyn":
-        from validation.blind.exudyn_truth import ExudynTruth
-
-        return ExudynTruth(rig, effects)
-    return Truth(rig, effects)
 
 
 def _effects(
@@ -250,7 +231,8 @@ def _run(
     rng: np.random.Generator,
     simulator: Simulator,
 ) -> tuple[Record, ...]:
-    machine, nominal = _machine(rig, effects, simulator), Truth(rig)
+    machine = (Truth if simulator == "ritz" else ExudynTruth)(rig, effects)
+    nominal = Truth(rig)
     records = []
     for plan in plans:
         noise = rng.standard_normal((plan.voltage_V.size, 2)) * machine.noise

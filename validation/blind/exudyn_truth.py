@@ -56,7 +56,7 @@ class ExudynTruth:
         if not names <= set(SUPPORTED):
             raise ValueError(f"not in Exudyn's truth: {', '.join(sorted(names - set(SUPPORTED)))}")
         self._plain = Truth(rig, effects)  # checks, and the static voltage and sensor paths
-        self._by_name = {str(e["name"]): e for e in effects}
+        self.names, self.get, self.amplifier = names, self._plain.get, self._plain.amplifier
         self.rig = rig
         self.dt_s = self._plain.dt_s
         self.noise = self._plain.noise
@@ -74,13 +74,6 @@ class ExudynTruth:
         if not np.all(np.isfinite(run.outputs)):
             raise ValueError("the motion leaves every bound: the loop is unstable or the voltage too high")
         return self._plain.sensed(commanded, run.outputs)
-
-    def get(self, name: str, parameter: str, absent: float) -> float:
-        return float(self._by_name[name][parameter]) if name in self._by_name else absent
-
-    @property
-    def amplifier(self) -> Real:
-        return self._plain.amplifier
 
 
 class _Run:
@@ -119,7 +112,7 @@ class _Run:
         fixed = mbs.AddNode(items.NodePointGround())
         fixed_mark = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=fixed, coordinate=0))
         # The body that carries the link turns with the hub, or against a spring if the joint is compliant.
-        compliant = "joint_compliance" in self.machine._by_name
+        compliant = "joint_compliance" in self.machine.names
         root_node = mbs.AddNode(items.NodeRigidBody2D())
         inertia = 1e-4 * J if compliant else J
         root = mbs.AddObject(items.ObjectRigidBody2D(mass=1.0, inertia=inertia, nodeNumber=root_node))
@@ -137,7 +130,7 @@ class _Run:
                 )
             )
         self.base_node, base_mark = None, fixed_mark
-        if "base_compliance" in self.machine._by_name:
+        if "base_compliance" in self.machine.names:
             self.base_node, _, base_mark = self._rotor(items, get("base_compliance", "inertia_kg_m2", 0.0))
             mbs.AddObject(
                 items.ObjectConnectorCoordinateSpringDamper(

@@ -31,15 +31,6 @@ def case_name(index: int) -> str:
     return f"case_{index + 1:04d}"
 
 
-def draw_case(seed: int, index: int, plan: Plan, simulator: Simulator = "ritz") -> BlindCase:
-    """The case of this index and plan, whoever draws it."""
-    return make_case(*plan, np.random.default_rng([seed, 1, index]), simulator)
-
-
-def plan_cases(n_cases: int, seed: int, only: Sort | None = None) -> list[Plan]:
-    return schedule(n_cases, np.random.default_rng([seed, 0, n_cases]), only)
-
-
 def write_case(case: BlindCase, folder: Path) -> None:
     """rig.toml, case.toml and experiments/*.csv; the answer is not among them."""
     (folder / "experiments").mkdir(parents=True, exist_ok=True)
@@ -84,7 +75,7 @@ def answer_toml(answer: Mapping[str, Any]) -> str:
 
 def _one(seed: int, out: Path, open_cases: bool, simulator: Simulator, job: tuple[int, Plan]) -> Answer:
     index, plan = job
-    case = draw_case(seed, index, plan, simulator)
+    case = make_case(*plan, np.random.default_rng([seed, 1, index]), simulator)
     folder = out / case_name(index)
     write_case(case, folder)
     answer = {"case": folder.name, **case.answer}
@@ -114,7 +105,7 @@ def generate(
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
     work = partial(_one, seed, out, open_cases, simulator)
-    plans = plan_cases(n_cases, seed, only)
+    plans = schedule(n_cases, np.random.default_rng([seed, 0, n_cases]), only)
     tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
 
     def take(done: Iterable[Answer]) -> None:

@@ -111,7 +111,7 @@ class Truth:
         def get(name: str, parameter: str, absent: float) -> float:
             return float(by_name[name][parameter]) if name in by_name else absent
 
-        self._get = get
+        self.get = get
         link, hub = rig["link"], rig["hub"]
         stiffness_ratio = get("link_stiffness", "ratio", 1.0)
         section = link["width_m"] * link["thickness_m"]
@@ -186,7 +186,7 @@ class Truth:
 
         Raises ValueError where the motion leaves every bound (an unstable loop).
         """
-        get, p = self._get, self._physics
+        get, p = self.get, self._physics
         commanded = np.array(voltage_V, dtype=np.float64)
         static = self.amplifier
         acting = amplified(commanded, static)
@@ -211,7 +211,7 @@ class Truth:
     @property
     def amplifier(self) -> Real:
         """(gain, dead zone, limit, cubic part) of the voltage's static path."""
-        get = self._get
+        get = self.get
         return np.array(
             [
                 get("actuator_gain", "ratio", 1.0),
@@ -223,7 +223,7 @@ class Truth:
 
     def sensed(self, commanded: Real, outputs: Real) -> Clean:
         """The record as sensors see it, but for noise, clipping and quantisation; outputs (T, 2)."""
-        get = self._get
+        get = self.get
         hub, tip = outputs.T
         a, phase = (
             get("encoder_eccentricity", "amplitude_rad", 0.0),

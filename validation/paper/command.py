@@ -11,14 +11,15 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from validation.paper.experiments import STAGES, PaperResults, run_experiments
-from validation.paper.figures_response import (
+from validation.paper.figures_methods import (
     draw_bounds,
     draw_experiment,
+    draw_gobf_run,
+    draw_peer_runs,
     draw_simulation,
     draw_simulation_peers,
 )
 from validation.paper.figures_search import draw_surface
-from validation.paper.figures_time import draw_gobf_run, draw_peer_runs
 from validation.paper.findings import findings_of
 from validation.paper.page import headlines_of, page_html
 from validation.paper.quotes import REPORTED

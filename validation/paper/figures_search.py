@@ -11,7 +11,6 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator, MultipleLocator
 
-from validation.paper.colours import OUR_WAY, PAPER_WAY
 from validation.paper.surface import VARIANTS, MinimaCount, SearchShares, SurfaceStudy, slices
 from workflow.figures import style
 
@@ -115,8 +114,8 @@ def _shares(axes: Axes, shares: SearchShares) -> None:
     """Two bars per variant: the paper's raw box and our logarithmic coordinates."""
     place = np.arange(len(VARIANTS))[::-1]
     for offset, coordinates, colour, words in (
-        (0.2, "raw", PAPER_WAY, "search in (x, beta, gamma)"),
-        (-0.2, "log", OUR_WAY, "search in log decay, frequency, damping"),
+        (0.2, "raw", style.ACHIEVED, "search in (x, beta, gamma)"),
+        (-0.2, "log", style.MODEL, "search in log decay, frequency, damping"),
     ):
         percent = [100 * shares.hits["order 4", coordinates, name] / shares.searches for name in VARIANTS]
         axes.barh(place + offset, percent, height=0.36, color=colour, label=words)

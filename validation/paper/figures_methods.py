@@ -1,4 +1,9 @@
-"""Figs. 2, 3, 4 and 7 redrawn: frequency responses, in the paper's decibels and degrees."""
+"""Figs. 2 to 7 redrawn: frequency responses, in the paper's decibels and degrees, and free runs.
+
+One line per method, the same in every figure, in the house colours: those of the controller and the closed
+loop are free here, since the page has neither. Green is OE and vermilion is what the paper did. Dashes differ
+too (ARX thin, ARMAX thick, OE dash-dotted, as in the paper), so that a grey print reads.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +19,24 @@ from matplotlib.ticker import MultipleLocator
 from ident.data.arrays import ComplexArray, RealArray
 from ident.uncertainty import FrequencyUncertainty
 from validation.paper.bounds import BoundsStudy
-from validation.paper.colours import METHOD_LINES, OUR_WAY, PAPER_WAY, RECIPE_LINE, TRUTH_LINE
 from validation.paper.experiments import Comparison, PaperResults
+from validation.paper.machines import NOISE_STD
 from validation.paper.methods import JUDGED_BAND_RAD_S, METHODS
 from workflow.figures import style
 from workflow.figures.bands import response_band, unwrapped_degrees
+
+PAPER_WAY = style.ACHIEVED
+OUR_WAY = style.MODEL
+
+METHOD_LINES: dict[str, dict[str, Any]] = {
+    "GOBF": {"color": style.MODEL, "lw": 1.6},
+    "ARX": {"color": style.HIGHLIGHT, "lw": 1.2, "ls": (0, (3, 2))},
+    "ARMAX": {"color": style.LIMIT, "lw": 2.0, "ls": (0, (6, 3))},
+    "OE": {"color": style.PREDICTED, "lw": 1.6, "ls": (0, (6, 2, 1.5, 2))},
+}
+TRUTH_LINE: dict[str, Any] = {"color": style.REFERENCE, "lw": 3.0, "alpha": 0.35}
+RECIPE_LINE: dict[str, Any] = {"color": PAPER_WAY, "lw": 1.2, "ls": (0, (2, 2))}
+_MEASURED = style.MEASURED_LINE | {"lw": 2.4, "alpha": 0.6}
 
 # Where the phases of two curves are brought to the same turn.
 _COMMON_TURN_RAD_S = (0.5, 5.0)
@@ -86,6 +104,56 @@ def _bode(shown: Comparison, curves: list[Curve], title: str) -> Figure:
         figure.align_ylabels()
         style.finish(figure, gain, columns=4)
     return figure
+
+
+def draw_gobf_run(shown: Comparison) -> Figure:
+    """Fig. 5: measured tip and GOBF's free run, and what is left."""
+    record = shown.trial.fresh
+    time, measured = record.time_s, record.output[:, 0]
+    with style.house_style():
+        figure = style.new_figure(4.9)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1.0])
+        _overlay(upper, shown, "GOBF")
+        upper.set_title(f"Fresh data, GOBF: fit {shown.scores['GOBF'].fit_percent:.1f} %")
+        residual = {**style.MEASURED_LINE, "lw": 0.7}
+        lower.plot(time, measured - shown.simulated["GOBF"], **residual, label="measured - simulated")
+        sensor = "±2 standard deviations of the sensor noise"
+        lower.axhspan(-2 * NOISE_STD, 2 * NOISE_STD, **style.BAND, zorder=0, label=sensor)
+        lower.set_ylabel("residual [m]")
+        lower.set_xlabel("time [s]")
+        upper.set_xlim(time[0], time[-1])
+        figure.align_ylabels()
+        style.finish(figure, [upper, lower], columns=4)
+    return figure
+
+
+def draw_peer_runs(shown: Comparison) -> Figure:
+    """Fig. 6: the same for ARX, ARMAX and OE, one panel each on the same axes."""
+    measured = shown.trial.fresh.output[:, 0]
+    names = METHODS[1:]
+    with style.house_style():
+        figure = style.new_figure(7.0)
+        panels = figure.subplots(len(names), 1, sharex=True, sharey=True)
+        for axes, name in zip(panels, names, strict=True):
+            _overlay(axes, shown, name)
+            fit = shown.scores[name].fit_percent
+            words = f"fit {fit:.1f} %" if np.isfinite(fit) else "runs away"
+            axes.set_title(f"Fresh data, {name}: {words}")
+        span = float(np.ptp(measured))
+        # A run that leaves the measured range by far is not worth making the others unreadable for.
+        panels[0].set_ylim(measured.min() - 0.6 * span, measured.max() + 0.6 * span)
+        panels[0].set_xlim(0, shown.trial.fresh.time_s[-1])
+        panels[-1].set_xlabel("time [s]")
+        style.finish(figure, panels, columns=4)
+    return figure
+
+
+def _overlay(axes: Axes, shown: Comparison, name: str) -> None:
+    time = shown.trial.fresh.time_s
+    axes.plot(time, shown.trial.fresh.output[:, 0], **_MEASURED, label="measured")
+    simulated = np.clip(shown.simulated[name], -1e3, 1e3)
+    axes.plot(time, simulated, **METHOD_LINES[name], label=f"{name}, free run")
+    axes.set_ylabel("tip [m]")
 
 
 def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
