@@ -36,6 +36,7 @@ from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from validation.comparators.comparators import PolynomialModel, armax, arx, oe
+from validation.paper.methods import poles_of
 
 HALF = 512
 ORDERS = (4, 6, 8, 10)
@@ -62,7 +63,7 @@ def free_columns(model: Model, n_samples: int) -> np.ndarray:
 
 def largest_pole(model: Model) -> float:
     """Modulus of the slowest pole; 1 or more is unstable."""
-    return float(np.abs(model.poles.values if isinstance(model, GobfModel) else model.poles).max())
+    return float(np.abs(poles_of(model)).max())
 
 
 @dataclass(frozen=True)

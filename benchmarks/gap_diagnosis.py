@@ -30,14 +30,9 @@ LABELLED = Path(os.environ.get("FLEXLINK_GAP", Path(__file__).parents[2] / "shar
 
 def diagnose(cases: Sequence[Path], rig: str, out: Path, jobs: int) -> None:
     """The command as a user gives it."""
-    command = ["flexlink", "diagnose", *map(str, cases), "--out", str(out), "--rig", rig, "--jobs", str(jobs)]
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    done = subprocess.run(
-        [*command, "--no-controller"],
-        env={**os.environ, "PATH": path},
-        stdout=subprocess.DEVNULL,
-        check=False,
-    )
+    command = [sys.executable, "-m", "workflow", "diagnose", *map(str, cases), "--no-controller"]
+    command += ["--out", str(out), "--rig", rig, "--jobs", str(jobs)]
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
     if done.returncode not in (EXIT_OK, EXIT_NOT_CERTIFIED):  # the second: some answer is not certain
         raise SystemExit(f"flexlink diagnose ended with {done.returncode}")
 

@@ -18,46 +18,32 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import Print, main
-from benchmarks.p1_measures import FRICTION, HEADER, PLAIN, Model, Score, Variant, bounds, row, score
+from benchmarks.p1_measures import FRICTION, HEADER, PLAIN, Score, Variant, bounds, row, score
 from ident import IdentOptions, Record, identify
 from ident.basis.structure import filter_input
 from tests.ident.benchmark_plants import DT_S, Truth
 from validation.comparators.comparators import armax, arx, oe
 from validation.comparators.subspace import moesp
+from validation.paper.methods import LinearModel
 
-Fit = Callable[[Record], tuple[Model, np.ndarray]]
+Fit = Callable[[Record], LinearModel]
 KNOWN = "GOBF, known: rel. degree 2, {} integr."
 NOTHING = "GOBF, nothing known"
 
 
 def ours(**settings: Any) -> Fit:
     """Fit of GOBF with these settings."""
-
-    def fit(record: Record) -> tuple[Model, np.ndarray]:
-        model = identify([record], IdentOptions(**settings)).model
-        return model, model.poles.values
-
-    return fit
-
-
-def peer(method: Callable[[Record], Model]) -> Fit:
-    """Fit of a method whose model has `poles`."""
-
-    def fit(record: Record) -> tuple[Model, np.ndarray]:
-        model = method(record)
-        return model, model.poles  # type: ignore[attr-defined]
-
-    return fit
+    return lambda record: identify([record], IdentOptions(**settings)).model
 
 
 PEERS: dict[str, Fit] = {
-    "OE 4/4 (Steiglitz-McBride start)": peer(lambda record: oe(record, 4, 4, arx_start=False)),
-    "OE 4/4 (and from ARX)": peer(lambda record: oe(record, 4, 4)),
-    "ARMAX 4/4/4 (usual starts)": peer(lambda record: armax(record, 4, 4, 4, output_error_start=False)),
-    "ARMAX 4/4/4 (and from output error)": peer(lambda record: armax(record, 4, 4, 4)),
-    "ARX 4/4": peer(lambda record: arx(record, 4, 4)),
-    "subspace, order 4, horizon 10": peer(lambda record: moesp(record, 4)),
-    "subspace, order 4, horizon 150": peer(lambda record: moesp(record, 4, horizon=150)),
+    "OE 4/4 (Steiglitz-McBride start)": lambda record: oe(record, 4, 4, arx_start=False),
+    "OE 4/4 (and from ARX)": lambda record: oe(record, 4, 4),
+    "ARMAX 4/4/4 (usual starts)": lambda record: armax(record, 4, 4, 4, output_error_start=False),
+    "ARMAX 4/4/4 (and from output error)": lambda record: armax(record, 4, 4, 4),
+    "ARX 4/4": lambda record: arx(record, 4, 4),
+    "subspace, order 4, horizon 10": lambda record: moesp(record, 4),
+    "subspace, order 4, horizon 150": lambda record: moesp(record, 4, horizon=150),
 }
 
 
@@ -72,6 +58,11 @@ class Summed:
         sums = 1 / (1 - np.exp(-1j * omega_rad_s * DT_S)) ** self.integrators
         return np.asarray(self.model.frequency_response(omega_rad_s) * sums)
 
+    @property
+    def poles(self) -> np.ndarray:
+        """Without those of the integrators."""
+        return np.asarray(self.model.poles)
+
     def simulate(self, u: np.ndarray) -> np.ndarray:
         return np.asarray(self.model.simulate(filter_input(u, self.integrators, 0)))
 
@@ -79,10 +70,9 @@ class Summed:
 def summed_oe(integrators: int) -> Fit:
     """Output error with the integrators taken out: four coefficients in B, four less the integrators in F."""
 
-    def fit(record: Record) -> tuple[Summed, np.ndarray]:
+    def fit(record: Record) -> Summed:
         summed = replace(record, input=filter_input(record.input[:, 0], integrators, 0)[:, None])
-        model = oe(summed, 4, 4 - integrators, arx_start=False)
-        return Summed(model, integrators), model.poles
+        return Summed(oe(summed, 4, 4 - integrators, arx_start=False), integrators)
 
     return fit
 
@@ -156,7 +146,7 @@ def run(out: Print, *, seeds: int = 50) -> None:
         error = quantile(found, key, 0.5), quantile(found, key, 0.9)
         out(
             reach_line(
-                f"{said}: RMS relative error {band} rad/s, median / 90th",
+                f"{said}: RMS error {band} rad/s, median / 90th",
                 f"{limits[0]} / {limits[1]}",
                 f"{error[0]:.4f} / {error[1]:.4f}",
                 error[0] <= limits[0] and error[1] <= limits[1],

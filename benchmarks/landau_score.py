@@ -7,6 +7,7 @@ counts for the worst load; the score is their mean, and 0 if any load is unstabl
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,16 +20,30 @@ LOADS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "half": ((1, -1.99185, 2.20265, -1.84083, 0.89413), (0, 0, 0, 0.10276, 0.18123)),
     "full": ((1, -2.09679, 2.31962, -1.93353, 0.87129), (0, 0, 0, 0.06408, 0.10407)),
 }
-ITEMS = (
-    "rise_s",
-    "peak",
-    "rejection_s",
-    "integrator",
-    "attenuation_Hz",
-    "sensitivity_dB",
-    "delay_margin_s",
-    "effort_dB",
-)
+
+
+@dataclass(frozen=True)
+class Item:
+    """Limit for the full score in words; share of the score (0 to 1 where it is between), and how far inside
+    the limit, as a share of the limit (negative: outside), of a value."""
+
+    limit: str
+    share: Callable[[float], float]
+    margin: Callable[[float], float]
+
+
+ITEMS = {
+    "rise_s": Item("<= 1", lambda v: 2 - v, lambda v: 1 - v),
+    "peak": Item("<= 1.1", lambda v: (1.2 - v) / 0.1, lambda v: (1.1 - v) / 0.1),
+    "rejection_s": Item("<= 1.2", lambda v: (1.4 - v) / 0.2, lambda v: (1.2 - v) / 1.2),
+    "integrator": Item("yes", lambda v: v, lambda v: np.inf if v else -1.0),
+    "attenuation_Hz": Item(">= 0.2", lambda v: (v - 0.1) / 0.1, lambda v: (v - 0.2) / 0.2),
+    "sensitivity_dB": Item("<= 6", lambda v: (12 - v) / 6, lambda v: (6 - v) / 6),
+    "delay_margin_s": Item(
+        ">= 0.04", lambda v: (v / TS_S - 0.4) / 0.4, lambda v: (v - 0.8 * TS_S) / (0.8 * TS_S)
+    ),
+    "effort_dB": Item("<= 10", lambda v: (20 - v) / 10, lambda v: (10 - v) / 10),
+}
 _HZ = np.arange(1, 1001) * 0.01
 _FINE = np.geomspace(1e-3, np.pi, 2000)  # rad/sample, for the crossovers
 
@@ -101,31 +116,7 @@ def _delay_margin(ar: np.ndarray, bs: np.ndarray) -> float:
 
 def points(item: str, value: float) -> float:
     """0 to 100 for one item and load."""
-    share = {
-        "rise_s": 2 - value,
-        "peak": (1.2 - value) / 0.1,
-        "rejection_s": (1.4 - value) / 0.2,
-        "integrator": value,
-        "attenuation_Hz": (value - 0.1) / 0.1,
-        "sensitivity_dB": (12 - value) / 6,
-        "delay_margin_s": (value / TS_S - 0.4) / 0.4,
-        "effort_dB": (20 - value) / 10,
-    }[item]
-    return 100.0 * float(np.clip(share, 0, 1))
-
-
-def margin(item: str, value: float) -> float:
-    """How far a value is inside its full-score limit, as a share of the limit (negative: outside)."""
-    return {
-        "rise_s": 1 - value,
-        "peak": (1.1 - value) / 0.1,
-        "rejection_s": (1.2 - value) / 1.2,
-        "integrator": np.inf if value else -1.0,
-        "attenuation_Hz": (value - 0.2) / 0.2,
-        "sensitivity_dB": (6 - value) / 6,
-        "delay_margin_s": (value - 0.8 * TS_S) / (0.8 * TS_S),
-        "effort_dB": (10 - value) / 10,
-    }[item]
+    return 100.0 * float(np.clip(ITEMS[item].share(value), 0, 1))
 
 
 def all_values(law: Law) -> dict[str, dict[str, float]] | None:
@@ -149,4 +140,4 @@ def margins(law: Law) -> dict[str, float]:
     found = all_values(law)
     if found is None:
         return dict.fromkeys(ITEMS, -np.inf)
-    return {item: min(margin(item, v[item]) for v in found.values()) for item in ITEMS}
+    return {item: min(ITEMS[item].margin(v[item]) for v in found.values()) for item in ITEMS}

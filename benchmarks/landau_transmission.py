@@ -40,16 +40,6 @@ QUICK = SynthesisOptions(
     omega_min_rad_s=1e-2,
     sufficient_gamma=0.999,
 )
-LIMITS = {
-    "rise_s": "<= 1",
-    "peak": "<= 1.1",
-    "rejection_s": "<= 1.2",
-    "integrator": "yes",
-    "attenuation_Hz": ">= 0.2",
-    "sensitivity_dB": "<= 6",
-    "delay_margin_s": ">= 0.04",
-    "effort_dB": "<= 10",
-}
 SPLITS = {
     (4, 2): np.array([0.2, -0.55, 0.4, -0.05, -0.3, -0.2]),
     (3, 3): np.array([0.2, -0.5, 0.35, -0.05, -0.2, -0.15]),
@@ -84,7 +74,7 @@ def table(out: Print, law: Law) -> None:
     out(f"  {'item':<15} {'limit':>8}  " + "  ".join(f"{load:>8}" for load in found) + "   margin %")
     for item in ITEMS:
         cells = "  ".join(f"{v[item]:>8.3f}" for v in found.values())
-        out(f"  {item:<15} {LIMITS[item]:>8}  {cells}  {100 * smallest[item]:>8.1f}")
+        out(f"  {item:<15} {ITEMS[item].limit:>8}  {cells}  {100 * smallest[item]:>8.1f}")
     out(f"  R = {np.round(law.R, 7).tolist()}")
     out(f"  S = {np.round(law.S, 7).tolist()}, T = S(1) = {law.T[0]:.7f}")
 

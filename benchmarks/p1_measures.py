@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -24,19 +24,12 @@ import scipy.signal
 from benchmarks.harness import timed
 from ident.data.record import Record
 from tests.ident.benchmark_plants import DT_S, Truth, max_length_sequence, p1, p1_friction, run
+from validation.paper.methods import LinearModel, poles_of
 
 GRID = np.geomspace(0.1, 600, 400)
 MIDDLE = (GRID >= 1) & (GRID <= 100)
 MODE_RAD_S = 15.0
 _DRAWS = 20_000
-
-
-class Model(Protocol):
-    """What every method returns."""
-
-    def frequency_response(self, omega_rad_s: np.ndarray) -> np.ndarray: ...
-
-    def simulate(self, u: np.ndarray) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -68,16 +61,15 @@ class Score:
     model: Any
 
 
-def score(
-    fit: Callable[[Record], tuple[Model, np.ndarray]], variant: Variant, truths: Sequence[Truth]
-) -> list[Score]:
-    """Fit every truth's record (after one warm-up fit); `fit` returns the model and its poles."""
+def score(fit: Callable[[Record], LinearModel], variant: Variant, truths: Sequence[Truth]) -> list[Score]:
+    """Fit every truth's record (after one warm-up fit)."""
     fit(truths[0].record)
     response, fresh = truths[0].response(GRID), variant.fresh_input()
     y = run(truths[0].system, fresh)
     scores = []
     for truth in truths:
-        (model, poles), cpu_s = timed(partial(fit, truth.record))
+        model, cpu_s = timed(partial(fit, truth.record))
+        poles = poles_of(model)
         error = np.abs(model.frequency_response(GRID) / response - 1)
         natural = np.abs(np.log(poles[poles.imag > 0])) / DT_S
         scores.append(

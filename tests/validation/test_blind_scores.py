@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.gap_diagnosis import score
-from plant.effects import EFFECTS
 from validation.blind.generate import answer_toml
 from validation.blind.report import confusion_figure, text
 from validation.blind.scores import scores, wilson
-from validation.blind.sizes import FAMILY
 from workflow.engine.errors import InputError
 from workflow.engine.storage import write_json
 
@@ -49,12 +47,6 @@ def _true(case, verdict, effects=(), *, ratio=5.0, before=2.0, oracle=1.0, nomin
 
 GRAVITY = ("gravity", {"acceleration_m_s2": 1.0})
 DELAY = ("input_delay", {"delay_s": 0.01})
-
-
-def test_families_are_the_groups_of_the_registry():
-    for family, names in FAMILY.items():
-        assert {EFFECTS[name].group for name in names} == {family}
-    assert {name for names in FAMILY.values() for name in names} == set(EFFECTS)
 
 
 def test_wilson_against_published_values():

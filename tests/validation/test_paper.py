@@ -15,11 +15,10 @@ import pytest
 
 from tests.workflow.test_figures import panels
 from validation.paper import command
-from validation.paper.command import DRAWERS, PAGE, redraw_paper
+from validation.paper.command import DRAWERS, PAGE, headlines_of, page_html, redraw_paper
 from validation.paper.experiments import run_experiments
 from validation.paper.findings import findings_of
 from validation.paper.methods import METHODS
-from validation.paper.page import headlines_of, page_html
 from validation.paper.quotes import OPEN_CHOICES, REPORTED
 from validation.paper.settings import PaperSettings
 from validation.paper.table import csv_text, rows_of

@@ -99,11 +99,10 @@ class _Truth:
         return self._machine.output(u)
 
 
-def test_the_truth_scores_fully(monkeypatch):
+def test_the_truth_scores_fully():
     machine = SimulationExample()
     trial = machine.trial(np.random.default_rng(1))
     poles = np.exp(paper_example().poles() * DT_S)
-    monkeypatch.setattr("validation.paper.methods.poles_of", lambda model: model.poles)
     marks = score(machine, trial, _Truth(machine, poles), frequencies())
     assert marks.response_error == pytest.approx(0, abs=1e-12)
     assert marks.mode_found

@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from validation.blind.sizes import FAMILY
+from plant.effects import EFFECTS
 
 Document = Mapping[str, Any]
 
-_FAMILY_OF = {name: family for family, names in FAMILY.items() for name in names}
 CLEAR, FAINT = 3.0, (0.3, 1.5)
 CONFIDENT = 0.8
 _BINS = 10
@@ -226,8 +225,8 @@ def _top(pair: Pair, depth: int) -> bool:
 
 
 def _family(pair: Pair) -> bool:
-    families = {_FAMILY_OF.get(name, name) for name in pair.names}
-    return _FAMILY_OF.get(pair.first, pair.first) in families
+    said, *true = (EFFECTS[name].group if name in EFFECTS else name for name in (pair.first, *pair.names))
+    return said in true
 
 
 def _matches(pair: Pair) -> list[tuple[str, float, float, Any]]:

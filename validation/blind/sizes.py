@@ -15,23 +15,6 @@ from validation.blind.truth import LISTED, UNLISTED, RigTable
 
 Table = dict[str, Any]
 
-FAMILY = {
-    "actuator": ("actuator_saturation", "actuator_dead_zone", "actuator_lag", "input_delay", "actuator_gain"),
-    "joint": (
-        "coulomb_friction",
-        "stribeck_friction",
-        "viscous_friction",
-        "backlash",
-        "torque_ripple",
-        "joint_compliance",
-        "hardening_spring",
-        "periodic_disturbance",
-        "base_compliance",
-        "hub_inertia",
-    ),
-    "link": ("tip_payload", "link_stiffness", "structural_damping", "gravity"),
-    "sensor": ("sensor_lag", "sensor_gain", "sensor_drift", "quantisation"),
-}
 # Effects that multiply or add to a stated parameter, and the tolerances that could explain them away.
 PARAMETRIC: Mapping[str, tuple[str, ...]] = {
     "hub_inertia": ("hub.inertia_kg_m2",),
@@ -77,6 +60,10 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     def log(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
+    def growing(first: float, largest: float, fixed: Table, **units: float) -> Sizable:
+        """Parameters in proportion to the size, beside fixed ones."""
+        return Sizable(name, first, largest, lambda size: {k: size * u for k, u in units.items()} | fixed)
+
     # name -> (parameter, its value at size 1, first size tried, largest)
     simple = {
         "coulomb_friction": ("torque_Nm", s.torque, 0.05, 0.6),
@@ -106,31 +93,18 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     }
     if name in simple:
         parameter, unit, first, largest = simple[name]
-        return Sizable(name, first, largest, lambda size: {parameter: size * unit})
+        return growing(first, largest, {}, **{parameter: unit})
     if name in ratios:
         return Sizable(name, *ratios[name], ratio)
     if name == "stribeck_friction":
         share, speed = rng.uniform(0.35, 0.75), log(0.02, 0.3)
-        return Sizable(
-            name,
-            0.05,
-            0.8,
-            lambda size: {
-                "static_torque_Nm": size * s.torque,
-                "coulomb_torque_Nm": share * size * s.torque,
-                "stribeck_velocity_rad_s": speed,
-            },
-        )
+        levels = {"static_torque_Nm": s.torque, "coulomb_torque_Nm": share * s.torque}
+        return growing(0.05, 0.8, {"stribeck_velocity_rad_s": speed}, **levels)
     if name == "actuator_saturation":
         return Sizable(name, 0.2, 3.0, lambda size: {"limit_V": s.peak * np.exp(-size)})
     if name == "torque_ripple":
-        cycles = float(rng.integers(4, 41))
-        return Sizable(
-            name,
-            0.05,
-            0.5,
-            lambda size: {"amplitude_Nm": size * s.torque, "cycles_per_rev": cycles, "phase_rad": phase},
-        )
+        turning = {"cycles_per_rev": float(rng.integers(4, 41)), "phase_rad": phase}
+        return growing(0.05, 0.5, turning, amplitude_Nm=s.torque)
     if name == "joint_compliance":
         time = log(0.0005, 0.003)
         return Sizable(
@@ -143,13 +117,8 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
             },
         )
     if name == "periodic_disturbance":
-        frequency = log(0.5, 12.0)
-        return Sizable(
-            name,
-            0.05,
-            1.0,
-            lambda size: {"amplitude_Nm": size * s.torque, "frequency_Hz": frequency, "phase_rad": phase},
-        )
+        tone = {"frequency_Hz": log(0.5, 12.0), "phase_rad": phase}
+        return growing(0.05, 1.0, tone, amplitude_Nm=s.torque)
     if name == "base_compliance":
         base, damping = s.inertia * log(0.3, 3.0), rng.uniform(0.03, 0.15)
         # Size 1: the base swings at 6 Hz.
@@ -164,18 +133,9 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
             }
 
         return Sizable(name, 0.3, 8.0, compliant)
-    return _unlisted(name, s, sign, phase, rng)
-
-
-def _unlisted(name: str, s: _Scales, sign: float, phase: float, rng: np.random.Generator) -> Sizable:
     if name == "cogging":
-        cycles = float(rng.integers(6, 31))
-        return Sizable(
-            name,
-            0.1,
-            0.7,
-            lambda size: {"relative_amplitude": size, "cycles_per_rev": cycles, "phase_rad": phase},
-        )
+        turning = {"cycles_per_rev": float(rng.integers(6, 31)), "phase_rad": phase}
+        return growing(0.1, 0.7, turning, relative_amplitude=1.0)
     if name == "inductance":
         return Sizable(
             name,
@@ -187,22 +147,15 @@ def _unlisted(name: str, s: _Scales, sign: float, phase: float, rng: np.random.G
             },
         )
     if name == "asymmetric_friction":
-        uneven = rng.uniform(0.3, 0.8)
-        return Sizable(
-            name,
-            0.05,
-            0.6,
-            lambda size: {
-                "torque_positive_Nm": size * s.torque * (1 + sign * uneven),
-                "torque_negative_Nm": size * s.torque * (1 - sign * uneven),
-            },
-        )
+        uneven = sign * rng.uniform(0.3, 0.8)
+        levels = {"positive": s.torque * (1 + uneven), "negative": s.torque * (1 - uneven)}
+        return growing(0.05, 0.6, {}, **{f"torque_{side}_Nm": level for side, level in levels.items()})
     if name == "sensor_clipping":
         return Sizable(name, 0.2, 2.0, lambda size: {"limit_m": s.tip_peak * np.exp(-size)})
     if name == "encoder_eccentricity":
         # Phases that would mostly scale the angle are left out: a gain is another effect.
         offset = 0.5 * pi * sign + rng.uniform(-0.6, 0.6)
-        return Sizable(name, 0.03, 0.5, lambda size: {"amplitude_rad": size, "phase_rad": offset})
+        return growing(0.03, 0.5, {"phase_rad": offset}, amplitude_rad=1.0)
     raise ValueError(f"unknown effect {name!r}; known: {', '.join(LISTED + UNLISTED)}")
 
 

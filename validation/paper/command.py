@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from validation.paper.experiments import STAGES, PaperResults, run_experiments
+from validation.paper import table
+from validation.paper.bounds import TWO_SIGMA_LEVEL
+from validation.paper.experiments import RECIPE_BUDGET, STAGES, PaperResults, run_experiments
 from validation.paper.figures_methods import (
     draw_bounds,
     draw_experiment,
@@ -20,19 +23,20 @@ from validation.paper.figures_methods import (
     draw_simulation_peers,
 )
 from validation.paper.figures_search import draw_surface
-from validation.paper.findings import findings_of
-from validation.paper.page import headlines_of, page_html
-from validation.paper.quotes import REPORTED
+from validation.paper.findings import CLOSE_TO_BEST, PEERS, Findings, findings_of
+from validation.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
+from validation.paper.quotes import OPEN_CHOICES, REPORTED, SOURCE
 from validation.paper.settings import PaperSettings
-from validation.paper.table import csv_text, rows_of
 from workflow.engine import storage
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import package_versions
 from workflow.engine.store import Store
-from workflow.figures.style import render
+from workflow.figures.style import Picture, render
+from workflow.report.rendering import embedded
 from workflow.tasks.summary import Row, RunSummary, Section
+from workflow.text.templates import environment
 
 PAGE = "paper.html"
 TABLE_CSV, TABLE_JSON = "table.csv", "table.json"
@@ -85,7 +89,7 @@ def redraw_paper(
     for number, draw in DRAWERS.items():
         progress.update("page", (number - 1) / len(DRAWERS), f"figure {number}")
         pictures[number] = render(draw(results))
-    findings, rows = findings_of(results), rows_of(results)
+    findings, rows = findings_of(results), table.rows_of(results)
     headlines = headlines_of(results, findings)
     document = {
         "seed": settings.seed,
@@ -107,11 +111,53 @@ def redraw_paper(
     store.prepare(replace=True)
     for number, picture in pictures.items():
         storage.write_bytes(store.path / f"figure-{number}.{picture.kind}", picture.content)
-    storage.write_text(store.path / TABLE_CSV, csv_text(rows))
+    storage.write_text(store.path / TABLE_CSV, table.csv_text(rows))
     storage.write_text(store.path / TABLE_JSON, plain_text(document))
     storage.write_text(store.manifest_path, page)
     progress.finish("page", time.monotonic() - started, taken_up=False)
     return _summary(store.path, document)
+
+
+def headlines_of(results: PaperResults, findings: Findings) -> list[str]:
+    """What the run found, one line a figure."""
+    template = environment(package="validation").get_template("paper_headlines.txt.j2")
+    text = template.render(results=results, found=findings, methods=METHODS, peers=PEERS)
+    return text.strip().splitlines()
+
+
+def page_html(
+    results: PaperResults, pictures: Mapping[int, Picture], findings: Findings, rows: Sequence[table.Row]
+) -> str:
+    """The self-contained page; everything drawn stands inside it."""
+    return (
+        environment(package="validation")
+        .get_template("paper.html.j2")
+        .render(
+            contents=[],
+            results=results,
+            found=findings,
+            headlines=headlines_of(results, findings),
+            source=SOURCE,
+            reported=REPORTED,
+            choices=OPEN_CHOICES,
+            band=JUDGED_BAND_RAD_S,
+            methods=METHODS,
+            peers=PEERS,
+            better=BETTER_STARTS,
+            close=CLOSE_TO_BEST,
+            level=TWO_SIGMA_LEVEL,
+            recipe_evaluations=RECIPE_BUDGET * results.settings.evaluations,
+            drawings={
+                item.number: embedded(
+                    f"figure-{item.number}",
+                    f"Fig. {item.number}, redrawn: {item.title}",
+                    pictures[item.number],
+                )
+                for item in REPORTED
+            },
+            tables={figure: list(group) for figure, group in groupby(rows, key=lambda row: row.figure)},
+        )
+    )
 
 
 def _summary(out: Path, document: Mapping[str, Any]) -> RunSummary:

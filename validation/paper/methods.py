@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.identify import identify
 from validation.comparators.comparators import armax, arx, oe
-from validation.comparators.polynomial_model import PolynomialModel
 from validation.paper.machines import PaperMachine, Trial
 from validation.paper.settings import N_PAIRS, N_REAL, ORDER
 from validation.paper.usual_starts import usual_oe
@@ -28,10 +27,12 @@ JUDGED_BAND_RAD_S = (1.0, 100.0)
 
 
 class LinearModel(Protocol):
-    """What GobfModel and PolynomialModel share."""
+    """What GobfModel and the models of the comparators share."""
 
     def frequency_response(self, omega_rad_s: RealArray) -> ComplexArray: ...
     def simulate(self, u: RealArray) -> RealArray: ...
+    @property
+    def poles(self) -> Any: ...
 
 
 def gobf_options() -> IdentOptions:
@@ -55,10 +56,8 @@ def fit_methods(record: Record) -> dict[str, LinearModel]:
 
 def poles_of(model: LinearModel) -> ComplexArray:
     """Poles (n,) in the z plane."""
-    if isinstance(model, GobfModel):
-        return model.poles.values
-    assert isinstance(model, PolynomialModel)
-    return model.poles
+    poles: ComplexArray = model.poles.values if isinstance(model, GobfModel) else model.poles
+    return poles
 
 
 def pairs_of(model: LinearModel, dt_s: float) -> RealArray:

@@ -187,27 +187,26 @@ def _costs(record: Record, options: IdentOptions, evaluations: int) -> dict[tupl
     found: dict[tuple[str, str], float] = {}
     for coordinates in COORDINATES:
         for variant in VARIANTS:
-            poles, _ = direct_alone(PoleSearch(data, _searched(options, coordinates, variant)), evaluations)
+            poles = direct_alone(PoleSearch(data, _searched(options, coordinates, variant)), evaluations)
             # Downhill with the same bounds for both: what differs is where the search was made.
             found[coordinates, variant] = refine(data, poles, PoleSearch(data, options).bounds).rss
     return found
 
 
-def direct_alone(search: PoleSearch, evaluations: int) -> tuple[Poles, float]:
-    """The paper's search: the best point DIRECT looked at, and its residual sum of squares; no descent."""
+def direct_alone(search: PoleSearch, evaluations: int) -> Poles:
+    """The paper's search: the best point DIRECT looked at; no descent."""
     options = search.options
     space = search.space(options.n_real or 0, options.n_pairs or 0)
     cost = search.data.candidate_cost(space, search.fixed, search.fixed)
     points, costs = minimise(cost.log, space.dimension, options.algorithm, evaluations)
-    best = int(np.argmin(costs))
-    return space.poles(points[best]), float(np.exp(costs[best]))
+    return space.poles(points[int(np.argmin(costs))])
 
 
 def paper_recipe(record: Record, evaluations: int) -> GobfModel:
     """GOBF as the paper found it: DIRECT in the raw box (x, beta, gamma), least squares there, no descent."""
     options = _searched(_from_rest(N_REAL, N_PAIRS), "raw", "GN_DIRECT")
     data = prepare([record], options.structure())
-    poles, _ = direct_alone(PoleSearch(data, options), evaluations)
+    poles = direct_alone(PoleSearch(data, options), evaluations)
     return GobfModel(
         poles,
         fit(data, poles).coefficients[0],

@@ -56,19 +56,10 @@ def _row(figure: int, quantity: str, value: float, unit: str = "", paper: str = 
 def _surface_rows(results: PaperResults) -> list[Row]:
     study = results.surface
     rows = [
-        _row(
-            1,
-            f"minima inside the window, grid of {count.n_points} x {count.n_points}",
-            count.inside,
-            paper="several (none counted)",
-        )
-        for count in study.counts
-    ]
-    rows += [
-        _row(
-            1,
-            f"lowest points at the window's border, grid of {count.n_points} x {count.n_points}",
-            count.border,
+        _row(1, f"{words}, grid of {count.n_points} x {count.n_points}", getattr(count, kind), paper=paper)
+        for words, kind, paper in (
+            ("minima inside the window", "inside", "several (none counted)"),
+            ("lowest points at the window's border", "border", _NOT_PRINTED),
         )
         for count in study.counts
     ]
