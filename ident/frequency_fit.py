@@ -12,6 +12,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
+from ident.checks.plausible_modes import pairs_outside
 from ident.data.arrays import RealArray, lock
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.finding import Finding, FindingKind, distinct, finding
@@ -176,6 +177,7 @@ def identify_frf(
         options=embedding,
         shared_gain_std=shared_gain_std,
     )
+    band_rad_s = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
     return FrfIdentification(
         model=model,
         posterior=posterior,
@@ -195,7 +197,7 @@ def identify_frf(
             distinct(
                 [
                     *pole_warnings(poles, fixed, search.bounds, response.dt_s),
-                    *_outside_the_band(poles, fixed, response),
+                    *pairs_outside(poles, fixed, response.dt_s, band_rad_s),
                 ]
             ),
             search.evaluations,
@@ -212,16 +214,6 @@ def _chi_square(rss: float, freedom: int) -> Finding:
         expected_low=low,
         expected_high=high,
     )
-
-
-def _outside_the_band(poles: Poles, fixed: Poles, response: FrequencyUncertainty) -> list[Finding]:
-    """One finding for each pair that no measured frequency surrounds."""
-    low, high = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
-    return [
-        finding(FindingKind.OUTSIDE_BAND, omega_rad_s=omega, low_rad_s=low, high_rad_s=high)
-        for omega in poles.omega_rad_s(response.dt_s)[fixed.pairs.size :]
-        if not low <= omega <= high
-    ]
 
 
 def _pole_deviations(

@@ -47,3 +47,14 @@ def implausible_pairs(poles: Poles, fixed: Poles, dt_s: float, longest_s: float)
         elif kind is PairKind.OVERDAMPED:
             found.append(finding(FindingKind.DAMPED_PAIR, **pair, largest_zeta=LARGEST_DAMPING))
     return found
+
+
+def pairs_outside(poles: Poles, fixed: Poles, dt_s: float, band_rad_s: tuple[float, float]) -> list[Finding]:
+    """One finding for each pair that was found outside the band of the data."""
+    low, high = band_rad_s
+    known = set(fixed.omega_rad_s(dt_s).tolist())
+    return [
+        finding(FindingKind.OUTSIDE_BAND, omega_rad_s=omega, low_rad_s=low, high_rad_s=high)
+        for omega in poles.omega_rad_s(dt_s).tolist()
+        if omega not in known and not low <= omega <= high
+    ]

@@ -8,7 +8,7 @@ import scipy.signal
 
 from ident import IdentOptions, identify
 from ident.basis.poles import Poles
-from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair
+from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair, pairs_outside
 from ident.coloured_noise import long_arx_filter, prewhitened
 from ident.finding import FindingKind
 from tests.ident.benchmark_plants import as_record, p1, p2
@@ -103,4 +103,6 @@ def test_a_mode_of_fewer_than_three_periods_is_none():
     assert slow.values["omega_rad_s"] == pytest.approx(2 * np.pi * 0.01)
     assert (damped.values["omega_rad_s"], damped.values["zeta"]) == pytest.approx((2 * np.pi * 9.0, 0.8))
     assert implausible_pairs(found, found, 0.005, 8.0) == []
+    (outside,) = pairs_outside(found, Poles(pairs=found.pairs[:1]), 0.005, (20.0, 50.0))
+    assert outside.values["omega_rad_s"] == pytest.approx(2 * np.pi * 9.0)
     assert kind_of_pair(2 * np.pi * 5, 0.02, 8.0) is PairKind.MODE

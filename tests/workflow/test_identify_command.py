@@ -234,6 +234,12 @@ def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
     assert numbers["uncertainty"]["bands"][0]["from_rad_s"] >= 8
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "Fitted inside the band from 8 to 300 rad/s" in text
+    assert not [sentence for sentence in numbers["warnings"] if "outside the band" in sentence]
+
+    upper = 2 * np.pi * P2_HZ[1] / 1.1
+    cut = flexlink("identify", log, *COLUMNS, "--real", 2, "--pairs", 2, "--band", 8, upper, "--json")
+    warnings = json.loads(cut.out)["numbers"]["warnings"]
+    assert [sentence for sentence in warnings if "outside the band of the data" in sentence]
 
 
 def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexlink, undrawn, tmp_path):

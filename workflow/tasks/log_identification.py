@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.basis.options import IdentOptions
+from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import ResidualTest, residual_advice, whiteness_test
 from ident.checks.validation import FreshFit, fit_on_fresh_data
 from ident.closed_loop import two_stage
@@ -181,6 +182,7 @@ def identify_records(
         careful=(
             *_doubts([*measured, *fresh_records]),
             *_careful(found, spread),
+            *_beyond(found, options, band_rad_s),
             *(opened.warnings(omega) if opened else ()),
         ),
     )
@@ -222,3 +224,12 @@ def _careful(found: Identification, spread: UncertainChannel) -> list[Finding]:
         spread.test("whiteness"), spread.test("independence"), noise_order=spread.noise_order
     )
     return [*found.warnings, *advice]
+
+
+def _beyond(
+    found: Identification, options: IdentOptions, band_rad_s: tuple[float, float] | None
+) -> list[Finding]:
+    """Pairs beside the band that was asked for: the search may go an octave further."""
+    if band_rad_s is None:
+        return []
+    return pairs_outside(found.model.poles, options.fixed(), found.model.dt_s, band_rad_s)
