@@ -37,7 +37,8 @@ from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
-from workflow.tasks.stages import STAGES, StageInput
+from workflow.tasks.stage import StageInput
+from workflow.tasks.stages import STAGES
 
 REACH_PERCENT = 5.0
 BAND_RAD_S = (0.5, 120.0)

@@ -44,7 +44,7 @@ def run(out: Print, *, seeds: int = 50) -> None:
     first, second = true_modes_Hz(source)
     entries = [entry for entry in source.records if entry.role == "estimation"]
     experiments = [
-        [simulate_record(source, entry, seed).record.siso("voltage_V", "hub_angle_rad") for entry in entries]
+        [simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad") for entry in entries]
         for seed in range(seeds)
     ]
     longest_s = max(record.n_samples * record.dt_s for record in experiments[0])

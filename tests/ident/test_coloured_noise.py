@@ -23,7 +23,7 @@ def arm_records(seed: int):
     """The default arm's estimation records: dry friction of 0.02 N m, an encoder, sensor noise of 1 mrad."""
     source = built_in_config()[0].source
     return [
-        simulate_record(source, entry, seed).record.siso("voltage_V", "hub_angle_rad")
+        simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad")
         for entry in source.records
         if entry.role == "estimation"
     ]

@@ -29,7 +29,9 @@ from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.conditioning import as_fitted
+from workflow.tasks import closed_loop as closed_loop_stage
+from workflow.tasks import uncertainty as uncertainty_stage
+from workflow.tasks.identification import as_fitted
 from workflow.tasks.loop_conditions import condition_run
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -49,8 +51,6 @@ from workflow.tasks.results import (
     SensitivityCheck,
     UncertaintyResult,
 )
-from workflow.tasks.stages import closed_loop as closed_loop_stage
-from workflow.tasks.stages import uncertainty as uncertainty_stage
 
 DT_S = 0.01
 INPUT = "voltage_V"
@@ -248,9 +248,9 @@ def build_run(
         RunRecord(record(models, name, seed, samples=900), role, "same", "a remark", kind="prbs")
         for seed, (name, role) in enumerate(zip(names, roles, strict=True), 1)
     )
-    run.save_stage("records", RecordsResult("simulated", (), records), "00")
+    run.save_stage("records", RecordsResult(records), "00")
     results = _save_identification(run, settings, models, records)
-    _save_uncertainty(run, settings, results, scatter)
+    _save_uncertainty(run, results, scatter)
     _save_design(run, settings, gain, impossible, settled)
     for number, name in enumerate(("records", "identify", "uncertainty", "design", "certify", "closed_loop")):
         run.record_stage(name, 1.5 + number, "00")
@@ -267,8 +267,6 @@ def _save_identification(
         channels.append(
             IdentifiedChannel(
                 name=channel.label,
-                input=channel.input,
-                output=channel.output,
                 identification=identification(of, used),
                 used=tuple(used),
                 bounded=tuple(used),
@@ -283,21 +281,17 @@ def _save_identification(
     return tuple(channels)
 
 
-def _save_uncertainty(
-    run: RunDirectory, settings: RunConfig, results: tuple[IdentifiedChannel, ...], scatter: bool
-) -> None:
+def _save_uncertainty(run: RunDirectory, results: tuple[IdentifiedChannel, ...], scatter: bool) -> None:
     channels = []
-    for channel, result in zip(settings.channels, results, strict=True):
+    for result in results:
         omega = uncertainty_stage.display_grid(result.model, result.used)
         found = uncertainty_stage.uncertain_channel(
-            channel.label,
             "tangent",
             0.95,
             posterior(result.model),
             result,
             omega,
             omega,
-            empirical_band_rad_s=None,
             repeat_scatter=tuple(scatter_rows()) if scatter else None,
         )
         channels.append(replace(found, nominal=result.model))
@@ -377,7 +371,7 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
         u = np.clip(4 * (reference - y), -24, 24)
         return LoopRuns(y, u, 0.9 * y if len(settings.channels) > 1 else None, np.abs(u) >= 24)
 
-    trial = closed_loop_stage.Trial(time, reference, disturbance, 0.5, 400, tracking=True)
+    trial = closed_loop_stage.Trial(time, reference, reference, disturbance, 0.5, 400, tracking=True)
     predicted, achieved = runs(1, 0.0), runs(draws, 0.002)
     sensitivity, conditions = None, ()
     if settings.machine == "simulated":

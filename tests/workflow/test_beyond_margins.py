@@ -42,13 +42,12 @@ from workflow.tasks.achievable_performance import (
     find_bracket,
 )
 from workflow.tasks.controller_files import filter_bytes, filter_file
-from workflow.tasks.joint_coverage import (
+from workflow.tasks.design import (
     certify_asked,
+    find_design,
     joint_numbers,
-    synthesise_asked,
     undrawable,
 )
-from workflow.tasks.proportions import wilson_interval
 from workflow.tasks.reference_filter import find_filter, model_answer
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -79,18 +78,10 @@ def spec(**changes) -> Specification:
         (2999, 3000, (0.9981144, 0.9999412)),
     ],
 )
-def test_wilson_interval(count, total, expected):
-    found = wilson_interval(count, total)
-    assert found == pytest.approx(expected, abs=1e-6)
-    for end in found:
-        if 0 < end < 1:
-            off = (count / total - end) ** 2 - 1.959963985**2 * end * (1 - end) / total
-            assert abs(off) < 1e-9
-
-
-def test_wilson_interval_refuses_more_than_all():
-    with pytest.raises(ValueError, match="0 <= count <= total"):
-        wilson_interval(4, 3)
+def test_shares_of_sampled_responses_have_wilson_intervals(count, total, expected):
+    joint = replace(sampled_responses(0.9).joint, draws=total, coverage_given=count / total)
+    found = joint_numbers(SampledResponses(replace(joint, stable_share=count / total)))
+    assert found["held_interval"] == found["stable_interval"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_words_of_the_achievable_performance():
@@ -142,7 +133,7 @@ def test_whole_responses_agree_with_drawing_them_here():
     assert abs(np.mean(gamma <= certificate.gamma) - numbers["held_share"]) < 0.02
     assert numbers["stable_share"] == 1.0
     low, high = numbers["stable_interval"]
-    assert low == pytest.approx(wilson_interval(400, 400)[0])
+    assert low == pytest.approx(400 / (400 + 1.959963985**2))
     assert high == 1.0
 
 
@@ -151,7 +142,7 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
         return JointCoverage(coverage, draws, 0.9, 0.99, 0.95, 0.88, 0.9, 0.4, 0.998, 0.99)
 
     monkeypatch.setattr("control_design.analysis.certificate.calibrate", calibrate)
-    monkeypatch.setattr("workflow.tasks.joint_coverage.joint_coverage", calibrate)
+    monkeypatch.setattr("workflow.tasks.design.joint_coverage", calibrate)
     found = {}
     for wanted in (False, True):
         options = CertificateOptions.model_validate({"calibrate": wanted, "joint_draws": 100})
@@ -170,24 +161,25 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
 
 def test_calibration_is_designed_for(monkeypatch):
     asked = []
+    result = SimpleNamespace(gamma=0.9, explain=lambda: "met")
 
     def plain(plants, specification, options, *, rng, progress):
         asked.append("plain")
-        return "result"
+        return result
 
     def jointly(plants, specification, options, *, rng, progress):
         asked.append("jointly")
-        return SimpleNamespace(result="result", sentence=lambda: "2 of 10000 unstable")
+        return SimpleNamespace(result=result, sentence=lambda: "2 of 10000 unstable")
 
-    monkeypatch.setattr("workflow.tasks.joint_coverage.synthesise", plain)
-    monkeypatch.setattr("workflow.tasks.joint_coverage.synthesise_jointly", jointly)
+    monkeypatch.setattr("workflow.tasks.design.synthesise", plain)
+    monkeypatch.setattr("workflow.tasks.design.synthesise_jointly", jointly)
     exact = UncertainPlant("exact", model().to_control())
     options = CertificateOptions.model_validate({"calibrate": True})
     rng, how = np.random.default_rng(1), SynthesisOptions()
-    assert synthesise_asked([plant()], spec(), how, options, rng) == ("result", "2 of 10000 unstable")
-    assert synthesise_asked([exact], spec(), how, options, rng) == ("result", None)
+    assert find_design([plant()], spec(), how, options, rng).jointly == "2 of 10000 unstable"
+    assert find_design([exact], spec(), how, options, rng).jointly is None
     kept = CertificateOptions.model_validate({})
-    assert synthesise_asked([plant()], spec(), how, kept, rng) == ("result", None)
+    assert find_design([plant()], spec(), how, kept, rng).jointly is None
     assert asked == ["jointly", "plain", "plain"]
 
 

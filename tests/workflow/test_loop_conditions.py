@@ -36,8 +36,7 @@ def bench(fast_run) -> ConditionBench:
 
 def test_prediction_is_the_feedback_of_model_and_controller(bench):
     """python-control's closed loop of the posterior mean; the command stays within its limit."""
-    a, b, c, d = realise(bench.posterior, bench.posterior.mean)
-    model = control.ss(a, b[:, None], c[None, :], [[d]], bench.controller.dt_s)
+    model = realise(bench.posterior, bench.posterior.mean)
     loop = control.feedback(bench.controller.to_control(include_delay=True) * model, 1)
     expected = control.forced_response(loop, inputs=bench.reference).outputs
     found = bench.predict(bench.reference)

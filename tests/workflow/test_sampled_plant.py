@@ -5,13 +5,12 @@ from __future__ import annotations
 import control
 import numpy as np
 import pytest
-from scipy.signal import dlsim
 
-from control_design.analysis.closed_loop import simulate
+from control_design.analysis.closed_loop import LinearMachine, simulate
 from control_design.controllers.controller import Controller
 from ident.basis.poles import Poles
 from ident.uncertainty import ResponsePosterior
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
+from workflow.tasks.sampled_plant import FINITE, ClippedMachine, realise, simulate_draw
 
 DT_S = 0.01
 
@@ -39,73 +38,59 @@ def posterior(*, feedthrough: bool, integrators: int, delay: int, fir: int = 7) 
 def test_realisation_has_the_response_of_the_draw(feedthrough, integrators, delay, fir):
     found = posterior(feedthrough=feedthrough, integrators=integrators, delay=delay, fir=fir)
     draw = found.sample(np.random.default_rng(1), 1)[0]
-    a, b, c, d = realise(found, draw)
+    plant = realise(found, draw)
     omega = np.geomspace(0.5, 300.0, 40)
     z = np.exp(1j * omega * DT_S)
-    response = [(c @ np.linalg.solve(value * np.eye(a.shape[0]) - a, b)) + d for value in z]
+    response = [
+        plant.C @ np.linalg.solve(value * np.eye(plant.nstates) - plant.A, plant.B) + plant.D for value in z
+    ]
+    response = np.ravel(response)
     np.testing.assert_allclose(response, found.response_of(draw[None, :], omega)[0], rtol=1e-9)
 
 
-def test_stepping_is_the_linear_simulation():
-    found = posterior(feedthrough=False, integrators=1, delay=1)
-    a, b, c, d = realise(found, found.mean)
-    machine = StateSpaceMachine(a, b, c, d, DT_S, holds_input=False)
-    u = np.random.default_rng(2).standard_normal(60)
-    outputs = []
-    for value in u:
-        outputs.append(machine.measure()[0])
-        machine.advance(value)
-    _, expected, _ = dlsim((a, b[:, None], c[None, :], np.array([[d]]), DT_S), u)
-    np.testing.assert_allclose(outputs, expected[:, 0], atol=1e-12)
-    machine.reset()
-    assert machine.measure()[0] == 0.0
+def law(gain: float, delay: int) -> Controller:
+    nothing = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    return Controller(*nothing, np.array([[gain]]), DT_S, computational_delay_samples=delay)
 
 
-def test_closed_loop_with_a_direct_term_is_the_linear_feedback():
-    """One sample of delay kept by the machine gives the loop that python-control computes from K z^-1 G."""
-    found = posterior(feedthrough=True, integrators=0, delay=0)
-    a, b, c, d = realise(found, found.mean)
-    assert d != 0
+@pytest.mark.parametrize("feedthrough", [False, True])
+def test_closed_loop_is_the_linear_feedback(feedthrough):
+    """With a direct term, too: the loop that python-control computes from K z^-1 G, and a disturbance of the
+    plant's input that acts at its own sample."""
+    found = posterior(feedthrough=feedthrough, integrators=0, delay=0)
     gain = 0.3
-    law = Controller(
-        np.zeros((0, 0)),
-        np.zeros((0, 1)),
-        np.zeros((1, 0)),
-        np.array([[gain]]),
-        DT_S,
-        computational_delay_samples=0,
-    )
     reference = np.where(np.arange(80) >= 5, 1.0, 0.0)
-    run = simulate(law, StateSpaceMachine(a, b, c, d, DT_S, holds_input=True), reference)
-    plant = control.ss(a, b[:, None], c[None, :], [[d]], DT_S)
+    disturbance = np.where(np.arange(80) >= 40, 0.5, 0.0)
+    run = simulate_draw(law(gain, 1), found, found.mean, reference, input_disturbance=disturbance)
+    plant = realise(found, found.mean)
+    assert (plant.D.item() != 0) == feedthrough
     late = control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], DT_S)
     loop = control.feedback(plant * late * gain, 1)
     expected = control.forced_response(loop, inputs=reference).outputs
+    expected = (
+        expected + control.forced_response(control.feedback(plant, late * gain), inputs=disturbance).outputs
+    )
     np.testing.assert_allclose(run.measured, expected, atol=1e-10)
+    acted = gain * np.concatenate([[0.0], (reference - run.measured)[:-1]])
+    np.testing.assert_allclose(run.command, acted, atol=1e-10)
 
 
-def test_direct_term_without_held_input_is_refused():
-    with pytest.raises(ValueError, match="holds_input"):
-        StateSpaceMachine(np.zeros((1, 1)), np.ones(1), np.ones(1), 0.5, DT_S, holds_input=False)
-
-
-def test_hub_torque_has_nowhere_to_go():
-    machine = StateSpaceMachine(np.zeros((1, 1)), np.ones(1), np.ones(1), 0.0, DT_S, holds_input=False)
-    with pytest.raises(ValueError, match="no input for a hub torque"):
-        machine.advance(1.0, hub_torque_Nm=0.1)
+def test_direct_term_without_a_delay_is_refused():
+    found = posterior(feedthrough=True, integrators=0, delay=0)
+    with pytest.raises(ValueError, match="at least one sample of computational delay"):
+        simulate_draw(law(0.3, 0), found, found.mean, np.ones(5))
 
 
 def test_loop_that_runs_away_stays_finite():
     """Far too much gain on an integrator: the clipped machine keeps every number a number."""
-    machine = StateSpaceMachine(np.ones((1, 1)), np.ones(1), np.ones(1), 0.0, DT_S, holds_input=False)
-    law = Controller(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[50.0]]), DT_S)
-    run = simulate(law, ClippedMachine(machine, FINITE), np.ones(3000))
+    machine = LinearMachine(control.ss([[1.0]], [[1.0]], [[1.0]], [[0.0]], DT_S))
+    run = simulate(law(50.0, 1), ClippedMachine(machine, FINITE), np.ones(3000))
     assert np.all(np.isfinite(run.measured))
     assert np.max(np.abs(run.measured)) > 1e8
 
 
 def test_clipping_is_clipping():
-    machine = StateSpaceMachine(np.zeros((1, 1)), np.ones(1), np.ones(1), 0.0, DT_S, holds_input=False)
+    machine = LinearMachine(control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], DT_S))
     clipped = ClippedMachine(machine, 2.0)
     seen = []
     for value in (1.0, 5.0, -7.0):

@@ -13,24 +13,24 @@ from control_design.analysis.certificate import certify
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
 from ident.identify import identify
-from plant import linear_arm
+from plant import linear_arm, parse_effect, simulate
 from plant.presets import paper_link
 from tests.workflow.command import FAST_ARM
 from workflow.config.design_options import ReferenceFilterSettings
-from workflow.config.run_config import Channel, FileRecord, load_config
+from workflow.config.run_config import Channel, FileRecord, FileSource, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.conditioning import as_bounded, as_fitted
+from workflow.tasks.closed_loop import run_closed_loop
+from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
+from workflow.tasks.records import read_record, refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import RunRecord, RunResults
-from workflow.tasks.simulated_rig import EncodedArm
-from workflow.tasks.stages import StageInput
-from workflow.tasks.stages.closed_loop import run_closed_loop
-from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
-from workflow.tasks.stages.reference_filter import design_filter
-from workflow.tasks.stages.uncertainty import posterior_of
+from workflow.tasks.simulated_rig import EncodedArm, rig_of
+from workflow.tasks.stage import StageInput
+from workflow.tasks.stages import design_filter
+from workflow.tasks.uncertainty import posterior_of
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +47,12 @@ def true_response(omega):
     return sampled(np.exp(1j * omega * rig.sampling.dt_s))[0, 0]
 
 
-def test_records_know_their_noise_free_output(run):
-    records = run.records.records
+def test_records_are_the_simulated_arm_and_its_sensor_noise(run):
+    records, source = run.records.records, config_of(run.run).source
     assert [item.role for item in records] == ["estimation", "validation"]
-    clean = records[0].noise_free
-    noise = records[0].record.output - clean
+    effects = [parse_effect(effect) for effect in source.effects]
+    clean = simulate(rig_of(source), records[0].record.input[:, 0], effects, n_modes=source.modes)
+    noise = records[0].record.output - clean.output
     sensors = paper_link().sensors
     # 700 samples: the standard deviation is known to 2.7 %; 5 sigma.
     np.testing.assert_allclose(
@@ -301,7 +302,7 @@ def test_files_of_three_kinds_give_the_same_record(tmp_path):
     np.savez(tmp_path / "log.npz", **table)
     savemat(tmp_path / "log.mat", table)
     records = [
-        read_log(tmp_path / name, ["u"], ["y"], time="t", dt_s=None)
+        Record.from_file(tmp_path / name, ["u"], ["y"], time="t")
         for name in ("log.csv", "log.npz", "log.mat")
     ]
     for record in records:
@@ -311,9 +312,6 @@ def test_files_of_three_kinds_give_the_same_record(tmp_path):
 
 def test_slice_and_mirror(tmp_path, flexlink_data):
     """The second half of the DaISy arm is the first with its sign turned, as its description says."""
-    from workflow.config.run_config import Channel, FileSource
-    from workflow.tasks.stages.records import read_record
-
     path = flexlink_data / "daisy_robot_arm" / "robot_arm.csv"
     tables = [
         {"path": str(path), "stop_sample": 512},

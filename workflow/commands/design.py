@@ -23,8 +23,8 @@ from workflow.engine.errors import InputError, naming, need
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.achievable_performance import bracket_numbers, find_bracket
 from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
+from workflow.tasks.design import certify_asked, find_design, joint_numbers
 from workflow.tasks.design_source import DesignFile, load_sources, read_design_file
-from workflow.tasks.joint_coverage import certify_asked, joint_numbers
 from workflow.tasks.reference_filter import check_filter, find_filter
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -33,7 +33,6 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
-from workflow.tasks.stages.design import find_design
 from workflow.tasks.summary import RunSummary, sections_of
 from workflow.text.templates import rows_of, said
 

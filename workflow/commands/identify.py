@@ -11,13 +11,13 @@ from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
 from workflow.engine import codec, storage
-from workflow.engine.errors import InputError
+from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress, Silence
 from workflow.tasks import truth
 from workflow.tasks.log_identification import LogIdentification, identify_records
 from workflow.tasks.model_files import MODEL_SUFFIXES, write_model
+from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
-from workflow.tasks.stages.records import read_log, refuse_constant_input, with_common_sampling_time
 from workflow.tasks.summary import RunSummary, model_numbers, sections_of, uncertainty_numbers
 from workflow.text.formats import count
 from workflow.text.templates import rows_of, words
@@ -61,15 +61,16 @@ def identify_logs(
     references = [] if reference is None else [reference]
 
     def read(path: Path) -> Record:
-        return read_log(
-            path,
-            [input_name],
-            [output_name],
-            time=time,
-            dt_s=dt_s,
-            time_unit=time_unit,
-            references=references,
-        )
+        with naming(str(path)):
+            return Record.from_file(
+                path,
+                [input_name],
+                [output_name],
+                time=time,
+                dt_s=dt_s,
+                time_unit=time_unit,
+                references=references,
+            )
 
     true_modes = truth.truth_beside([*logs, *validation], output_name)
     measured = [read(Path(path)) for path in logs]

@@ -30,7 +30,7 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     records = []
     for index, entry in enumerate(config.source.records):
         with naming(f"source.records[{index}] ({entry.name})"):
-            records.append(simulate_record(config.source, entry, config.run.seed).record)
+            records.append(simulate_record(config.source, entry, config.run.seed))
     existed = out.is_dir()
     files: list[Path] = []
     try:

@@ -19,7 +19,6 @@ from workflow.config.settings import Section, check, expand, read_toml
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
-from workflow.tasks.stages.records import read_log
 
 CASE_FILE = "case.toml"
 RIG_FILE = "rig.toml"
@@ -183,9 +182,10 @@ def _experiment(
     hub, tip = names["hub_angle_rad"], names["tip_m"]
     if hub.column == tip.column:
         raise InputError(f"{file}: experiments[{index}]: hub_angle_rad and tip_m are both {hub.column!r}")
-    record = read_log(
-        path, [names["voltage_V"].column], [hub.column, tip.column], time=time, dt_s=settings.dt_s
-    )
+    with naming(str(path)):
+        record = Record.from_file(
+            path, [names["voltage_V"].column], [hub.column, tip.column], time=time, dt_s=settings.dt_s
+        )
     _check_sampling(path, record, rig)
     if entry.samples is not None and entry.samples != record.n_samples:
         raise InputError(

@@ -281,15 +281,7 @@ def _achieved(
         for e in case.estimation
     ]
     hub = [record.siso("voltage_V", "hub_angle_rad") for record in records]
-    plan = plan_sensitivity(controller, plant.uncertain, np.inf, hub, trial.time_s.size // 2)
-    seen = measure_on(
-        _Watched(arm),
-        controller,
-        plan,
-        np.random.default_rng(_SEED),
-        measured_index=0,
-        measurement_step=0.0,
-        command_step=0.0,
-    )
+    plan = plan_sensitivity(controller, plant.uncertain, hub, trial.time_s.size // 2)
+    seen = measure_on(_Watched(arm), controller, plan, np.random.default_rng(_SEED))
     peak, _, _ = seen.peak
     return trial.run(controller, _Watched(arm), plant.uncertain.name, "repaired machine", 1.0 / peak)

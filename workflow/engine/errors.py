@@ -84,7 +84,7 @@ def naming(where: str) -> Iterator[None]:
         # Some complaints of the rooms begin with the file already.
         raise InputError(error if str(error).startswith(where) else f"{where}: {error}") from error
     except OSError as error:
-        raise InputError(f"{where}: {describe_os_error(error)}") from error
+        raise InputError(f"{where}: {describe_os_error(error, where)}") from error
 
 
 def describe_os_error(error: OSError, known: object = None) -> str:

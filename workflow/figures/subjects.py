@@ -24,8 +24,8 @@ from ident.data.record import Record
 from workflow.config.run_config import Channel, RunConfig
 from workflow.figures.bands import Complex, Real
 from workflow.figures.style import ratio_unit
-from workflow.tasks.conditioning import as_fitted
-from workflow.tasks.joint_coverage import joint_numbers
+from workflow.tasks.design import joint_numbers
+from workflow.tasks.identification import as_fitted
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import IdentifiedChannel, LoopCheck, ModelMode, RunResults, UncertainChannel
 

@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import ReportResult
-from workflow.tasks.stages import STAGES, Stage, StageInput
-
-
-def settings(config: RunConfig) -> Mapping[str, Any]:
-    """Words that appear on the page and nowhere before."""
-    return {
-        "run": config.run.model_dump(mode="json"),
-        "notes": config.notes.model_dump(mode="json"),
-        "specification": config.specification.model_dump(mode="json"),
-    }
+from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.stages import STAGES
 
 
 def write_page(stage: StageInput) -> ReportResult:
@@ -43,8 +32,9 @@ def page(run: RunDirectory) -> tuple[Path, ...]:
 REPORT = Stage(
     "report",
     tuple(stage.name for stage in STAGES),
-    settings,
     write_page,
     expected_s=7.0,
+    # Words that appear on the page and nowhere before.
+    uses={"run": True, "notes": True, "specification": True},
     also_writes=page,
 )

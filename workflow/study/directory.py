@@ -26,7 +26,7 @@ from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point
 from workflow.study.task import Done
 from workflow.tasks.pipeline import stage_input_hash
 from workflow.tasks.results import RunResults
-from workflow.tasks.stages import Stage
+from workflow.tasks.stage import Stage
 from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1

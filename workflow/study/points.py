@@ -19,7 +19,8 @@ from workflow.engine.run_directory import RunDirectory, hash_of
 from workflow.study.keys import last_name, with_values
 from workflow.study.settings import Axis, StudyConfig
 from workflow.tasks.pipeline import config_of
-from workflow.tasks.stages import STAGES, Stage
+from workflow.tasks.stage import Stage
+from workflow.tasks.stages import STAGES
 
 PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
 POINT_STAGES: tuple[Stage, ...] = tuple(

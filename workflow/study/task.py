@@ -24,7 +24,8 @@ from workflow.engine.progress import Silence
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import stage_input_hash
 from workflow.tasks.results import RunResults
-from workflow.tasks.stages import STAGES, StageInput
+from workflow.tasks.stage import StageInput
+from workflow.tasks.stages import STAGES
 
 
 @dataclass(frozen=True, eq=False)

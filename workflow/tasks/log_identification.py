@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ident.basis.options import IdentOptions
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import ResidualTest, residual_advice, whiteness_test
-from ident.checks.validation import FreshFit, fit_on_fresh_data
 from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
 from ident.finding import Finding
-from ident.identify import Identification, identify
-from ident.stabilisation import Stabilisation, stabilisation
-from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from ident.identification import Identification
+from ident.uncertainty import ResponsePosterior
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from workflow.engine.errors import naming
 from workflow.engine.progress import Progress, Silence
+from workflow.tasks.identification import identified_channel
 from workflow.tasks.results import IdentifiedChannel, UncertainChannel
-from workflow.tasks.stages.identify import settled
-from workflow.tasks.stages.uncertainty import (
-    N_BANDS,
-    display_grid,
-    residual_tests,
-    uncertain_channel,
-)
 from workflow.tasks.truth import TrueMode
+from workflow.tasks.uncertainty import N_BANDS, display_grid, residual_tests, uncertain_channel
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
@@ -52,30 +46,6 @@ class LogIdentification:
     spread: UncertainChannel
     careful: tuple[Finding, ...]
     true_modes: tuple[TrueMode | None, ...] = ()
-
-    @property
-    def found(self) -> Identification:
-        return self.about.identification
-
-    @property
-    def used(self) -> tuple[Record, ...]:
-        return self.about.used
-
-    @property
-    def fresh(self) -> tuple[FreshFit, ...]:
-        return self.about.fresh
-
-    @property
-    def plot(self) -> Stabilisation | None:
-        return self.about.stabilisation
-
-    @property
-    def frequency(self) -> FrequencyUncertainty:
-        return self.spread.frequency
-
-    @property
-    def empirical(self) -> FrequencyUncertainty | None:
-        return self.spread.empirical
 
 
 def identify_records(
@@ -126,31 +96,16 @@ def identify_records(
                 EmbeddingOptions(estimate_initial_state=False),
             )
             used = list(opened.records)
-        share = 0.6 if with_plot else 1.0
-        found = settled(
-            identify(used, options, progress=lambda f, m: progress.update("identify", share * f, m))
-        )
-        plot = None
-        if with_plot:
-            plot = stabilisation(
-                used,
-                found,
-                options,
-                progress=lambda f, m: progress.update("identify", share + (1 - share) * f, m),
-            )
-        about = IdentifiedChannel(
-            name=found.model.output_name,
-            input=found.model.input_name,
-            output=found.model.output_name,
-            identification=found,
-            used=tuple(used),
-            bounded=tuple(used),
-            fresh=tuple(fit_on_fresh_data(found.model, record) for record in fresh_records),
-            fresh_roles=tuple("validation" for _ in fresh_records),
-            stabilisation=plot,
-            band_rad_s=band_rad_s,
+        about = identified_channel(
+            used[0].output_names[0],
+            used,
+            [(record, "validation") for record in fresh_records],
+            options,
+            partial(progress.update, "identify"),
+            with_plot=with_plot,
             two_stage=None if opened is None else opened.finding,
         )
+        about, found = replace(about, band_rad_s=band_rad_s), about.identification
         progress.finish("identify", 0.0, taken_up=False)
         progress.start("uncertainty")
         posterior, tests = _posterior(used, found, noise_order)
@@ -161,17 +116,7 @@ def identify_records(
                 raise ValueError(
                     f"the band {band_rad_s[0]:g} to {band_rad_s[1]:g} rad/s is too narrow to show"
                 )
-        spread = uncertain_channel(
-            about.name,
-            "tangent",
-            level,
-            posterior,
-            about,
-            omega,
-            omega,
-            empirical_band_rad_s=band_rad_s,
-            tests=tests,
-        )
+        spread = uncertain_channel("tangent", level, posterior, about, omega, omega, tests=tests)
     progress.finish("uncertainty", 0.0, taken_up=False)
     return LogIdentification(
         measured=tuple(measured),
@@ -181,7 +126,10 @@ def identify_records(
         spread=spread,
         careful=(
             *_doubts([*measured, *fresh_records]),
-            *_careful(found, spread),
+            *found.warnings,
+            *residual_advice(
+                spread.test("whiteness"), spread.test("independence"), noise_order=spread.noise_order
+            ),
             *_beyond(found, options, band_rad_s),
             *(opened.warnings(omega) if opened else ()),
         ),
@@ -216,14 +164,6 @@ def _doubts(records: Sequence[Record]) -> list[Finding]:
     """Time columns that look like another unit, each said once."""
     doubted = {record.time_column: record.dt_s for record in records if record.time_column is not None}
     return [column.doubt(dt_s) for column, dt_s in doubted.items() if column.doubtful]
-
-
-def _careful(found: Identification, spread: UncertainChannel) -> list[Finding]:
-    """Warnings of the fit, and what to do about residual tests that fail."""
-    advice = residual_advice(
-        spread.test("whiteness"), spread.test("independence"), noise_order=spread.noise_order
-    )
-    return [*found.warnings, *advice]
 
 
 def _beyond(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.closed_loop import ClosedLoopTrajectory, SampledMachine, simulate
+from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
@@ -24,7 +24,7 @@ from plant import simulate as simulate_arm
 from plant.machine import Machine
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine, StateSpaceMachine, realise
+from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
 from workflow.tasks.simulated_rig import EncodedArm
 
 Real = npt.NDArray[np.float64]
@@ -68,29 +68,6 @@ def condition_run(
     )
 
 
-class _Pushed:
-    """The arm with a force at its tip, sample by sample."""
-
-    def __init__(self, arm: EncodedArm, tip_force_N: Real) -> None:
-        self._arm, self._force = arm, tip_force_N
-        self.reset()
-
-    @property
-    def dt_s(self) -> float:
-        return self._arm.dt_s
-
-    def reset(self) -> None:
-        self._arm.reset()
-        self._sample = 0
-
-    def measure(self) -> Real:
-        return self._arm.measure()
-
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        self._arm.advance(u, hub_torque_Nm=hub_torque_Nm, tip_force_N=float(self._force[self._sample]))
-        self._sample += 1
-
-
 @dataclass(frozen=True, eq=False)
 class ConditionBench:
     """Everything the conditions share.
@@ -129,17 +106,14 @@ class ConditionBench:
         clip: float | None = None,
     ) -> ClosedLoopTrajectory:
         """The loop on the posterior mean."""
-        law = law or self.controller
-        a, b, c, d = realise(self.posterior, self.posterior.mean)
-        holds = d != 0.0
-        model = StateSpaceMachine(a, b, c, d, self.posterior.dt_s, holds_input=holds)
-        if holds:
-            law = replace(law, computational_delay_samples=law.computational_delay_samples - 1)
-        machine: SampledMachine = model if clip is None else ClippedMachine(model, clip)
-        run = simulate(law, machine, self._given(reference), output_disturbance=output_disturbance)
-        if holds:
-            return replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
-        return run
+        return simulate_draw(
+            law or self.controller,
+            self.posterior,
+            self.posterior.mean,
+            self._given(reference),
+            output_disturbance=output_disturbance,
+            clip=clip,
+        )
 
     def achieve(
         self,
@@ -154,13 +128,12 @@ class ConditionBench:
     ) -> ClosedLoopTrajectory:
         """The loop on the arm, with effects exchanged by name; steps: of measurement and command."""
         extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
-        arm = EncodedArm(self.source, extra, self.rng.spawn(1)[0], rig=rig or self.rig)
-        machine: SampledMachine = arm if tip_force_N is None else _Pushed(arm, tip_force_N)
-        machine = ClippedMachine(machine, FINITE if clip is None else clip)
+        rng = self.rng.spawn(1)[0]
+        arm = EncodedArm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)
         measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
         return simulate(
             law or self.controller,
-            machine,
+            ClippedMachine(arm, FINITE if clip is None else clip),
             self._given(reference),
             measured_index=self.measured,
             measurement_step=measurement,

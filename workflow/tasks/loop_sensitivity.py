@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,11 @@ from control_design.analysis.closed_loop import MeasuredSensitivity, SampledMach
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from ident.data.record import Record
-from workflow.tasks.results import MeasuredPeak
+from workflow.config.run_config import SimulatedSource
+from workflow.tasks.results import MeasuredPeak, SensitivityCheck
+from workflow.tasks.sampled_plant import FINITE, ClippedMachine
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, steps_of
+from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
 
@@ -27,7 +32,7 @@ _SHORTEST, _LONGEST = 500, 4000
 @dataclass(frozen=True)
 class SensitivityPlan:
     """How S is excited: band around the predicted peak, period, lead-in, size of the large excitation; and
-    the nominal and certified peaks it is compared with."""
+    the nominal peak it is compared with."""
 
     band_rad_s: tuple[float, float]
     period_samples: int
@@ -35,13 +40,11 @@ class SensitivityPlan:
     rms: float
     nominal_peak: float
     nominal_omega_rad_s: float
-    certified_peak: float
 
 
 def plan_sensitivity(
     controller: Controller,
     plant: UncertainPlant,
-    certified_peak: float,
     records: list[Record],
     transient_samples: int,
 ) -> SensitivityPlan:
@@ -69,7 +72,6 @@ def plan_sensitivity(
         rms=command / float(np.sqrt(np.mean(gain**2))),
         nominal_peak=float(size[at]),
         nominal_omega_rad_s=float(omega[at]),
-        certified_peak=certified_peak,
     )
 
 
@@ -79,10 +81,10 @@ def measure_on(
     plan: SensitivityPlan,
     rng: np.random.Generator,
     *,
-    measured_index: int,
-    measurement_step: float,
-    command_step: float,
     small: bool = False,
+    measured_index: int = 0,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
 ) -> MeasuredSensitivity:
     """S on a machine by the plan; `small` takes a tenth of the size."""
     return measure_sensitivity(
@@ -101,22 +103,50 @@ def measure_on(
     )
 
 
-def measured_peak(name: str, found: MeasuredSensitivity, plan: SensitivityPlan) -> MeasuredPeak:
-    """One measurement beside the predicted and certified peaks."""
-    peak, std, omega = found.peak
-    return MeasuredPeak(
-        name=name,
-        reference_rms=found.reference_rms,
-        peak=peak,
-        peak_std=std,
-        peak_omega_rad_s=omega,
-        off_nominal_percent=100 * (peak / plan.nominal_peak - 1),
-        off_certified_percent=100 * (peak / plan.certified_peak - 1)
-        if np.isfinite(plan.certified_peak)
-        else None,
-        peak_command=found.peak_command,
-        limited_fraction=found.limited_fraction,
-        omega_rad_s=found.omega_rad_s,
-        magnitude=np.abs(found.response),
-        std=found.std,
+def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samples: int) -> SensitivityCheck:
+    """The peak of S on the simulated arm, large and small, beside prediction and certified bound."""
+    config, certificate, source = stage.config, stage.results.certify.certificate, stage.config.source
+    assert certificate is not None
+    assert isinstance(source, SimulatedSource)
+    options = config.closed_loop
+    records = stage.results.records.fitted(config.control_channel)
+    plan = plan_sensitivity(controller, stage.plant, records, transient_samples)
+    certified = certificate.plants[0].worst_peak_sensitivity
+    arms: list[tuple[str, tuple[dict[str, Any], ...], bool]] = [
+        ("arm as identified", (), False),
+        ("arm as identified, a tenth of the size", (), True),
+    ]
+    if options.effects:
+        arms.append(("arm of the closed-loop check", options.effects, False))
+    rows = []
+    for number, (name, effects, small) in enumerate(arms):
+        arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
+        found = measure_on(
+            ClippedMachine(arm, FINITE),
+            controller,
+            plan,
+            stage.rng("closed_loop", "sensitivity", str(number)),
+            small=small,
+            measured_index=OUTPUT_NAMES.index(config.control_channel.output),
+            **steps_of(options),
+        )
+        peak, std, omega = found.peak
+        rows.append(
+            MeasuredPeak(
+                name=name,
+                reference_rms=found.reference_rms,
+                peak=peak,
+                peak_std=std,
+                peak_omega_rad_s=omega,
+                off_nominal_percent=100 * (peak / plan.nominal_peak - 1),
+                off_certified_percent=100 * (peak / certified - 1) if np.isfinite(certified) else None,
+                peak_command=found.peak_command,
+                limited_fraction=found.limited_fraction,
+                omega_rad_s=found.omega_rad_s,
+                magnitude=np.abs(found.response),
+                std=found.std,
+            )
+        )
+    return SensitivityCheck(
+        plan.nominal_peak, plan.nominal_omega_rad_s, certified, plan.band_rad_s, tuple(rows)
     )

@@ -14,7 +14,8 @@ from workflow.engine.progress import Progress, Silence
 from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.controller_files import write_controller
 from workflow.tasks.results import RecordsResult, RunResults
-from workflow.tasks.stages import STAGES, Stage, StageInput
+from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import RunSummary, summarise
 
 
@@ -120,7 +121,7 @@ def _perform(
     interrupts.check()
     run.save_stage(stage.name, result, input_hash)
     # The stages after it see what is on the disk, as they would in a resumed run: to the last digit.
-    results.forget(stage.name)
+    results.read.pop(stage.name, None)
     seconds = time.monotonic() - started + before_s
     run.record_stage(stage.name, seconds, input_hash)
     progress.finish(stage.name, seconds, taken_up=False)

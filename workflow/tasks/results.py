@@ -6,10 +6,9 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -48,8 +47,7 @@ T = TypeVar("T")
 class RunRecord:
     """A record of the run and what the configuration says about it.
 
-    kind: of the excitation, or "file"; noise_free: output (T, Y) before sensor effects and noise, simulated
-    records only.
+    kind: of the excitation, or "file".
     """
 
     record: Record
@@ -57,8 +55,6 @@ class RunRecord:
     condition: str | None
     remark: str
     kind: str = "file"
-    file: str | None = None
-    noise_free: Real | None = None
 
     @property
     def name(self) -> str:
@@ -77,10 +73,8 @@ class RunRecord:
 
 @dataclass(frozen=True, eq=False)
 class RecordsResult:
-    """All records; effects: those of the simulated arm, as in the configuration."""
+    """All records."""
 
-    source: Literal["simulated", "files"]
-    effects: tuple[Mapping[str, Any], ...]
     records: tuple[RunRecord, ...]
 
     def of_role(self, role: Role) -> list[RunRecord]:
@@ -119,8 +113,6 @@ class IdentifiedChannel:
     """
 
     name: str
-    input: str
-    output: str
     identification: Identification
     used: tuple[Record, ...]
     bounded: tuple[Record, ...]
@@ -137,6 +129,14 @@ class IdentifiedChannel:
         return self.identification.model
 
     @property
+    def input(self) -> str:
+        return self.model.input_name
+
+    @property
+    def output(self) -> str:
+        return self.model.output_name
+
+    @property
     def order(self) -> int:
         return self.model.order
 
@@ -151,6 +151,11 @@ class IdentifiedChannel:
     @property
     def feedthrough(self) -> bool:
         return self.identification.structure.feedthrough
+
+    @property
+    def data_band_rad_s(self) -> Interval | None:
+        """Band of the data behind the ellipses; None where they were not confined to one."""
+        return self.bounds_band_rad_s or self.band_rad_s
 
     @property
     def modes(self) -> tuple[ModelMode, ...]:
@@ -510,54 +515,37 @@ class ReportResult:
     report_sha256: str
 
 
+class _Stage(Generic[T]):
+    """The result of the stage that the attribute is named after, read when it is first asked for."""
+
+    def __init__(self, kind: type[T]) -> None:
+        self._kind = kind
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, results: RunResults, owner: type) -> T:
+        if self._name not in results.read:
+            results.read[self._name] = results.run.load_stage(self._name, self._kind)
+        found: T = results.read[self._name]
+        return found
+
+
 class RunResults:
-    """Results of a run directory, each read once."""
+    """Results of a run directory, each read once; `read` holds those that were."""
+
+    records = _Stage(RecordsResult)
+    identify = _Stage(IdentifyResult)
+    uncertainty = _Stage(UncertaintyResult)
+    design = _Stage(DesignResult)
+    achievable_performance = _Stage(AchievablePerformance)
+    certify = _Stage(CertifyResult)
+    reference_filter = _Stage(ReferenceFilterResult)
+    closed_loop = _Stage(ClosedLoopResult)
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
-        self._read: dict[str, Any] = {}
+        self.read: dict[str, Any] = {}
 
     def has(self, stage: str) -> bool:
         return self.run.stage_file(stage) is not None
-
-    def forget(self, stage: str) -> None:
-        """Read the stage again when it is asked for: it was written anew."""
-        self._read.pop(stage, None)
-
-    def _load(self, stage: str, kind: type[T]) -> T:
-        if stage not in self._read:
-            self._read[stage] = self.run.load_stage(stage, kind)
-        found: T = self._read[stage]
-        return found
-
-    @property
-    def records(self) -> RecordsResult:
-        return self._load("records", RecordsResult)
-
-    @property
-    def identify(self) -> IdentifyResult:
-        return self._load("identify", IdentifyResult)
-
-    @property
-    def uncertainty(self) -> UncertaintyResult:
-        return self._load("uncertainty", UncertaintyResult)
-
-    @property
-    def design(self) -> DesignResult:
-        return self._load("design", DesignResult)
-
-    @property
-    def achievable_performance(self) -> AchievablePerformance:
-        return self._load("achievable_performance", AchievablePerformance)
-
-    @property
-    def certify(self) -> CertifyResult:
-        return self._load("certify", CertifyResult)
-
-    @property
-    def reference_filter(self) -> ReferenceFilterResult:
-        return self._load("reference_filter", ReferenceFilterResult)
-
-    @property
-    def closed_loop(self) -> ClosedLoopResult:
-        return self._load("closed_loop", ClosedLoopResult)

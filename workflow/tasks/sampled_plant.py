@@ -1,11 +1,17 @@
-"""A plant drawn from an identified posterior, as a machine that can be sampled in a closed loop."""
+"""A plant drawn from an identified posterior, in a closed loop."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import reduce
+from operator import add
+
+import control
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.closed_loop import SampledMachine
+from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, SampledMachine, simulate
+from control_design.controllers.controller import Controller
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.uncertainty import ResponsePosterior
@@ -16,8 +22,8 @@ FINITE = 1e9
 """Input at which a machine is clipped only so that a loop that runs away stays made of numbers."""
 
 
-def realise(posterior: ResponsePosterior, coefficients: Real) -> tuple[Real, Real, Real, float]:
-    """State space (A, B, C, D) of one draw of coefficients (P,): poles and kernel in parallel.
+def realise(posterior: ResponsePosterior, coefficients: Real) -> control.StateSpace:
+    """One draw of coefficients (P,): poles and kernel in parallel.
 
     A kernel of L taps is the basis of L poles at zero, a shift register; both parts carry their own
     integrators and delay, which doubles those states and changes nothing in the response from rest.
@@ -27,20 +33,12 @@ def realise(posterior: ResponsePosterior, coefficients: Real) -> tuple[Real, Rea
     if posterior.fir_length:
         shift = Poles(np.zeros(posterior.fir_length), np.zeros(0, dtype=np.complex128))
         parts.append(_part(posterior, shift, coefficients[n + direct :], 0.0))
-    spaces = [part.state_space() for part in parts]
-    size = sum(space[0].shape[0] for space in spaces)
-    a = np.zeros((size, size))
-    start = 0
-    for space in spaces:
-        stop = start + space[0].shape[0]
-        a[start:stop, start:stop] = space[0]
-        start = stop
-    b = np.concatenate([space[1][:, 0] for space in spaces])
-    c = np.concatenate([space[2][0] for space in spaces])
-    return a, b, c, sum(float(space[3][0, 0]) for space in spaces)
+    return reduce(add, parts)
 
 
-def _part(posterior: ResponsePosterior, poles: Poles, coefficients: Real, feedthrough: float) -> GobfModel:
+def _part(
+    posterior: ResponsePosterior, poles: Poles, coefficients: Real, feedthrough: float
+) -> control.StateSpace:
     return GobfModel(
         poles,
         coefficients,
@@ -48,45 +46,54 @@ def _part(posterior: ResponsePosterior, poles: Poles, coefficients: Real, feedth
         feedthrough=feedthrough,
         integrators=posterior.integrators,
         input_delay_samples=posterior.input_delay_samples,
-    )
+    ).to_control()
 
 
-class StateSpaceMachine:
-    """SISO state space as a `control_design.analysis.closed_loop.SampledMachine`.
+def simulate_draw(
+    controller: Controller,
+    posterior: ResponsePosterior,
+    coefficients: Real,
+    reference: Real,
+    *,
+    input_disturbance: Real | None = None,
+    output_disturbance: Real | None = None,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
+    clip: float | None = None,
+) -> ClosedLoopTrajectory:
+    """The loop on the plant of one draw of coefficients (P,); signals (T,) and steps as of `simulate`; clip:
+    of the plant's input, behind the controller's back.
 
     A direct term answers to the input of the same instant, which a sampled machine cannot do: it is measured
-    before the input is known. With `holds_input` the machine keeps one sample of the loop's computational
-    delay itself: `advance(u)` stores u for the next interval, so that the measurement may contain D times the
-    input now acting. The controller must then run with one sample of delay less.
+    before the input is known. There the machine keeps one sample of the loop's computational delay itself.
+    Raises ValueError where the loop has none.
     """
-
-    def __init__(self, a: Real, b: Real, c: Real, d: float, dt_s: float, *, holds_input: bool) -> None:
-        if d != 0.0 and not holds_input:
-            raise ValueError("a machine with a direct term needs holds_input")
-        self._a, self._b, self._c, self._d = a, b, c, d
-        self._dt_s, self._holds_input = dt_s, holds_input
-        self.reset()
-
-    @property
-    def dt_s(self) -> float:
-        return self._dt_s
-
-    def reset(self) -> None:
-        self._x = np.zeros(self._a.shape[0])
-        self._held = 0.0
-
-    def measure(self) -> Real:
-        """(1,) output at t_k."""
-        return np.array([float(self._c @ self._x) + self._d * self._held])
-
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        """Hold the input for one sample. Raises ValueError for a torque, which this machine has no input
-        for."""
-        if hub_torque_Nm != 0.0:
-            raise ValueError("a machine known by its response only has no input for a hub torque")
-        acting = self._held if self._holds_input else u
-        self._x = self._a @ self._x + self._b * acting
-        self._held = u
+    plant = realise(posterior, coefficients)
+    direct = bool(np.any(plant.D != 0))
+    if direct:
+        delay = controller.computational_delay_samples
+        if delay < 1:
+            raise ValueError(
+                "a plant with a direct term needs at least one sample of computational delay in the loop"
+            )
+        controller = replace(controller, computational_delay_samples=delay - 1)
+        plant = plant * control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], plant.dt)
+        if input_disturbance is not None:
+            input_disturbance = np.append(input_disturbance[1:], input_disturbance[-1])
+    machine: SampledMachine = LinearMachine(plant)
+    run = simulate(
+        controller,
+        machine if clip is None else ClippedMachine(machine, clip),
+        reference,
+        input_disturbance=input_disturbance,
+        output_disturbance=output_disturbance,
+        measurement_step=measurement_step,
+        command_step=command_step,
+    )
+    if not direct:
+        return run
+    # The machine acted on each command one sample after it was handed over.
+    return replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
 
 
 class ClippedMachine:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,20 +11,12 @@ import numpy.typing as npt
 from ident.data.record import Record
 from plant import Rig, SampledArm, parse_effect, simulate
 from workflow.config.rig_settings import PRESETS
-from workflow.config.run_config import SimulatedRecord, SimulatedSource
+from workflow.config.run_config import ClosedLoopOptions, SimulatedRecord, SimulatedSource
 from workflow.engine.randomness import stage_rng
 
 INPUT_NAME = "voltage_V"
 OUTPUT_NAMES = SampledArm.output_names
 UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedExperiment:
-    """A record as measured, and the outputs (T, 2), hub and tip, before sensor effects and noise."""
-
-    record: Record
-    noise_free_output: npt.NDArray[np.float64]
 
 
 def rig_of(source: SimulatedSource) -> Rig:
@@ -35,7 +26,7 @@ def rig_of(source: SimulatedSource) -> Rig:
     return Rig.from_toml(source.rig)
 
 
-def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> SimulatedExperiment:
+def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> Record:
     """Run one experiment on the rig with the effects of the source.
 
     The record has the commanded voltage, and hub angle (in encoder steps) and tip position as measured, from
@@ -51,7 +42,7 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
         rng=stage_rng(seed, "records", entry.name, "noise"),
         n_modes=source.modes,
     )
-    record = Record(
+    return Record(
         name=entry.name,
         input=trajectory.voltage_V[:, None],
         output=quantised(trajectory.output, source.encoder_step_rad),
@@ -61,8 +52,6 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
         input_units=(UNITS[INPUT_NAME],),
         output_units=tuple(UNITS[name] for name in OUTPUT_NAMES),
     )
-    true = np.column_stack([trajectory.hub_angle_true_rad, trajectory.tip_true_m])
-    return SimulatedExperiment(record, true)
 
 
 def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.NDArray[np.float64]:
@@ -74,11 +63,17 @@ def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.N
     return result
 
 
-class EncodedArm:
-    """The simulated arm behind its encoder: `plant.SampledArm` with the measured hub angle in encoder
-    steps."""
+def steps_of(options: ClosedLoopOptions) -> dict[str, float]:
+    """Steps of the loop's converters, as `control_design.analysis.closed_loop` calls them."""
+    return {"measurement_step": options.measurement_step, "command_step": options.quantisation}
 
-    output_names = OUTPUT_NAMES
+
+class EncodedArm(SampledArm):
+    """The simulated arm behind its encoder: the measured hub angle comes in encoder steps.
+
+    extra_effects: take the place of those of the source that have their names. tip_force_N (T,): acts at the
+    tip, one value per sample from rest on.
+    """
 
     def __init__(
         self,
@@ -87,26 +82,20 @@ class EncodedArm:
         rng: np.random.Generator,
         *,
         rig: Rig | None = None,
+        tip_force_N: npt.NDArray[np.float64] | None = None,
     ) -> None:
+        self._step, self._force = source.encoder_step_rad, tip_force_N
         replaced = {effect["name"] for effect in extra_effects}
         kept = [effect for effect in source.effects if effect["name"] not in replaced]
         effects = [parse_effect(effect) for effect in (*kept, *extra_effects)]
-        self._arm = SampledArm(rig or rig_of(source), effects, rng, n_modes=source.modes)
-        self._step = source.encoder_step_rad
-
-    @property
-    def dt_s(self) -> float:
-        return self._arm.dt_s
-
-    @property
-    def true_output(self) -> npt.NDArray[np.float64]:
-        return self._arm.true_output
+        super().__init__(rig or rig_of(source), effects, rng, n_modes=source.modes)
 
     def reset(self) -> None:
-        self._arm.reset()
+        super().reset()
+        self._forces = iter(() if self._force is None else self._force.tolist())
 
     def measure(self) -> npt.NDArray[np.float64]:
-        return quantised(self._arm.measure(), self._step)
+        return quantised(super().measure(), self._step)
 
-    def advance(self, voltage_V: float, /, *, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
-        self._arm.advance(voltage_V, hub_torque_Nm, tip_force_N)
+    def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
+        super().advance(voltage_V, hub_torque_Nm, tip_force_N + next(self._forces, 0.0))

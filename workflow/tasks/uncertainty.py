@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +23,9 @@ from ident.uncertainty.conditions import combine_posteriors, group_posteriors, r
 from ident.uncertainty.embedding import classical, tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
-from workflow.config.run_config import Channel, RunConfig, UncertaintyOptions
+from workflow.config.run_config import Channel, UncertaintyOptions
 from workflow.engine.errors import naming
-from workflow.tasks.conditioning import as_bounded
+from workflow.tasks.identification import as_bounded
 from workflow.tasks.results import (
     Band,
     IdentifiedChannel,
@@ -37,7 +36,7 @@ from workflow.tasks.results import (
     UncertainChannel,
     UncertaintyResult,
 )
-from workflow.tasks.stages.base import StageInput
+from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
 
@@ -46,11 +45,6 @@ _SHARE_INSIDE = 0.9
 
 N_BANDS = 6
 """Bands of equal width on the log axis in which radii and scatter are summarised."""
-
-
-def settings(config: RunConfig) -> Mapping[str, Any]:
-    """Uncertainty options of the channels."""
-    return {"channels": [channel.uncertainty.model_dump(mode="json") for channel in config.channels]}
 
 
 def find_uncertainty(stage: StageInput) -> UncertaintyResult:
@@ -65,14 +59,12 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
             omega = display_grid(result.model, result.bounded)
             channels.append(
                 uncertain_channel(
-                    channel.label,
                     channel.uncertainty.method,
                     channel.uncertainty.level,
                     posterior,
                     result,
                     omega,
-                    nominal_grid(omega, channel),
-                    empirical_band_rad_s=channel.bounds_band_rad_s or channel.band_rad_s,
+                    nominal_grid(omega, result.data_band_rad_s),
                     repeat_scatter=scatter_of(channel, result, records, bands_of(omega)),
                 )
             )
@@ -80,7 +72,6 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
 
 
 def uncertain_channel(
-    name: str,
     method: str,
     level: float,
     posterior: ResponsePosterior,
@@ -88,7 +79,6 @@ def uncertain_channel(
     omega: Real,
     nominal_omega: Real,
     *,
-    empirical_band_rad_s: tuple[float, float] | None,
     repeat_scatter: tuple[ScatterRow, ...] | None = None,
     tests: tuple[ResidualTest, ...] | None = None,
 ) -> UncertainChannel:
@@ -98,7 +88,7 @@ def uncertain_channel(
     frequency = posterior.at(omega, level)
     nominal = nominal_of(posterior, model.poles, nominal_omega)
     return UncertainChannel(
-        name=name,
+        name=result.name,
         method=method,
         level=level,
         posterior=posterior,
@@ -108,11 +98,11 @@ def uncertain_channel(
             result.bounded,
             integrators=0 if result.increments else model.integrators,
             level=level,
-            band_rad_s=empirical_band_rad_s,
+            band_rad_s=result.data_band_rad_s,
         ),
         bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
         tests=residual_tests(posterior, result.bounded) if tests is None else tests,
-        agreement=agreement_of(posterior.at(nominal_omega, level), nominal),
+        agreement=agreement_of(posterior.at(nominal_omega, level), nominal.frequency_response),
         intervals=intervals_of(posterior, model.poles, level),
         repeat_scatter=repeat_scatter,
     )
@@ -140,9 +130,8 @@ def posterior_of(
     return combine_posteriors(each, small_sample_level=options.level)
 
 
-def nominal_grid(omega: Real, channel: Channel) -> Real:
+def nominal_grid(omega: Real, band: tuple[float, float] | None) -> Real:
     """Where the nominal model has to be right: the band of the data, everywhere without one."""
-    band = channel.bounds_band_rad_s or channel.band_rad_s
     if band is None:
         return omega
     inside = omega[(omega >= band[0]) & (omega <= band[1])]
@@ -192,9 +181,11 @@ def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> Band:
     return Band(low, high, float(np.median(relative)), float(np.max(relative)))
 
 
-def agreement_of(frequency: FrequencyUncertainty, nominal: GobfModel) -> NominalAgreement:
-    """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
-    distance = frequency.normalised_distance(nominal.frequency_response(frequency.omega_rad_s))
+def agreement_of(
+    frequency: FrequencyUncertainty, nominal: Callable[[Real], npt.NDArray[np.complex128]]
+) -> NominalAgreement:
+    """How far a nominal response, rad/s (F,) to G (F,), is from the ellipses' centres, in ellipses."""
+    distance = frequency.normalised_distance(nominal(frequency.omega_rad_s))
     worst = int(np.argmax(distance))
     return NominalAgreement(
         share_inside_percent=100 * float(np.mean(distance <= 1)),

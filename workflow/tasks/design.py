@@ -1,4 +1,4 @@
-"""The certificate, and for how many whole responses of the posterior its worst case holds."""
+"""The design, its certificate, and for how many whole responses of the posterior the worst case holds."""
 
 from __future__ import annotations
 
@@ -6,37 +6,46 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from scipy.stats import binomtest
 
-from control_design.analysis.certificate import Certificate, certify
+from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import ResponseDraws, joint_coverage
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
-from control_design.specification import Specification
+from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
-from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import CertificateOptions
 from workflow.engine import codec
-from workflow.tasks.proportions import wilson_interval
-from workflow.tasks.results import CertifyResult, SampledResponses
+from workflow.tasks.results import CertifyResult, DesignResult, SampledResponses
 
 
-def synthesise_asked(
+def find_design(
     plants: Sequence[UncertainPlant],
     specification: Specification,
     synthesis: SynthesisOptions,
     options: CertificateOptions,
     rng: np.random.Generator,
     progress: Callable[[float, str], None] | None = None,
-) -> tuple[SynthesisResult, str | None]:
-    """The design; with `calibrate`, and plants to draw from, one whose sampled responses are stable as often
-    as the certificate then asks. Second: what became of that, in one sentence."""
-    if not options.calibrate or undrawable(plants) is not None:
-        return synthesise(plants, specification, synthesis, rng=rng, progress=progress), None
-    found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
-    return found.result, found.sentence()
+) -> DesignResult:
+    """One controller for all plants; `reason` says in one line how it stands against the specification.
+
+    With `calibrate`, and plants to draw from, one whose sampled responses are stable as often as the
+    certificate then asks. A specification that no controller can meet is a result, not an error: the report
+    has to say what blocks it.
+    """
+    try:
+        if options.calibrate and undrawable(plants) is None:
+            found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
+            result, jointly = found.result, found.sentence()
+        else:
+            result = synthesise(plants, specification, synthesis, rng=rng, progress=progress)
+            jointly = None
+    except SpecificationError as impossible:
+        return DesignResult(None, met=False, reason=str(impossible))
+    return DesignResult(result, result.gamma <= 1.0, result.explain(), jointly)
 
 
 def certify_asked(
@@ -55,41 +64,34 @@ def certify_asked(
     item of the certificate.
     """
     reason = undrawable(plants) if options.joint_draws else "no responses were drawn (joint_draws = 0)"
-    if reason is None and options.calibrate:
-        certificate = certify(
-            controller,
-            plants,
-            specification,
-            between_own_points=between_own_points,
-            joint_coverage=options.joint_coverage,
-            rng=rng,
-            joint_draws=options.joint_draws,
-        )
-        assert certificate.joint is not None
-        return _result(certificate, SampledResponses(certificate.joint, calibrated=True))
-    certificate = certify(controller, plants, specification, between_own_points=between_own_points)
-    if reason is not None:
-        return _result(certificate, SampledResponses(reason=reason))
-    joint = joint_coverage(
+    calibrated = reason is None and options.calibrate
+    certificate = certify(
         controller,
         plants,
         specification,
+        between_own_points=between_own_points,
+        joint_coverage=options.joint_coverage if calibrated else None,
         rng=rng,
-        coverage=options.joint_coverage,
-        draws=options.joint_draws,
+        joint_draws=options.joint_draws,
     )
-    return _result(certificate, SampledResponses(joint))
-
-
-def _result(certificate: Certificate, sampled: SampledResponses) -> CertifyResult:
-    missed = [item.sentence() for item in certificate.items if not item.met]
+    joint = certificate.joint
+    if reason is None and not calibrated:
+        joint = joint_coverage(
+            controller,
+            plants,
+            specification,
+            rng=rng,
+            coverage=options.joint_coverage,
+            draws=options.joint_draws,
+        )
     unstable = [verdict.plant for verdict in certificate.plants if not verdict.stable]
-    reason = "; ".join([*(f"{name}: nominal closed loop unstable" for name in unstable), *missed])
+    missed = [item.sentence() for item in certificate.items if not item.met]
+    doubts = "; ".join([*(f"{name}: nominal closed loop unstable" for name in unstable), *missed])
     return CertifyResult(
         certificate,
         certificate.certified,
-        reason or ("every item is met" if certificate.certified else "an ellipse reaches -1"),
-        sampled,
+        doubts or ("every item is met" if certificate.certified else "an ellipse reaches -1"),
+        SampledResponses(joint, calibrated, reason),
     )
 
 
@@ -117,16 +119,15 @@ def joint_numbers(found: SampledResponses) -> dict[str, Any]:
     joint = found.joint
     if joint is None:
         return {"reason": found.reason}
-    held, stable = (_counted(share, joint.draws) for share in (joint.coverage_given, joint.stable_share))
+    held, stable = (
+        binomtest(round(share * joint.draws), joint.draws).proportion_ci(method="wilson")
+        for share in (joint.coverage_given, joint.stable_share)
+    )
     return {
         **codec.plain(joint),
         "calibrated": found.calibrated,
-        "held_share": held[0],
-        "held_interval": list(held[1]),
-        "stable_interval": list(stable[1]),
+        "held_share": joint.coverage_given,
+        "held_interval": [held.low, held.high],
+        "stable_interval": [stable.low, stable.high],
         "reason": None,
     }
-
-
-def _counted(share: float, draws: int) -> tuple[float, tuple[float, float]]:
-    return share, wilson_interval(round(share * draws), draws)

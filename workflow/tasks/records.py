@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,22 +13,14 @@ from workflow.config.run_config import (
     Channel,
     FileRecord,
     FileSource,
-    RunConfig,
+    SimulatedRecord,
     SimulatedSource,
     record_name,
 )
 from workflow.engine.errors import InputError, naming
 from workflow.tasks.results import RecordsResult, RunRecord
 from workflow.tasks.simulated_rig import simulate_record
-from workflow.tasks.stages.base import StageInput
-
-
-def settings(config: RunConfig) -> Mapping[str, Any]:
-    """The source, and the columns the channels ask for."""
-    return {
-        "source": config.source.model_dump(mode="json"),
-        "columns": [[channel.input, channel.output] for channel in config.channels],
-    }
+from workflow.tasks.stage import StageInput
 
 
 def make_records(stage: StageInput) -> RecordsResult:
@@ -39,42 +29,28 @@ def make_records(stage: StageInput) -> RecordsResult:
     Raises InputError: a file or an excitation that is none, sampling times that differ, or a record to
     identify from whose input stands still.
     """
-    source = stage.config.source
+    source, made = stage.config.source, []
+    entries: Sequence[SimulatedRecord | FileRecord] = source.records
     if isinstance(source, SimulatedSource):
-        made = []
         for index, entry in enumerate(source.records):
             stage.progress.update("records", index / len(source.records), entry.name)
             with naming(f"source.records[{index}] ({entry.name})"):
-                simulated = simulate_record(source, entry, stage.config.run.seed)
-            made.append(
-                RunRecord(
-                    simulated.record,
-                    entry.role,
-                    entry.condition,
-                    entry.remark,
-                    kind=entry.excitation.kind,
-                    noise_free=simulated.noise_free_output,
-                )
-            )
-        effects = tuple(dict(effect) for effect in source.effects)
+                made.append(simulate_record(source, entry, stage.config.run.seed))
     else:
-        made = [
-            RunRecord(
-                read_record(source, entry, stage.config.channels),
-                entry.role,
-                entry.condition,
-                entry.remark,
-                file=str(entry.path),
-            )
-            for entry in source.records
-        ]
-        effects = ()
-    common = with_common_sampling_time([item.record for item in made])
-    records = tuple(replace(item, record=record) for item, record in zip(made, common, strict=True))
-    result = RecordsResult(source.kind, effects, records)
+        made = [read_record(source, entry, stage.config.channels) for entry in source.records]
+    result = RecordsResult(
+        tuple(
+            RunRecord(record, entry.role, entry.condition, entry.remark, kind=_kind(entry))
+            for entry, record in zip(entries, with_common_sampling_time(made), strict=True)
+        )
+    )
     for item in result.of_role("estimation"):
         refuse_constant_input(item.record)
     return result
+
+
+def _kind(entry: SimulatedRecord | FileRecord) -> str:
+    return entry.excitation.kind if isinstance(entry, SimulatedRecord) else "file"
 
 
 def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel]) -> Record:
@@ -85,18 +61,18 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
     # A record's own time base replaces the common one altogether: dt_s here must not meet a time column
     # there.
     own = entry.time is not None or entry.dt_s is not None
-    record = read_log(
-        entry.path,
-        inputs,
-        outputs,
-        time=entry.time if own else source.time,
-        dt_s=entry.dt_s if own else source.dt_s,
-        time_unit=entry.time_unit or (None if own else source.time_unit),
-        references=list(references),
-        name=record_name(entry),
-    )
-    if entry.start_sample or entry.stop_sample is not None:
-        with naming(f"{entry.path}"):
+    with naming(str(entry.path)):
+        record = Record.from_file(
+            entry.path,
+            inputs,
+            outputs,
+            time=entry.time if own else source.time,
+            dt_s=entry.dt_s if own else source.dt_s,
+            time_unit=entry.time_unit or (None if own else source.time_unit),
+            references=list(references),
+            name=record_name(entry),
+        )
+        if entry.start_sample or entry.stop_sample is not None:
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
     sign = -1.0 if entry.mirrored else 1.0
 
@@ -108,35 +84,6 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
         input_units=units(record.input_names),
         output_units=units(record.output_names),
     )
-
-
-def read_log(
-    path: Path,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    *,
-    time: str | None,
-    dt_s: float | None,
-    time_unit: str | None = None,
-    references: Sequence[str] = (),
-    name: str | None = None,
-) -> Record:
-    """A log by its ending, in any format of `ident.data.record_files`. Raises InputError, one line."""
-    try:
-        return Record.from_file(
-            path,
-            inputs,
-            outputs,
-            time=time,
-            dt_s=dt_s,
-            time_unit=time_unit,
-            references=references,
-            name=name,
-        )
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise InputError(error) from error
 
 
 def refuse_constant_input(record: Record) -> None:

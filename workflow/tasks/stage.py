@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from control_design.plants.plant_set import UncertainPlant
 from workflow.config.run_config import RunConfig
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
@@ -31,17 +32,14 @@ class StageInput:
             raise RuntimeError("the first stage has no earlier results")
         return self.earlier
 
+    @property
+    def plant(self) -> UncertainPlant:
+        """The plant that was identified."""
+        return self.results.uncertainty.plant(self.config)
+
     def rng(self, *names: str) -> np.random.Generator:
         """The random stream of these names: the same whatever else ran before."""
         return stage_rng(self.config.run.seed, *names)
-
-    def part_of_progress(self, name: str, index: int, count: int, label: str) -> Callable[[float, str], None]:
-        """A library's progress callback for part `index` of `count` equal parts of stage `name`."""
-
-        def report(fraction: float, message: str) -> None:
-            self.progress.update(name, (index + fraction) / count, f"{label}: {message}")
-
-        return report
 
 
 def _nothing(run: RunDirectory) -> tuple[Path, ...]:
@@ -52,14 +50,20 @@ def _nothing(run: RunDirectory) -> tuple[Path, ...]:
 class Stage:
     """One step of a run.
 
-    `settings` gives the JSON-able part of the configuration the result depends on, `after` the stages whose
-    files it reads: with the seed and the input files these make the input hash. `expected_s` (two cores,
-    warm) only shapes the progress bar. `also_writes` names files outside `stages/` that belong to the result.
+    `uses` and `except_for` name the part of the configuration the result depends on (pydantic's `include` and
+    `exclude`), `after` the stages whose files it reads: with the seed and the input files these make the
+    input hash. `expected_s` (two cores, warm) only shapes the progress bar. `also_writes` names files outside
+    `stages/` that belong to the result.
     """
 
     name: str
     after: tuple[str, ...]
-    settings: Callable[[RunConfig], Mapping[str, Any]]
     run: Callable[[StageInput], Any]
     expected_s: float
+    uses: Mapping[str, Any]
+    except_for: Mapping[str, Any] | None = None
     also_writes: Callable[[RunDirectory], tuple[Path, ...]] = _nothing
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Its share of the configuration, JSON-able."""
+        return config.model_dump(mode="json", include=self.uses, exclude=self.except_for)

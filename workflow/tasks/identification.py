@@ -1,0 +1,110 @@
+"""Records into one GOBF model per channel, and how it does on records it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from ident.basis.options import IdentOptions
+from ident.checks.validation import fit_on_fresh_data
+from ident.closed_loop import two_stage
+from ident.data.record import Record
+from ident.data.signal_filter import band_limited, increments
+from ident.finding import Finding
+from ident.identify import identify
+from ident.stabilisation import stabilisation
+from workflow.config.run_config import Channel, Role
+from workflow.engine.errors import naming
+from workflow.tasks.results import IdentifiedChannel, IdentifyResult
+from workflow.tasks.stage import StageInput
+
+Report = Callable[[float, str], None]
+_OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
+
+
+def as_fitted(record: Record, channel: Channel) -> Record:
+    """The channel's columns as the pole search sees them: as measured, as increments, or inside the band."""
+    record = record.siso(channel.input, channel.output)
+    if channel.increments:
+        return increments(record)
+    return record if channel.band_rad_s is None else band_limited(record, *channel.band_rad_s)
+
+
+def as_bounded(record: Record, channel: Channel) -> Record:
+    """The channel's columns as the ellipses see them; the same unless a wider band is given for them."""
+    if channel.bounds_band_rad_s is None:
+        return as_fitted(record, channel)
+    return band_limited(record.siso(channel.input, channel.output), *channel.bounds_band_rad_s)
+
+
+def identify_channels(stage: StageInput) -> IdentifyResult:
+    """Fit every channel; free runs on all validation and repeat records."""
+    config, records = stage.config, stage.results.records
+    measured = [item.record for item in records.of_role("estimation")]
+    unseen = [item for item in records.records if item.role != "estimation"]
+    channels = []
+    for k, channel in enumerate(config.channels):
+
+        def report(fraction: float, message: str, k: int = k, label: str = channel.label) -> None:
+            stage.progress.update("identify", (k + fraction) / len(config.channels), f"{label}: {message}")
+
+        with naming(f"channel {channel.label!r}"):
+            bounded, finding = [as_bounded(record, channel) for record in measured], None
+            used = [as_fitted(record, channel) for record in measured]
+            if config.closed_loop_data.method == "two_stage":
+                opened = two_stage(bounded, channel.identification, channel.uncertainty)
+                used = bounded = list(opened.records)
+                finding = opened.finding
+                if channel.bounds_band_rad_s is not None:
+                    used = [as_fitted(record, channel) for record in bounded]
+            found = identified_channel(
+                channel.label,
+                used,
+                # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
+                [(as_fitted(item.record, channel), item.role) for item in unseen],
+                channel.identification,
+                report,
+                two_stage=finding,
+            )
+            channels.append(
+                replace(
+                    found,
+                    bounded=tuple(bounded),
+                    increments=channel.increments,
+                    band_rad_s=channel.band_rad_s,
+                    bounds_band_rad_s=channel.bounds_band_rad_s,
+                )
+            )
+    return IdentifyResult(tuple(channels))
+
+
+def identified_channel(
+    name: str,
+    used: Sequence[Record],
+    fresh: Sequence[tuple[Record, Role]],
+    options: IdentOptions,
+    report: Report,
+    *,
+    with_plot: bool = True,
+    two_stage: Finding | None = None,
+) -> IdentifiedChannel:
+    """Model of SISO records as the fit is to see them, with free runs on the records it does not see."""
+    share = _OF_THE_FIT if with_plot else 1.0
+    found = identify(used, options, progress=lambda done, what: report(share * done, what))
+    # All of its warnings are looked for now, so that it is a plain value.
+    found = replace(found, search=replace(found.search, warnings=found.warnings), advise=tuple)
+    plot = None
+    if with_plot:
+        plot = stabilisation(
+            used, found, options, progress=lambda done, what: report(share + (1 - share) * done, what)
+        )
+    return IdentifiedChannel(
+        name=name,
+        identification=found,
+        used=tuple(used),
+        bounded=tuple(used),
+        fresh=tuple(fit_on_fresh_data(found.model, record) for record, _ in fresh),
+        fresh_roles=tuple(role for _, role in fresh),
+        stabilisation=plot,
+        two_stage=two_stage,
+    )

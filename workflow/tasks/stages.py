@@ -1,0 +1,128 @@
+"""The stages of a run before its page, in order: each is a task on what the stages before it left.
+
+What each leaves behind is a type of `workflow.tasks.results`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+from workflow.engine.errors import naming
+from workflow.tasks.achievable_performance import UNKNOWN_TO_BRACKET, find_bracket
+from workflow.tasks.closed_loop import run_closed_loop
+from workflow.tasks.design import certify_asked, find_design
+from workflow.tasks.identification import identify_channels
+from workflow.tasks.records import make_records
+from workflow.tasks.reference_filter import find_filter
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    DesignResult,
+    ReferenceFilterResult,
+)
+from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.uncertainty import find_uncertainty
+
+
+def design_controller(stage: StageInput) -> DesignResult:
+    """Best controller found for the plant that was identified."""
+    config = stage.config
+    with naming("design"):
+        return find_design(
+            [stage.plant],
+            config.specification,
+            config.synthesis,
+            config.certificate,
+            stage.rng("design"),
+            partial(stage.progress.update, "design"),
+        )
+
+
+def find_achievable(stage: StageInput) -> AchievablePerformance:
+    """What a controller of any order could reach, or the reason why that is not known."""
+    config = stage.config
+    report = partial(stage.progress.update, "achievable_performance")
+    with naming("achievable performance"):
+        return find_bracket([stage.plant], config.specification, config.achievable_performance, report)
+
+
+def certify_controller(stage: StageInput) -> CertifyResult:
+    """The controller checked independently of the optimiser that made it, or why there is none."""
+    design, config = stage.results.design, stage.config
+    if design.synthesis is None or not design.has_controller:
+        return CertifyResult(None, certified=False, reason=design.reason)
+    law, rng = design.synthesis.controller, stage.rng("certify")
+    with naming("certify"):
+        return certify_asked(law, [stage.plant], config.specification, config.certificate, rng)
+
+
+def design_filter(stage: StageInput) -> ReferenceFilterResult:
+    """The filter with its worst-case errors; nothing where none is asked for or no controller is there."""
+    settings, synthesis = stage.config.reference_filter, stage.results.design.synthesis
+    if settings is None:
+        return ReferenceFilterResult()
+    if synthesis is None or stage.results.certify.certificate is None:
+        return ReferenceFilterResult(reason="no reference filter: there is no controller")
+    with naming("reference filter"):
+        return find_filter(synthesis.controller, [stage.plant], settings)
+
+
+_PLANT = ("identify", "uncertainty")
+_PURPOSES = {"channels": {"__all__": {"purpose"}}}
+
+STAGES: tuple[Stage, ...] = (
+    Stage(
+        "records",
+        (),
+        make_records,
+        1.0,
+        uses={"source": True, "channels": {"__all__": {"input", "output"}}},
+    ),
+    Stage(
+        "identify",
+        ("records",),
+        identify_channels,
+        2.0,
+        uses={"channels": True, "closed_loop_data": True},
+        except_for={"channels": {"__all__": {"uncertainty", "purpose"}}},
+    ),
+    Stage(
+        "uncertainty",
+        ("records", "identify"),
+        find_uncertainty,
+        2.0,
+        uses={"channels": {"__all__": {"uncertainty"}}},
+    ),
+    Stage(
+        "design",
+        _PLANT,
+        design_controller,
+        15.0,
+        uses={"specification": True, "synthesis": True, "certificate": {"calibrate"}, **_PURPOSES},
+    ),
+    Stage(
+        "achievable_performance",
+        _PLANT,
+        find_achievable,
+        2.5,
+        uses={"specification": True, "achievable_performance": True, **_PURPOSES},
+        # Another order leaves the bracket as it is.
+        except_for={"specification": set(UNKNOWN_TO_BRACKET)},
+    ),
+    Stage("certify", (*_PLANT, "design"), certify_controller, 1.0, uses={"certificate": True}),
+    Stage(
+        "reference_filter",
+        (*_PLANT, "design", "certify"),
+        design_filter,
+        0.1,
+        uses={"reference_filter": True},
+    ),
+    Stage(
+        "closed_loop",
+        ("records", *_PLANT, "design", "certify", "reference_filter"),
+        run_closed_loop,
+        5.0,
+        uses={"closed_loop": True, "source": True},
+        except_for={"source": {"records"}},
+    ),
+)
