@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
-from rich.text import Text
 
 from workflow.engine.errors import printable
 from workflow.tasks.summary import RunSummary
-
-
-class _Remaining(ProgressColumn):
-    """Seconds left, from the stages' expected times and the speed seen so far."""
-
-    def render(self, task: Task) -> Text:
-        left = task.fields.get("remaining_s")
-        return Text("" if left is None else f"about {left:.0f} s left", style="cyan", no_wrap=True)
 
 
 class TerminalProgress:
@@ -37,7 +27,7 @@ class TerminalProgress:
             TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
             BarColumn(bar_width=30),
             TextColumn("{task.percentage:>3.0f} %"),
-            _Remaining(),
+            TimeRemainingColumn(compact=True),
             console=console,
             transient=True,
             disable=not console.is_terminal,
@@ -45,8 +35,6 @@ class TerminalProgress:
         self._task: TaskID | None = None
         self._expected: dict[str, float] = {}
         self._done_s = 0.0
-        self._started = time.monotonic()
-        self._skipped_s = 0.0
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -59,38 +47,27 @@ class TerminalProgress:
 
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
         self._expected = dict(stages)
-        self._started = time.monotonic()
         self._task = self._bar.add_task("", total=sum(self._expected.values()) or 1.0)
 
     def start(self, stage: str) -> None:
-        self._show(stage, 0.0, "")
+        self.update(stage, 0.0)
 
     def update(self, stage: str, fraction: float, message: str = "") -> None:
-        self._show(stage, min(max(fraction, 0.0), 1.0), message)
+        if self._task is not None:
+            self._bar.update(
+                self._task,
+                completed=self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0),
+                total=sum(self._expected.values()) or 1.0,
+                description=escape(f"{stage}: {message}" if message else stage),
+            )
 
     def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
-        expected = self._expected.get(stage, 0.0)
-        self._done_s += expected
         if taken_up:
-            self._skipped_s += expected
+            self._expected[stage] = 0.0  # it says nothing about the speed of this run
+        self._done_s += self._expected.get(stage, 0.0)
         if not self._bar.disable:
             words = "taken up from the earlier run" if taken_up else f"{seconds:.1f} s"
             self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)
-        self._show(stage, 0.0, "")
-
-    def _show(self, stage: str, fraction: float, message: str) -> None:
-        if self._task is None:
-            return
-        total = sum(self._expected.values())
-        done = self._done_s + fraction * self._expected.get(stage, 0.0)
-        worked = done - self._skipped_s
-        elapsed = time.monotonic() - self._started
-        # The expected times set the shape, the run so far the speed; early on there is too little to go by.
-        speed = min(max(elapsed / worked, 0.3), 10.0) if worked > 0.05 * total else 1.0
-        text = stage if not message else f"{stage}: {message}"
-        self._bar.update(
-            self._task, completed=done, description=escape(text), remaining_s=max(total - done, 0.0) * speed
-        )
 
 
 class _Output(Console):
