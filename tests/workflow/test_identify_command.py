@@ -335,7 +335,7 @@ def test_damaged_model_files_are_one_line(identified, tmp_path):
     for name, content, words in (
         ("cut.json", whole[:200], "not JSON"),
         ("other.json", b"{}", "'format' is missing"),
-        ("bytes.json", b"\xff\xfe", "not a UTF-8 text"),
+        ("bytes.json", b"\xff\xfe", "not UTF-8 text"),
         ("cut.mat", ModelFile.from_json(whole.decode()).to_mat()[:200], "not a MATLAB"),
     ):
         (tmp_path / name).write_bytes(content)

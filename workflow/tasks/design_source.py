@@ -11,7 +11,6 @@ Several sources are several plants that one controller has to serve.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,16 +18,17 @@ from typing import Any, Literal, Self
 
 import control
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from control_design.plants.plant_set import UncertainPlant, count_integrators
 from control_design.plants.stated_uncertainty import StatedDiscs
 from control_design.specification import RationalWeight, Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
-from ident.basis.model_files import FORMAT, ModelFile
+from ident.basis.model_files import FORMAT
 from ident.basis.options import IdentOptions
 from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
+from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.design_options import (
     AchievableOptions,
@@ -36,16 +36,17 @@ from workflow.config.design_options import (
     ReferenceFilterSettings,
 )
 from workflow.config.run_config import RunConfig
-from workflow.config.settings import InputPath, ModelT, Section, check, read_toml
+from workflow.config.settings import InputPath, Section, check, read_toml
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.model_files import read_model
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
+from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import words
 
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
-_STATE_SPACE_FILES = (".json", ".mat", ".npz")
 
 
 class PlantSection(Section):
@@ -137,20 +138,22 @@ class DesignFile:
         return "a design file (--spec FILE)" if self.path is None else str(self.path)
 
 
+_TABLES: dict[str, type[BaseModel]] = {
+    "synthesis": SynthesisOptions,
+    "plant": PlantSection,
+    "uncertainty": StatedUncertainty,
+    "certificate": CertificateOptions,
+    "achievable_performance": AchievableOptions,
+    "reference_filter": ReferenceFilterSettings,
+}
+
+
 def read_design_file(path: Path) -> DesignFile:
     """TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
     [uncertainty], [synthesis], [certificate], [achievable_performance] and [reference_filter]; of a run's
     configuration all of these but the first two are taken. Raises InputError."""
     _, document = read_toml(path)
-    known = {
-        "specification",
-        "plant",
-        "uncertainty",
-        "synthesis",
-        "certificate",
-        "achievable_performance",
-        "reference_filter",
-    }
+    known = {"specification", *_TABLES}
     if "specification" not in document:
         wanted = {key: value for key, value in document.items() if key not in known}
     else:
@@ -158,23 +161,13 @@ def read_design_file(path: Path) -> DesignFile:
         unknown = sorted(set(document) - known)
         if unknown and "channels" not in document:
             raise InputError(f"{path}: unknown key {unknown[0]} (known keys: {', '.join(sorted(known))})")
-
-    def table(name: str, model: type[ModelT]) -> ModelT | None:
-        if name not in document:
-            return None
-        base = {"base": path.absolute().parent}
-        return check(model, document[name], source=f"{path} [{name}]", context=base)
-
-    return DesignFile(
-        specification=check(Specification, wanted, source=str(path)),
-        synthesis=table("synthesis", SynthesisOptions),
-        plant=table("plant", PlantSection) or PlantSection.model_validate({}),
-        uncertainty=table("uncertainty", StatedUncertainty),
-        certificate=table("certificate", CertificateOptions),
-        achievable_performance=table("achievable_performance", AchievableOptions),
-        reference_filter=table("reference_filter", ReferenceFilterSettings),
-        path=path,
-    )
+    base = {"base": path.absolute().parent}
+    tables: dict[str, Any] = {
+        name: check(kind, document[name], source=f"{path} [{name}]", context=base)
+        for name, kind in _TABLES.items()
+        if name in document
+    }
+    return DesignFile(check(Specification, wanted, source=str(path)), path=path, **tables)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +179,6 @@ class DesignSource:
     origin: str
     remarks: tuple[str, ...] = ()
     config: RunConfig | None = None
-
-    @property
-    def specification(self) -> Specification | None:
-        """What the run was asked for."""
-        return None if self.config is None else self.config.specification
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
@@ -231,94 +219,57 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         run = RunDirectory.open(path)
         config = config_of(run)
         return DesignSource(RunResults(run).uncertainty.plant(config), "run directory", config=config)
-    suffix = path.suffix.lower()
-    if suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         return _measured(path, design)
-    if suffix not in _STATE_SPACE_FILES:
-        known = ", ".join((*_STATE_SPACE_FILES, ".csv"))
-        raise InputError(f"{path}: not a run directory, and the ending is none of {known}")
-    document = _read_document(path, suffix)
-    if codec.DOCUMENT in document:
-        return DesignSource(_with_posterior(path, document), "model and posterior of flexlink identify")
-    if document.get("format") == FORMAT:
-        return _exported(path, suffix, design)
-    return _plain(path, document, design)
-
-
-def _read_document(path: Path, suffix: str) -> dict[str, Any]:
-    """Top-level names and values of a .npz, .json or .mat file."""
-    if suffix == ".npz":
-        return dict(storage.read_npz(path))
-    content = _read_bytes(path)
-    if suffix == ".json":
-        try:
-            document = json.loads(content.decode("utf-8-sig"))
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
-        except json.JSONDecodeError as error:
-            raise InputError(
-                f"{path}, line {error.lineno}, column {error.colno}: not JSON ({error.msg})"
-            ) from error
-        if not isinstance(document, dict):
-            raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
-        return document
+    document = _read_document(path)
     with naming(str(path)):
-        raw = mat_variables(content, path)
+        if codec.DOCUMENT in document:
+            found = codec.from_arrays(IdentifiedPlant, document)
+            name, nominal = found.model.output_name, found.model.to_control()
+            plant = UncertainPlant(name, nominal, found.posterior, level=found.level)
+            return DesignSource(plant, "model and posterior of flexlink identify")
+        if document.get("format") == FORMAT:
+            exported = read_model(path)
+            name, nominal, ellipses = (
+                exported.model.output_name,
+                exported.model.to_control(),
+                exported.ellipses,
+            )
+            if ellipses is None:
+                return _stated(name, nominal, design, "exported model")
+            plant = UncertainPlant(name, nominal, ellipses, level=ellipses.level)
+            return DesignSource(plant, "exported model with ellipses", _grid_remarks(plant))
+        nominal = read_state_space(path, document)
+        _refuse_untold_integrators(path, nominal, design)
+        return _stated(path.stem, nominal, design, "state space")
+
+
+def _read_document(path: Path) -> dict[str, Any]:
+    """Top-level names and values of a .npz, .json or .mat file. Raises InputError."""
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return storage.read_npz(path)
+    if suffix == ".json":
+        return storage.read_json(path)
+    if suffix != ".mat":
+        raise InputError(f"{path}: not a run directory, and the ending is none of .json, .mat, .npz, .csv")
+    with naming(str(path)):
+        raw = mat_variables(path.read_bytes(), path)
     return {
         name: "".join(value.ravel().tolist()) if np.asarray(value).dtype.kind == "U" else value
         for name, value in raw.items()
     }
 
 
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
-
-
-def _with_posterior(path: Path, arrays: Mapping[str, Any]) -> UncertainPlant:
-    """The plant in a file of `flexlink identify --out`."""
-    with naming(str(path)):
-        found = codec.from_arrays(IdentifiedPlant, arrays)
-        return UncertainPlant(
-            found.model.output_name, found.model.to_control(), found.posterior, level=found.level
-        )
-
-
-def _exported(path: Path, suffix: str, design: DesignFile) -> DesignSource:
-    """A model of `flexlink identify --export`: its ellipses, or the stated uncertainty."""
-    content = _read_bytes(path)
-    with naming(str(path)):
-        if suffix == ".json":
-            found = ModelFile.from_json(content.decode("utf-8-sig"), source=str(path))
-        else:
-            found = ModelFile.from_mat(content, source=str(path))
-        nominal, ellipses = found.model.to_control(), found.ellipses
-        if ellipses is None:
-            return _stated(path, found.model.output_name, nominal, design, "exported model")
-        plant = UncertainPlant(found.model.output_name, nominal, ellipses, level=ellipses.level)
-    return DesignSource(plant, "exported model with ellipses", _grid_remarks(plant))
-
-
-def _plain(path: Path, document: Mapping[str, Any], design: DesignFile) -> DesignSource:
-    """A user's own state space."""
-    nominal = read_state_space(path, document)
-    _refuse_untold_integrators(path, nominal, design)
-    return _stated(path, path.stem, nominal, design, "state space")
-
-
-def _stated(
-    path: Path, name: str, nominal: control.StateSpace, design: DesignFile, origin: str
-) -> DesignSource:
-    with naming(str(path)):
-        if design.uncertainty is None:
-            remark = "no uncertainty is stated ([uncertainty] in the design file): the design and its "
-            remark += "certificate hold for exactly this model"
-            return DesignSource(UncertainPlant(name, nominal), origin, (remark,))
-        with naming(f"{design.name} [uncertainty]"):
-            discs = design.uncertainty.around(nominal)
-        return DesignSource(UncertainPlant(name, nominal, discs), origin)
+def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
+    """A model that brings no ellipses: with the uncertainty of the design file, if it states one."""
+    if design.uncertainty is None:
+        remark = "no uncertainty is stated ([uncertainty] in the design file): the design and its "
+        remark += "certificate hold for exactly this model"
+        return DesignSource(UncertainPlant(name, nominal), origin, (remark,))
+    with naming(f"{design.name} [uncertainty]"):
+        discs = design.uncertainty.around(nominal)
+    return DesignSource(UncertainPlant(name, nominal, discs), origin)
 
 
 def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSpace:
@@ -405,32 +356,24 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
         response = _read_response(path, about)
         if response.omega_rad_s.size < 2:
             raise InputError(f"{path}: one frequency is no response; expected many")
+    origin, said = "measured response", tuple[str, ...]()
     if about.nominal is not None:
-        nominal_path = about.nominal
-        suffix = nominal_path.suffix.lower()
-        if suffix not in _STATE_SPACE_FILES:
-            raise InputError(f"{nominal_path}: the ending must be one of {', '.join(_STATE_SPACE_FILES)}")
-        nominal = read_state_space(nominal_path, _read_document(nominal_path, suffix))
+        nominal = read_state_space(about.nominal, _read_document(about.nominal))
         if not np.isclose(float(nominal.dt), about.dt_s, rtol=1e-9, atol=0):
             raise InputError(
-                f"{nominal_path}: dt_s = {float(nominal.dt):.6g}, but [plant] says {about.dt_s:.6g}"
+                f"{about.nominal}: dt_s = {float(nominal.dt):.6g}, but [plant] says {about.dt_s:.6g}"
             )
-        _refuse_untold_integrators(nominal_path, nominal, design)
-        with naming(str(path)):
-            plant = UncertainPlant(path.stem, nominal, response, level=response.level)
-        return DesignSource(plant, "measured response", _grid_remarks(plant))
-    from ident.frequency_fit import identify_frf
-
-    options = about.fit.model_copy(update={"integrators": about.integrators})
+        _refuse_untold_integrators(about.nominal, nominal, design)
     with naming(str(path)):
-        found = identify_frf(response, options)
-        nominal = found.model.to_control()
-        said = tuple(words(item) for item in (*found.verdicts, *found.warnings))
-        if about.ellipses == "fitted":
-            plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
-            return DesignSource(plant, "model fitted to a measured response", said)
+        if about.nominal is None:
+            found = identify_frf(response, about.fit.model_copy(update={"integrators": about.integrators}))
+            nominal, origin = found.model.to_control(), "measured response, poles of a fitted model"
+            said = tuple(words(item) for item in (*found.verdicts, *found.warnings))
+            if about.ellipses == "fitted":
+                plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
+                return DesignSource(plant, "model fitted to a measured response", said)
         plant = UncertainPlant(path.stem, nominal, response, level=response.level)
-    return DesignSource(plant, "measured response, poles of a fitted model", (*said, *_grid_remarks(plant)))
+    return DesignSource(plant, origin, (*said, *_grid_remarks(plant)))
 
 
 def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
@@ -443,15 +386,12 @@ def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
         _refuse_strange_spread(path, header)
         return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level)
     repeats = FrfRepeats.from_csv(path)
-    try:
-        return repeats.mean(
-            about.dt_s,
-            level=about.level,
-            pool_neighbours=about.pool_neighbours,
-            outlier_threshold=about.outlier_threshold,
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return repeats.mean(
+        about.dt_s,
+        level=about.level,
+        pool_neighbours=about.pool_neighbours,
+        outlier_threshold=about.outlier_threshold,
+    )
 
 
 def _refuse_strange_spread(path: Path, header: str) -> None:
@@ -472,9 +412,8 @@ def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:
     at = FrequencyUncertainty(
         own.omega_rad_s[inside], own.centre[inside], own.covariance[inside], own.dt_s, own.level, own.method
     )
-    away = at.normalised_distance(plant.channel.nominal_response(at.omega_rad_s))
-    worst = int(np.argmax(away))
+    found = agreement_of(at, plant.channel.nominal_response)
     return (
-        f"nominal model inside {100 * float(np.mean(away <= 1)):.3g} % of the {own.omega_rad_s.size} "
-        f"ellipses, at most {away[worst]:.3g} of one from the centre ({at.omega_rad_s[worst]:.4g} rad/s)",
+        f"nominal model inside {found.share_inside_percent:.3g} % of the {own.omega_rad_s.size} "
+        f"ellipses, at most {found.largest_distance:.3g} of one from the centre ({found.at_rad_s:.4g} rad/s)",
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ident.basis.model_files import ModelFile
 from workflow.engine import storage
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import naming
 
 MODEL_SUFFIXES = (".json", ".mat")
 
@@ -19,15 +19,7 @@ def write_model(path: Path, file: ModelFile) -> None:
 
 def read_model(path: Path) -> ModelFile:
     """The model in a file of `write_model`. Raises InputError: one line that names the file."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     with naming(str(path)):
         if path.suffix.lower() == ".mat":
-            return ModelFile.from_mat(content, str(path))
-        try:
-            text = content.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: not a UTF-8 text file (byte {error.start})") from error
-        return ModelFile.from_json(text, str(path))
+            return ModelFile.from_mat(path.read_bytes(), str(path))
+        return ModelFile.from_json(storage.read_text(path), str(path))
