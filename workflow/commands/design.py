@@ -33,7 +33,7 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
-from workflow.tasks.summary import RunSummary, sections_of
+from workflow.tasks.summary import RunSummary
 from workflow.text.templates import rows_of, said
 
 BetweenPoints = Literal["nothing", "linear"]
@@ -177,7 +177,7 @@ def design_controller(
     ]
     return RunSummary(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
-        sections=sections_of(rows),
+        sections=rows,
         numbers={
             "plants": about,
             "design": {**codec.plain(done.design), "order_advice": advice},

@@ -18,7 +18,7 @@ from workflow.tasks.log_identification import LogIdentification, identify_record
 from workflow.tasks.model_files import MODEL_SUFFIXES, write_model
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
-from workflow.tasks.summary import RunSummary, model_numbers, sections_of, uncertainty_numbers
+from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
 from workflow.text.formats import count
 from workflow.text.templates import rows_of, words
 
@@ -111,7 +111,7 @@ def _summary(
     about, spread = result.about, result.spread
     return RunSummary(
         title=f"{about.input} to {about.output}",
-        sections=sections_of(rows_of("summary/identification.j2", result=result)),
+        sections=rows_of("summary/identification.j2", result=result),
         numbers={
             **model_numbers(about),
             "warnings": [words(item) for item in result.careful],

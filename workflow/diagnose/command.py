@@ -29,8 +29,9 @@ from workflow.engine.errors import (
 )
 from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress, Silence
-from workflow.tasks.summary import Row, RunSummary, Section
+from workflow.tasks.summary import RunSummary
 from workflow.text.formats import listing
+from workflow.text.templates import Row, Section
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only

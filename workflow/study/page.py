@@ -13,7 +13,7 @@ from workflow.study.columns import COLUMNS, Column
 from workflow.study.points import short
 from workflow.study.rows import PointRow, State
 from workflow.study.settings import ParetoPlot, StudyConfig
-from workflow.tasks.summary import RunSummary, sections_of
+from workflow.tasks.summary import RunSummary
 from workflow.text.templates import render_text, rows_of
 
 _BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "rise_time_s")
@@ -106,7 +106,7 @@ def study_summary(title: str, study: StudyView, numbers: Mapping[str, Any], path
     """What the terminal says of it."""
     return RunSummary(
         title=title,
-        sections=sections_of(rows_of("study_summary.j2", study=study)),
+        sections=rows_of("study_summary.j2", study=study),
         numbers=numbers,
         certified=any(row.good for row in study.rows),
         verdict=render_text("study_verdict.j2", study=study).strip(),

@@ -300,20 +300,23 @@ class UncertaintyResult:
 
     def plant(self, config: RunConfig) -> UncertainPlant:
         """What the controller is designed for: control channel and first performance channel."""
-        return self._plants.setdefault((config.control_index, config.performance_index), self._plant(config))
+        key = config.control_index, config.performance_index
+        if key not in self._plants:
+            self._plants[key] = self._plant(*key, config.control_channel.label)
+        return self._plants[key]
 
     @cached_property
     def _plants(self) -> dict[tuple[int, int | None], UncertainPlant]:
         return {}
 
-    def _plant(self, config: RunConfig) -> UncertainPlant:
+    def _plant(self, control_index: int, performance: int | None, name: str) -> UncertainPlant:
         def channel(index: int) -> PlantChannel:
             found = self.channels[index]
             return PlantChannel(found.nominal.to_control(), found.posterior, found.level)
 
-        control, performance = channel(config.control_index), config.performance_index
+        control = channel(control_index)
         return UncertainPlant(
-            name=config.control_channel.label,
+            name=name,
             nominal=control.nominal,
             uncertainty=control.uncertainty,
             performance=None if performance is None else channel(performance),

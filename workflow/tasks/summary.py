@@ -19,26 +19,7 @@ from workflow.tasks.results import (
     RunResults,
     UncertainChannel,
 )
-from workflow.text.templates import rows_of, said, words
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table."""
-
-    label: str
-    value: str
-
-
-@dataclass(frozen=True)
-class Section:
-    title: str
-    rows: tuple[Row, ...]
-
-
-def sections_of(parts: Sequence[tuple[str, Sequence[tuple[str, str]]]]) -> tuple[Section, ...]:
-    """Of a table that a template made."""
-    return tuple(Section(title, tuple(Row(*row) for row in rows)) for title, rows in parts)
+from workflow.text.templates import Section, rows_of, said, words
 
 
 @dataclass(frozen=True)
@@ -50,7 +31,7 @@ class RunSummary:
     """
 
     title: str
-    sections: tuple[Section, ...]
+    sections: Sequence[Section]
     numbers: Mapping[str, Any] = field(default_factory=dict)
     certified: bool = True
     verdict: str = ""
@@ -81,7 +62,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
     settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
     return RunSummary(
         title=config.run.title or config.run.name,
-        sections=sections_of(rows_of("summary/run.j2", config=config, results=results, shares=shares)),
+        sections=rows_of("summary/run.j2", config=config, results=results, shares=shares),
         numbers={
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": design_numbers(design),
@@ -114,7 +95,7 @@ def verdict_of(
 
 def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
     """What was found in one channel, for programs."""
-    names: tuple[str, ...] = (
+    names = (
         "name",
         "input",
         "output",
@@ -122,9 +103,14 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "integrators",
         "input_delay_samples",
         "feedthrough",
+        "real_poles_per_s",
+        "real_poles_z",
+        "order_table",
+        "band_rad_s",
+        "fit_estimation_percent",
+        "fit_validation_percent",
+        "fit_repeat_percent",
     )
-    names += ("real_poles_per_s", "real_poles_z", "order_table", "band_rad_s")
-    names += ("fit_estimation_percent", "fit_validation_percent", "fit_repeat_percent")
     return {
         **{name: codec.plain(getattr(found, name)) for name in names},
         "warnings": [words(item) for item in found.warnings],
@@ -155,8 +141,8 @@ def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
 
 def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[str, Any]:
     """The model of a channel and its ellipses together."""
-    said = uncertainty_numbers(spread)
-    return {**model_numbers(found), **{key: said[key] for key in ("bands", "tests", "repeat_scatter")}}
+    ellipses = uncertainty_numbers(spread)
+    return {**model_numbers(found), **{key: ellipses[key] for key in ("bands", "tests", "repeat_scatter")}}
 
 
 def design_numbers(design: DesignResult) -> dict[str, Any]:
@@ -175,6 +161,6 @@ def loop_numbers(loop: ClosedLoopResult) -> dict[str, Any]:
     """The check without its signals."""
     if loop.check is None:
         return {"skipped": loop.skipped}
-    draws, settled = loop.check.draws, loop.check.settled_draws
-    said: dict[str, Any] = codec.plain(loop.check, arrays=False)
-    return {"skipped": None, "draws": draws, "settled_draws": settled, **said}
+    check = loop.check
+    counts = {"skipped": None, "draws": check.draws, "settled_draws": check.settled_draws}
+    return {**counts, **codec.plain(check, arrays=False)}

@@ -87,16 +87,11 @@ def hertz(omega_rad_s: float) -> float:
     return omega_rad_s / (2 * math.pi)
 
 
-def degrees(radians: float) -> float:
-    """rad as degrees; infinite ones stay infinite."""
-    return math.degrees(radians)
-
-
 def decibels(factor: float) -> str:
     """A gain factor with its dB; as a gain margin, inf sets no upper limit and 0 no lower one."""
     if math.isinf(factor):
         return "unlimited"
-    return f"{number(factor)} ({20 * math.log10(factor):+.1f} dB)" if factor > 0 else "no lower limit"
+    return f"{number(factor)} ({in_decibels(factor):+.1f} dB)" if factor > 0 else "no lower limit"
 
 
 def in_decibels(factor: float) -> float:
@@ -155,11 +150,7 @@ def _finite(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 
-def _nan(value: float) -> bool:
-    return math.isnan(value)
-
-
-TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": _nan}
+TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "number": number,
     "fmt": format,
@@ -173,7 +164,7 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "frequency": frequency,
     "hertz": hertz,
     "ln": math.log,
-    "degrees": degrees,
+    "degrees": math.degrees,
     "decibels": decibels,
     "in_decibels": in_decibels,
     "unit": unit,

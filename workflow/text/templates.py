@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -52,12 +52,25 @@ def _findings() -> Any:
     return environment().get_template("findings.j2").module
 
 
-def rows_of(template: str, **values: Any) -> list[tuple[str, list[tuple[str, str]]]]:
-    """A table by template: titles with their (label, value) rows, plain text on one line each.
+class Row(NamedTuple):
+    """One line of a table."""
 
-    The template calls part("title") and {% call line("label") %}value{% endcall %}; an empty value is no row.
+    label: str
+    value: str
+
+
+class Section(NamedTuple):
+    title: str
+    rows: Sequence[Row]
+
+
+def rows_of(template: str, **values: Any) -> list[Section]:
+    """A table by template: plain text on one line each.
+
+    The template calls part("title") and {% call line("label") %}value{% endcall %}; an empty value is no row,
+    a part without rows no section.
     """
-    parts: list[tuple[str, list[tuple[str, str]]]] = []
+    parts: list[tuple[str, list[Row]]] = []
 
     def part(title: str) -> str:
         parts.append((_plain(title), []))
@@ -66,11 +79,11 @@ def rows_of(template: str, **values: Any) -> list[tuple[str, list[tuple[str, str
     def line(label: str, caller: Callable[[], str]) -> str:
         value = _plain(caller())
         if value:
-            parts[-1][1].append((_plain(label), value))
+            parts[-1][1].append(Row(_plain(label), value))
         return ""
 
     environment().get_template(template).render(part=part, line=line, **values)
-    return [(title, rows) for title, rows in parts if rows]
+    return [Section(title, rows) for title, rows in parts if rows]
 
 
 def _plain(text: str) -> str:
