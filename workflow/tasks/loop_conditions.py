@@ -158,16 +158,8 @@ class ConditionBench:
         if self.controller.input_limit is not None:
             peak = float(np.max(np.abs(self.predict(shape, law=self._unlimited).command)))
             size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
-        reference = np.asarray(size * shape, dtype=np.float64)
         seconds = length * self.controller.dt_s
-        return condition_run(
-            "slew",
-            f"smooth move in {seconds:.3g} s",
-            reference,
-            self.predict(reference),
-            self.achieve(reference),
-            size,
-        )
+        return self._run("slew", f"smooth move in {seconds:.3g} s", np.asarray(size * shape))
 
     def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""
@@ -182,15 +174,12 @@ class ConditionBench:
         )
         answer = np.column_stack([free.hub_angle_true_rad, free.tip_true_m])[:, self.measured]
         scale = self.step / float(np.max(np.abs(answer)))
-        nothing = np.zeros(n)
-        predicted = self.predict(nothing, output_disturbance=scale * answer)
-        return condition_run(
+        return self._run(
             "push at the tip",
             f"{scale:.3g} N, half sine of {1e3 * length * dt:.3g} ms",
-            nothing,
-            predicted,
-            self.achieve(nothing, tip_force_N=scale * force),
-            float(np.max(np.abs(predicted.measured))),
+            np.zeros(n),
+            output_disturbance=scale * answer,
+            tip_force_N=scale * force,
         )
 
     def payloads(self) -> list[ConditionRun]:
@@ -199,23 +188,22 @@ class ConditionBench:
         tenth = 0.1 * link.density_kg_m3 * link.width_m * link.thickness_m * link.length_m
         extra = float(self.effects.get("tip_payload", {}).get("mass_kg", 0.0))
         rated = self.rig.payload.mass_kg + extra or tenth
-        found = []
-        for percent in (0, 100, 200):
-            mass = rated * percent / 100
-            rig = self.rig.perturbed({"payload.mass_kg": mass})
-            without = {"tip_payload": {"name": "tip_payload", "mass_kg": 0.0}}
-            found.append(
-                self._stepped(
-                    f"payload {percent} %", f"{1e3 * mass:.3g} g at the tip", effects=without, rig=rig
-                )
+        without = {"tip_payload": {"name": "tip_payload", "mass_kg": 0.0}}
+        return [
+            self._run(
+                f"payload {percent} %",
+                f"{1e3 * rated * percent / 100:.3g} g at the tip",
+                effects=without,
+                rig=self.rig.perturbed({"payload.mass_kg": rated * percent / 100}),
             )
-        return found
+            for percent in (0, 100, 200)
+        ]
 
     def late(self) -> ConditionRun:
         """One sample of delay more."""
         own = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
         late = {"input_delay": {"name": "input_delay", "delay_s": own + self.controller.dt_s}}
-        return self._stepped("late", f"{1e3 * self.controller.dt_s:.3g} ms more delay", effects=late)
+        return self._run("late", f"{1e3 * self.controller.dt_s:.3g} ms more delay", effects=late)
 
     def frictions(self) -> list[ConditionRun]:
         """None of the arm's joint friction effects, and twice as much of each."""
@@ -232,8 +220,8 @@ class ConditionBench:
 
         listed = " and ".join(name.replace("_", " ") for name in own)
         return [
-            self._stepped("no friction", f"without {listed}", effects=scaled(0.0)),
-            self._stepped("double friction", f"twice the {listed}", effects=scaled(2.0)),
+            self._run("no friction", f"without {listed}", effects=scaled(0.0)),
+            self._run("double friction", f"twice the {listed}", effects=scaled(2.0)),
         ]
 
     def coarse(self) -> ConditionRun:
@@ -244,7 +232,7 @@ class ConditionBench:
             4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
         )
         words = f"command in steps of {command:.3g}, measurement of {measurement:.3g}"
-        return self._stepped("coarse", words, steps=(measurement, command))
+        return self._run("coarse", words, steps=(measurement, command))
 
     def overdriven(self) -> list[ConditionRun]:
         """A step that needs twice the voltage there is, with anti-windup and without."""
@@ -255,34 +243,35 @@ class ConditionBench:
         peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
         reference = self.reference * (_OVERDRIVEN * limit / peak)
         words = f"a step that asks for {_OVERDRIVEN:g} times the limit"
-        aware = condition_run(
-            "voltage limit",
-            f"{words}, with anti-windup",
-            reference,
-            self.predict(reference),
-            self.achieve(reference),
-            float(reference[-1]),
-        )
-        unaware = condition_run(
-            "no anti-windup",
-            f"{words}, the controller does not know of it",
-            reference,
-            self.predict(reference, law=free, clip=limit),
-            self.achieve(reference, law=free, clip=limit),
-            float(reference[-1]),
-        )
-        return [aware, unaware]
+        return [
+            self._run("voltage limit", f"{words}, with anti-windup", reference),
+            self._run(
+                "no anti-windup",
+                f"{words}, the controller does not know of it",
+                reference,
+                law=free,
+                clip=limit,
+            ),
+        ]
 
     @property
     def _unlimited(self) -> Controller:
         return replace(self.controller, input_limit=None, rate_limit=None)
 
-    def _stepped(self, name: str, words: str, **changes: Any) -> ConditionRun:
-        return condition_run(
-            name,
-            words,
-            self.reference,
-            self.predict(self.reference),
-            self.achieve(self.reference, **changes),
-            self.step,
-        )
+    def _run(
+        self,
+        name: str,
+        words: str,
+        reference: Real | None = None,
+        *,
+        law: Controller | None = None,
+        clip: float | None = None,
+        output_disturbance: Real | None = None,
+        **changes: Any,
+    ) -> ConditionRun:
+        """The reference (the step, unless another is given) predicted, and achieved with the changes."""
+        reference = self.reference if reference is None else reference
+        predicted = self.predict(reference, law=law, output_disturbance=output_disturbance, clip=clip)
+        achieved = self.achieve(reference, law=law, clip=clip, **changes)
+        size = float(reference[-1]) or float(np.max(np.abs(predicted.measured)))
+        return condition_run(name, words, reference, predicted, achieved, size)
