@@ -17,7 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.analysis.certificate import Certificate, certify
-from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
+from control_design.analysis.closed_loop import (
+    ClosedLoopTrajectory,
+    LinearMachine,
+    measure_sensitivity,
+    simulate,
+)
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import Channel, UncertainPlant, modes_of
@@ -29,7 +34,7 @@ from diagnosis.machine.case import Case
 from ident.data.record import Record
 from plant import Effect, Rig, SampledArm
 from workflow.diagnose.linear_machine import sampled_linear_machine
-from workflow.tasks.loop_sensitivity import measure_on, plan_sensitivity
+from workflow.tasks.loop_sensitivity import plan_sensitivity
 
 Real = npt.NDArray[np.float64]
 
@@ -282,6 +287,7 @@ def _achieved(
     ]
     hub = [record.siso("voltage_V", "hub_angle_rad") for record in records]
     plan = plan_sensitivity(controller, plant.uncertain, hub, trial.time_s.size // 2)
-    seen = measure_on(_Watched(arm), controller, plan, np.random.default_rng(_SEED))
+    rng = np.random.default_rng(_SEED)
+    seen = measure_sensitivity(controller, _Watched(arm), rng, **plan.excitation())
     peak, _, _ = seen.peak
     return trial.run(controller, _Watched(arm), plant.uncertain.name, "repaired machine", 1.0 / peak)

@@ -13,14 +13,14 @@ from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
-from workflow.config.run_config import SimulatedSource
+from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.engine.errors import naming
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import sensitivity_on_arm
 from workflow.tasks.reference_filter import model_answer
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of, steps_of
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
 from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
@@ -95,7 +95,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
                 posterior.sample(stage.rng("closed_loop", "control"), options.draws),
                 None if tip is None else tip.sample(stage.rng("closed_loop", "performance"), options.draws),
                 trial,
-                **steps_of(options),
+                **_steps(options),
             )
     model = None
     if reference_filter is not None and config.reference_filter is not None:
@@ -181,10 +181,15 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopR
                 trial.given,
                 measured_index=measured,
                 input_disturbance=trial.disturbance,
-                **steps_of(options),
+                **_steps(options),
             )
         )
     return _loop_runs(runs, None if tip is None else [run.output[:, tip] for run in runs])
+
+
+def _steps(options: ClosedLoopOptions) -> dict[str, float]:
+    """Steps of the loop's converters, as `control_design.analysis.closed_loop` calls them."""
+    return {"measurement_step": options.measurement_step, "command_step": options.quantisation}
 
 
 def run_on_draws(

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.closed_loop import MeasuredSensitivity, SampledMachine, measure_sensitivity
+from control_design.analysis.closed_loop import measure_sensitivity
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from ident.data.record import Record
 from workflow.config.run_config import SimulatedSource
 from workflow.tasks.results import MeasuredPeak, SensitivityCheck
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, steps_of
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
 from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
@@ -40,6 +40,17 @@ class SensitivityPlan:
     rms: float
     nominal_peak: float
     nominal_omega_rad_s: float
+
+    def excitation(self, *, small: bool = False) -> dict[str, Any]:
+        """Keywords of `measure_sensitivity`; `small` takes a tenth of the size."""
+        return {
+            "rms": self.rms * (_SMALL if small else 1.0),
+            "band_rad_s": self.band_rad_s,
+            "period_samples": self.period_samples,
+            "periods": _PERIODS_SMALL if small else 1,
+            "draws": _DRAWS,
+            "lead_in_periods": self.lead_in_periods,
+        }
 
 
 def plan_sensitivity(
@@ -75,34 +86,6 @@ def plan_sensitivity(
     )
 
 
-def measure_on(
-    machine: SampledMachine,
-    controller: Controller,
-    plan: SensitivityPlan,
-    rng: np.random.Generator,
-    *,
-    small: bool = False,
-    measured_index: int = 0,
-    measurement_step: float = 0.0,
-    command_step: float = 0.0,
-) -> MeasuredSensitivity:
-    """S on a machine by the plan; `small` takes a tenth of the size."""
-    return measure_sensitivity(
-        controller,
-        machine,
-        rng,
-        rms=plan.rms * (_SMALL if small else 1.0),
-        band_rad_s=plan.band_rad_s,
-        period_samples=plan.period_samples,
-        periods=_PERIODS_SMALL if small else 1,
-        draws=_DRAWS,
-        lead_in_periods=plan.lead_in_periods,
-        measured_index=measured_index,
-        measurement_step=measurement_step,
-        command_step=command_step,
-    )
-
-
 def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samples: int) -> SensitivityCheck:
     """The peak of S on the simulated arm, large and small, beside prediction and certified bound."""
     config, certificate, source = stage.config, stage.results.certify.certificate, stage.config.source
@@ -121,14 +104,14 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
     rows = []
     for number, (name, effects, small) in enumerate(arms):
         arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
-        found = measure_on(
-            ClippedMachine(arm, FINITE),
+        found = measure_sensitivity(
             controller,
-            plan,
+            ClippedMachine(arm, FINITE),
             stage.rng("closed_loop", "sensitivity", str(number)),
-            small=small,
+            **plan.excitation(small=small),
             measured_index=OUTPUT_NAMES.index(config.control_channel.output),
-            **steps_of(options),
+            measurement_step=options.measurement_step,
+            command_step=options.quantisation,
         )
         peak, std, omega = found.peak
         rows.append(

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ident.data.record import Record
 from plant import Rig, SampledArm, parse_effect, simulate
 from workflow.config.rig_settings import PRESETS
-from workflow.config.run_config import ClosedLoopOptions, SimulatedRecord, SimulatedSource
+from workflow.config.run_config import SimulatedRecord, SimulatedSource
 from workflow.engine.randomness import stage_rng
 
 INPUT_NAME = "voltage_V"
@@ -61,11 +61,6 @@ def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.N
     result = output.copy()
     result[..., 0] = encoder_step_rad * np.round(output[..., 0] / encoder_step_rad)
     return result
-
-
-def steps_of(options: ClosedLoopOptions) -> dict[str, float]:
-    """Steps of the loop's converters, as `control_design.analysis.closed_loop` calls them."""
-    return {"measurement_step": options.measurement_step, "command_step": options.quantisation}
 
 
 class EncodedArm(SampledArm):
