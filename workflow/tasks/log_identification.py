@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.basis.options import IdentOptions
 from ident.checks.plausible_modes import pairs_outside
-from ident.checks.residual_tests import ResidualTest, residual_advice, whiteness_test
+from ident.checks.residual_tests import residual_advice, whiteness_test
 from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
@@ -21,7 +21,7 @@ from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from workflow.engine.errors import naming
 from workflow.engine.progress import Progress, Silence
 from workflow.tasks.identification import identified_channel
-from workflow.tasks.results import IdentifiedChannel, UncertainChannel
+from workflow.tasks.results import IdentifiedChannel, Tests, UncertainChannel
 from workflow.tasks.truth import TrueMode
 from workflow.tasks.uncertainty import N_BANDS, display_grid, residual_tests, uncertain_channel
 
@@ -127,9 +127,7 @@ def identify_records(
         careful=(
             *_doubts([*measured, *fresh_records]),
             *found.warnings,
-            *residual_advice(
-                spread.test("whiteness"), spread.test("independence"), noise_order=spread.noise_order
-            ),
+            *residual_advice(*spread.tests, noise_order=spread.noise_order),
             *_beyond(found, options, band_rad_s),
             *(opened.warnings(omega) if opened else ()),
         ),
@@ -138,7 +136,7 @@ def identify_records(
 
 def _posterior(
     used: Sequence[Record], found: Identification, noise_order: int | None
-) -> tuple[ResponsePosterior, tuple[ResidualTest, ...]]:
+) -> tuple[ResponsePosterior, Tests]:
     """Tangent posterior and its residual tests, with as much of a noise model as the residuals ask for.
 
     White-noise bounds around coloured residuals are far too narrow, so the data decide.
@@ -146,11 +144,11 @@ def _posterior(
     if whiteness_test(found.residuals).passed:
         posterior = tangent(used, found.model)
         return posterior, residual_tests(posterior, used)
-    best: tuple[float, ResponsePosterior, tuple[ResidualTest, ...]] | None = None
+    best: tuple[float, ResponsePosterior, Tests] | None = None
     for order in _NOISE_ORDERS if noise_order is None else (noise_order,):
         posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=True, max_ar_order=order))
         tests = residual_tests(posterior, used)
-        whiteness = next(test for test in tests if test.name == "whiteness")
+        whiteness, _ = tests
         # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
         if best is None or whiteness.probability > best[0]:
             best = (whiteness.probability, posterior, tests)

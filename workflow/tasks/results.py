@@ -221,6 +221,9 @@ class IdentifyResult:
 # Ellipses
 
 
+Tests = tuple[ResidualTest, ResidualTest]
+
+
 @dataclass(frozen=True)
 class Band:
     """Size of the ellipses in a band: major semi-axis over |G|."""
@@ -266,8 +269,9 @@ class UncertainChannel:
     """Ellipses of one channel and what the residuals say about them.
 
     nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
-    display grid; empirical: response without a model, where the records allow one; tests: of the residuals on
-    the estimation records; repeat_scatter: None without repeats; intervals: None where the method has none.
+    display grid; empirical: response without a model, where the records allow one; tests: whiteness and
+    independence of the residuals on the estimation records; repeat_scatter: None without repeats; intervals:
+    None where the method has none.
     """
 
     name: str
@@ -278,7 +282,7 @@ class UncertainChannel:
     frequency: FrequencyUncertainty
     empirical: FrequencyUncertainty | None
     bands: tuple[Band, ...]
-    tests: tuple[ResidualTest, ...]
+    tests: Tests
     agreement: NominalAgreement
     intervals: Intervals | None = None
     repeat_scatter: tuple[ScatterRow, ...] | None = None
@@ -288,10 +292,6 @@ class UncertainChannel:
         """Order of the noise model behind which the residuals were tested."""
         report = self.posterior.report
         return 0 if report is None else len(report.ar_coefficients)
-
-    def test(self, name: str) -> ResidualTest:
-        """The residual test of this name."""
-        return next(test for test in self.tests if test.name == name)
 
 
 @dataclass(frozen=True, eq=False)

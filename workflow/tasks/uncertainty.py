@@ -13,7 +13,7 @@ from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.checks.residual_tests import ResidualTest, independence_test, whiteness_test
+from ident.checks.residual_tests import independence_test, whiteness_test
 from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
@@ -33,6 +33,7 @@ from workflow.tasks.results import (
     ModeInterval,
     NominalAgreement,
     RunRecord,
+    Tests,
     UncertainChannel,
     UncertaintyResult,
 )
@@ -80,7 +81,7 @@ def uncertain_channel(
     nominal_omega: Real,
     *,
     repeat_scatter: tuple[ScatterRow, ...] | None = None,
-    tests: tuple[ResidualTest, ...] | None = None,
+    tests: Tests | None = None,
 ) -> UncertainChannel:
     """Everything said about a posterior. omega (F,): shown; nominal_omega (F,): where the nominal has to be
     right; tests: of the residuals, where they are known already."""
@@ -194,7 +195,7 @@ def agreement_of(
     )
 
 
-def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> tuple[ResidualTest, ...]:
+def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> Tests:
     """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
 
     Where the bounds have a noise model, whiteness is that of the residuals behind it: they rest on those.
