@@ -42,7 +42,7 @@ def true_response(omega):
     """Held input to hub angle of the fast arm, exactly: viscous friction is linear, so the rig carries it."""
     rig = paper_link()
     rig = rig.perturbed({"hub.viscous_friction_Nms": rig.hub.viscous_friction_Nms + 0.02})
-    arm = linear_arm(rig).to_control()
+    arm = linear_arm(rig)
     sampled = arm.sample(rig.sampling.dt_s, method="zoh")
     return sampled(np.exp(1j * omega * rig.sampling.dt_s))[0, 0]
 
