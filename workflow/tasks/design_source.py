@@ -11,6 +11,7 @@ Several sources are several plants that one controller has to serve.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -250,7 +251,11 @@ def _read_document(path: Path) -> dict[str, Any]:
     if suffix == ".npz":
         return storage.read_npz(path)
     if suffix == ".json":
-        return storage.read_json(path)
+        with naming(str(path)):
+            document = json.loads(storage.read_text(path))
+            if not isinstance(document, dict):
+                raise ValueError(f"expected a JSON object, found {type(document).__name__}")
+            return document
     if suffix != ".mat":
         raise InputError(f"{path}: not a run directory, and the ending is none of .json, .mat, .npz, .csv")
     with naming(str(path)):
