@@ -17,14 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.harness import Print, main, reading, timed
-from benchmarks.p2_plants import DT_S, Setting, draw
+from benchmarks.p2_plants import Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.posterior import ResponsePosterior
 from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
 from ident.uncertainty.nominal import nominal_near
-from tests.ident.benchmark_plants import Truth
+from tests.ident.benchmark_plants import DT_S, Truth
 
 OMEGA = np.geomspace(0.3, 300.0, 150)
 BANDS = ((0.3, 1), (1, 5), (5, 13), (13, 19), (19, 55), (55, 85), (66, 72), (85, 150), (150, 190), (190, 301))

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import signal
-from scipy.linalg import block_diag
 
-from tests.ident.benchmark_plants import DT_S, Truth, as_record, run
+from tests.ident.benchmark_plants import Truth, as_record, p2_system, run
 
 # Three modes, then the two of the variant with five: frequency [Hz], damping ratio, gain.
 MODES = (
@@ -39,23 +38,6 @@ class Setting:
     noise_pole: float = 0.0
 
 
-def system(slow_per_s: float, fast_per_s: float, omega_rad_s: np.ndarray, zeta: np.ndarray, gain: np.ndarray):
-    """A, B, C, D after the hold, modes (M,); modal states, so that nothing is lost to companion forms."""
-    blocks = [np.array([[-slow_per_s]])]
-    drive, out = [1.0], [1.0]
-    for w, z, c in zip(omega_rad_s, zeta, gain, strict=True):
-        blocks.append(np.array([[0.0, w], [-w, -2 * z * w]]))
-        drive += [0.0, w]
-        out += [c, 0.0]
-    n = len(drive)
-    A = np.zeros((n + 1, n + 1))
-    A[:n, :n] = block_diag(*blocks)
-    A[:n, n] = drive
-    A[n, n] = -fast_per_s
-    B = fast_per_s * np.eye(n + 1)[:, n:]
-    return signal.cont2discrete((A, B, np.append(out, 0.0)[None, :], np.zeros((1, 1))), DT_S)[:4]
-
-
 def draw(setting: Setting, rng: np.random.Generator) -> Truth:
     """A run of this setting; everything random comes from rng."""
     modes = np.array(MODES[: setting.n_modes])
@@ -67,7 +49,7 @@ def draw(setting: Setting, rng: np.random.Generator) -> Truth:
         slow *= np.exp(rng.uniform(-0.5, 0.5))
         fast *= np.exp(rng.uniform(-0.3, 0.3))
         gain = gain * np.exp(np.concatenate([rng.uniform(-0.4, 0.4, 3), np.zeros(gain.size - 3)]))
-    plant = system(slow, fast, 2 * np.pi * hertz, zeta, gain)
+    plant = p2_system(slow, fast, 2 * np.pi * hertz, zeta, gain)
     before = 0 if setting.from_rest else _BEFORE
     total = before + setting.n_samples
     u = np.repeat(rng.choice([-1.0, 1.0], total // 2 + 2), 2)[rng.integers(0, 2) :][:total]

@@ -90,23 +90,26 @@ P2_HZ = (2.5, 11.0, 27.0)
 P2_ZETA = (0.015, 0.015, 0.02)
 
 
-def p2(seed, n_samples=2000, snr_db=35):
-    """Three modes and two slow real poles, random binary input held two samples."""
-    blocks, B, C = [np.array([[-0.1]])], [1.0], [1.0]
-    for hertz, zeta, gain in zip(P2_HZ, P2_ZETA, (-0.02, 0.0045, -0.0016), strict=True):
-        w = 2 * np.pi * hertz
-        blocks.append(np.array([[0, w], [-w, -2 * zeta * w]]))
-        B += [0.0, w]
-        C += [gain, 0.0]
-    n = len(B)
+def p2_system(slow_per_s, fast_per_s, omega_rad_s, zeta, gain):
+    """A, B, C, D of b/(s+b) [1/(s+a) + sum c_i w_i^2/(s^2 + 2 z_i w_i s + w_i^2)] after the hold, modes (M,);
+    modal states, so that nothing is lost to companion forms."""
+    blocks, drive, out = [np.array([[-slow_per_s]])], [1.0], [1.0]
+    for w, z, c in zip(omega_rad_s, zeta, gain, strict=True):
+        blocks.append(np.array([[0.0, w], [-w, -2 * z * w]]))
+        drive += [0.0, w]
+        out += [c, 0.0]
+    n = len(drive)
     A = np.zeros((n + 1, n + 1))
     A[:n, :n] = scipy.linalg.block_diag(*blocks)
-    A[:n, n] = B
-    A[n, n] = -25.0
-    drive, out = np.zeros((n + 1, 1)), np.zeros((1, n + 1))
-    drive[n, 0] = 25.0
-    out[0, :n] = C
-    system = scipy.signal.cont2discrete((A, drive, out, np.zeros((1, 1))), DT_S)[:4]
+    A[:n, n] = drive
+    A[n, n] = -fast_per_s
+    B = fast_per_s * np.eye(n + 1)[:, n:]
+    return scipy.signal.cont2discrete((A, B, np.append(out, 0.0)[None, :], np.zeros((1, 1))), DT_S)[:4]
+
+
+def p2(seed, n_samples=2000, snr_db=35):
+    """Three modes and two slow real poles, random binary input held two samples."""
+    system = p2_system(0.1, 25.0, 2 * np.pi * np.array(P2_HZ), P2_ZETA, (-0.02, 0.0045, -0.0016))
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.integers(0, 2, n_samples) * 2.0 - 1, 2)[rng.integers(0, 2) :][:n_samples]
     return _truth(system, u, snr_db, rng, f"P2 {seed}")

@@ -15,7 +15,8 @@ from ident.identify import identify
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
 
-from .three_mode_arm import BANDS, DT, OMEGA, per_band, random_arm
+from .benchmark_plants import DT_S as DT
+from .three_mode_arm import BANDS, OMEGA, per_band, random_arm
 
 
 def slightly_wrong_model(arm, rng, size):

@@ -22,7 +22,8 @@ from ident.uncertainty.embedding_algebra import (
 from ident.uncertainty.embedding_rows import EmbeddingRows
 from ident.uncertainty.residual_noise import Absorbed, gls_residuals
 
-from .three_mode_arm import DT, random_arm
+from .benchmark_plants import DT_S as DT
+from .three_mode_arm import random_arm
 
 FILTERS = [np.array([1.0, -0.9]), np.array([1.0, -1.2, 0.6]), np.array([1.0, -0.5, 0.1, -0.3, 0.2])]
 

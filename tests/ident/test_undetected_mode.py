@@ -27,7 +27,8 @@ from ident.uncertainty.undetected_mode import (
     with_pairs,
 )
 
-from .three_mode_arm import DT, OMEGA, random_arm
+from .benchmark_plants import DT_S as DT
+from .three_mode_arm import OMEGA, random_arm
 
 REAL = (0.8, 0.3)
 PAIR = 0.9 * np.exp(0.4j)
