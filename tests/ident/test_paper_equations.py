@@ -1,17 +1,14 @@
 """Equations (1) to (31) of Ziaei & Wang 2006: the function that is each of them, and the test that checks it.
 
-`EQUATIONS` is the table; the first tests walk it, so that a function or a test that moves is missed at once.
+`EQUATIONS` is the table; what moves is missed where it is imported, what loses its test in the first test.
 Reading the printed text: (8) and (9) are about squared moduli, the first entry of (19) is negative (otherwise
 (15) fails), and gamma of (29) is |xi|^2 in (0, 1), Fig. 1's axis being -gamma.
 """
 
 from __future__ import annotations
 
-import ast
-import pkgutil
+import re
 import typing
-from dataclasses import dataclass
-from pathlib import Path
 
 import nlopt
 import numpy as np
@@ -22,7 +19,9 @@ import scipy.signal
 
 from ident.basis.coordinates import search_space
 from ident.basis.functions import (
+    all_pass_response,
     basis_response,
+    basis_state_space,
     block_parameters,
     regressor,
 )
@@ -32,9 +31,13 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.record import Record
 from ident.fit.least_squares import fit
+from ident.fit.problem import CandidateCost
 from ident.fit.regression import prepare
+from ident.identify import identify
 from ident.search.direct import minimise
 from ident.search.error_surface import error_surface
+from ident.search.pole_search import PoleSearch
+from tests.ident import test_basis, test_error_surface, test_least_squares, test_model, test_pole_search
 from tests.ident.paper_oracles import (
     combination,
     complex_realisation,
@@ -48,223 +51,105 @@ from tests.ident.paper_oracles import (
 )
 from validation.comparators.comparators import arx
 
-HERE = Path(__file__).parent
 DT_S = 0.005
 MIXED = Poles([0.5, 0.9, -0.3], [0.8 * np.exp(0.4j), 0.95 * np.exp(2.0j)])
 Z = np.exp(1j * np.array([0.05, 0.3, 1.1, 2.0, 3.1]))
 DIRECT = [name for name in typing.get_args(Algorithm) if "DIRECT" in name]
 
 
-@dataclass(frozen=True)
-class Equation:
-    """`functions` are dotted names, `tests` "file::test" below tests/ident ("" is this file)."""
-
-    numbers: tuple[int, ...]
-    says: str
-    functions: tuple[str, ...]
-    tests: tuple[str, ...]
-
-
+# What each equation says, the functions that are it, and its tests in other files; those in this file have
+# its number in their names.
 EQUATIONS = (
-    Equation(
-        (1,),
-        "y = G(q) u + v, G a sum of delays",
-        ("ident.basis.model.GobfModel.simulate",),
-        ("::test_1_output_is_the_convolution_with_the_impulse_response",),
-    ),
-    Equation(
-        (2,),
-        "FIR: the sum cut off",
-        ("validation.comparators.comparators.arx", "ident.basis.functions.regressor"),
-        ("::test_2_zero_poles_are_the_fir_model", "test_basis.py::test_fir_is_delay"),
-    ),
-    Equation(
+    ((1,), "y = G(q) u + v, G a sum of delays", [GobfModel.simulate], []),
+    ((2,), "FIR: the sum cut off", [arx, regressor], [test_basis.test_fir_is_delay]),
+    (
         (3,),
         "y = sum theta_i L_i(q) u",
-        ("ident.basis.model.GobfModel.frequency_response", "ident.basis.model.GobfModel.simulate"),
-        (
-            "::test_3_model_is_the_weighted_sum_of_its_functions",
-            "test_model.py::test_simulation_agrees_with_control",
-        ),
+        [GobfModel.frequency_response, GobfModel.simulate],
+        [test_model.test_simulation_agrees_with_control],
     ),
-    Equation(
+    (
         (4,),
         "orthonormal on the unit circle",
-        ("ident.basis.functions.basis_response",),
-        ("test_basis.py::test_basis_is_orthonormal_on_the_circle", "test_basis.py::test_kernel_identity"),
+        [basis_response],
+        [test_basis.test_basis_is_orthonormal_on_the_circle, test_basis.test_kernel_identity],
     ),
-    Equation(
+    (
         (5,),
         "the generalised basis",
-        (
-            "ident.basis.functions.basis_response",
-            "ident.basis.functions.all_pass_response",
-            "tests.ident.paper_oracles.complex_realisation",
-        ),
-        (
-            "test_basis.py::test_real_poles_give_the_printed_formula",
-            "test_basis.py::test_paper_complex_states_are_the_printed_functions",
-            "::test_5_6_fir_laguerre_and_kautz_are_one_code_path",
-        ),
+        [basis_response, all_pass_response, complex_realisation],
+        [
+            test_basis.test_real_poles_give_the_printed_formula,
+            test_basis.test_paper_complex_states_are_the_printed_functions,
+        ],
     ),
-    Equation(
+    (
         (6,),
         "Laguerre: one real pole repeated",
-        ("ident.basis.functions.basis_response", "ident.basis.functions.regressor"),
-        (
-            "::test_5_6_fir_laguerre_and_kautz_are_one_code_path",
-            "test_basis.py::test_laguerre_by_transfer_functions",
-        ),
+        [basis_response, regressor],
+        [test_basis.test_laguerre_by_transfer_functions],
     ),
-    Equation(
-        (7,),
-        "real pair as combinations of the complex functions",
-        ("tests.ident.paper_oracles.combination",),
-        ("::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",),
-    ),
-    Equation(
-        (8, 9, 10),
-        "the combination is unitary",
-        ("tests.ident.paper_oracles.combination",),
-        ("::test_8_to_10_combination_is_unitary_for_every_solution",),
-    ),
-    Equation(
-        (11, 12),
-        "each function from the one before",
-        ("ident.basis.functions.basis_response", "tests.ident.paper_oracles.complex_realisation"),
-        ("::test_11_12_functions_follow_from_the_one_before",),
-    ),
-    Equation(
-        (13,),
-        "real numerator m1 q + m2 behind the all-pass of the poles before",
-        ("tests.ident.paper_oracles.pair_response", "tests.ident.paper_oracles.combination"),
-        (
-            "::test_7_13_combinations_of_the_complex_functions_are_the_real_ones",
-            "::test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles",
-        ),
-    ),
-    Equation(
-        (14, 15, 16),
-        "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M",
-        ("tests.ident.paper_oracles.pair_metric", "tests.ident.paper_oracles.pair_response"),
-        (
-            "test_real_pair.py::test_solutions_satisfy_the_constraints",
-            "test_real_pair.py::test_constraints_make_the_pair_orthonormal",
-            "test_real_pair.py::test_wrong_numerators_are_refused",
-        ),
-    ),
-    Equation(
-        (17,),
-        "x_2 from x_1 by a quarter turn in the space of M",
-        ("tests.ident.paper_oracles.rotated_numerators",),
-        ("::test_17_second_numerator_is_the_quarter_turn",),
-    ),
-    Equation(
-        (18, 19),
-        "the solution with m2 = 0",
-        ("tests.ident.paper_oracles.paper_numerators",),
-        (
-            "::test_18_19_solution_with_m2_zero",
-            "test_real_pair.py::test_every_solution_gives_the_same_fit",
-            "::test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles",
-        ),
-    ),
-    Equation(
+    ((7,), "real pair as combinations of the complex functions", [combination], []),
+    ((8, 9, 10), "the combination is unitary", [combination], []),
+    ((11, 12), "each function from the one before", [basis_response, complex_realisation], []),
+    ((13,), "m1 q + m2 behind the all-pass of the poles before", [pair_response, combination], []),
+    ((14, 15, 16), "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M", [pair_metric, pair_response], []),
+    ((17,), "x_2 from x_1 by a quarter turn in the space of M", [rotated_numerators], []),
+    ((18, 19), "the solution with m2 = 0", [paper_numerators], []),
+    (
         (20,),
         "J, the mean square of the residual",
-        ("ident.fit.least_squares.fit", "ident.search.error_surface.error_surface"),
-        (
-            "::test_20_cost_is_the_mean_square_residual",
-            "test_error_surface.py::test_surface_is_the_fit_at_every_point",
-        ),
+        [fit, error_surface],
+        [test_error_surface.test_surface_is_the_fit_at_every_point],
     ),
-    Equation(
-        (21,),
-        "linear regression phi' theta",
-        ("ident.basis.functions.regressor", "ident.basis.model.GobfModel.simulate"),
-        ("::test_21_output_is_linear_in_the_coefficients",),
-    ),
-    Equation(
-        (22,),
-        "difference equations of the states",
-        ("tests.ident.paper_oracles.complex_realisation", "ident.basis.functions.regressor"),
-        ("::test_22_difference_equations_give_the_printed_functions",),
-    ),
-    Equation(
-        (23, 24),
-        "E x(k+1) = A x + B u, solved for x(k+1)",
-        ("tests.ident.paper_oracles.complex_realisation",),
-        ("::test_23_24_matrices_are_the_printed_ones",),
-    ),
-    Equation(
+    ((21,), "linear regression phi' theta", [regressor, GobfModel.simulate], []),
+    ((22,), "difference equations of the states", [complex_realisation, regressor], []),
+    ((23, 24), "E x(k+1) = A x + B u, solved for x(k+1)", [complex_realisation], []),
+    (
         (25, 26),
         "real states by the block diagonal T",
-        ("tests.ident.paper_oracles.real_realisation", "ident.basis.functions.basis_state_space"),
-        (
-            "test_basis.py::test_paper_state_space_gives_the_same_basis",
-            "::test_25_26_transformation_keeps_the_space",
-            "test_basis.py::test_realisation_is_lossless_next_to_the_circle",
-        ),
+        [real_realisation, basis_state_space],
+        [
+            test_basis.test_paper_state_space_gives_the_same_basis,
+            test_basis.test_realisation_is_lossless_next_to_the_circle,
+        ],
     ),
-    Equation(
+    (
         (27,),
         "least-squares coefficients",
-        ("ident.fit.least_squares.fit",),
-        (
-            "::test_27_least_squares_solves_the_normal_equations",
-            "test_least_squares.py::test_fit_is_the_dense_least_squares_fit",
-        ),
+        [fit],
+        [test_least_squares.test_fit_is_the_dense_least_squares_fit],
     ),
-    Equation(
+    (
         (28, 29),
         "filter parameters eta, beta and gamma",
-        ("ident.basis.coordinates.search_space", "ident.basis.functions.block_parameters"),
-        (
-            "::test_28_29_filter_parameters_and_poles_correspond",
-            "test_pole_search.py::test_points_of_the_cube_are_ordered_poles_inside_the_circle",
-        ),
+        [search_space, block_parameters],
+        [test_pole_search.test_points_of_the_cube_are_ordered_poles_inside_the_circle],
     ),
-    Equation(
+    (
         (30,),
         "cost over eta with the coefficients fitted every time",
-        (
-            "ident.fit.problem.CandidateCost.rss",
-            "ident.search.pole_search.PoleSearch.joint",
-            "ident.identify.identify",
-        ),
-        (
-            "::test_30_cost_of_eta_is_that_of_the_fitted_coefficients",
-            "test_pole_search.py::test_paper_coordinates_can_be_chosen",
-        ),
+        [CandidateCost.rss, PoleSearch.joint, identify],
+        [test_pole_search.test_paper_coordinates_can_be_chosen],
     ),
-    Equation(
+    (
         (31,),
         "bounded global minimisation: DIRECT in all variants",
-        ("ident.search.direct.minimise",),
-        (
-            "::test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum",
-            "::test_31_all_variants_of_nlopt_are_there",
-            "::test_31_a_search_that_nlopt_breaks_off_keeps_what_it_found",
-            "test_pole_search.py::test_every_variant_of_direct_finds_the_lowest_of_many_minima",
-        ),
+        [minimise],
+        [test_pole_search.test_every_variant_of_direct_finds_the_lowest_of_many_minima],
     ),
 )
 
 
-def test_table_covers_the_equations_in_order():
-    assert [n for entry in EQUATIONS for n in entry.numbers] == list(range(1, 32))
-
-
-@pytest.mark.parametrize("entry", EQUATIONS, ids=lambda entry: f"({entry.numbers[0]})")
-def test_functions_and_tests_of_the_table_exist(entry):
-    for name in entry.functions:
-        found = pkgutil.resolve_name(name)
-        assert callable(found), name
-        assert found.__doc__, f"{name} has no contract"
-    for name in entry.tests:
-        file, test = name.split("::")
-        tree = ast.parse((HERE / (file or Path(__file__).name)).read_text(encoding="utf-8"))
-        assert test in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, name
+def test_every_equation_has_a_function_with_a_contract_and_a_test():
+    assert [number for numbers, *_ in EQUATIONS for number in numbers] == list(range(1, 32))
+    ranges = re.findall(
+        r"(?<=_)(\d+)(?:_to_(\d+))?(?=_)", " ".join(name for name in globals() if name.startswith("test_"))
+    )
+    tested = {number for low, high in ranges for number in range(int(low), int(high or low) + 1)}
+    for numbers, says, functions, elsewhere in EQUATIONS:
+        assert all(function.__doc__ for function in functions), says
+        assert elsewhere or tested.issuperset(numbers), says
 
 
 def record(u: np.ndarray, y: np.ndarray) -> Record:
@@ -398,6 +283,36 @@ def test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles(first, se
         signal = scipy.signal.lfilter(denominator[::-1], denominator, signal)
     theirs = np.column_stack(columns)
     np.testing.assert_allclose(theirs @ np.linalg.lstsq(theirs, y)[0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("pole", PAIRS)
+@pytest.mark.parametrize("solution", SOLUTIONS)
+def test_14_15_solutions_satisfy_the_constraints(pole, solution):
+    x1, x2 = SOLUTIONS[solution](pole)
+    metric, target = pair_metric(pole), abs(1 - pole**2) ** 2
+    assert x1 @ metric @ x1 == pytest.approx(target, rel=1e-10)  # (14)
+    assert x2 @ metric @ x2 == pytest.approx(target, rel=1e-10)
+    assert abs(x1 @ metric @ x2) <= 1e-10 * target  # (15)
+
+
+@pytest.mark.parametrize("solution", SOLUTIONS)
+def test_14_to_16_constraints_make_the_pair_orthonormal(solution):
+    pole = 0.9 * np.exp(0.3j)
+    circle = np.exp(2j * np.pi * np.arange(4096) / 4096)
+    values = pair_response(pole, *SOLUTIONS[solution](pole), circle)
+    np.testing.assert_allclose(values.conj().T @ values / 4096, np.eye(2), atol=1e-12)
+
+
+def test_14_to_16_wrong_numerators_are_refused():
+    with pytest.raises(ValueError, match="do not satisfy"):
+        pair_response(0.5j, np.array([1.0, 0.0]), np.array([1.0, 0.0]), np.array([1.0 + 0j]))
+
+
+def test_13_kautz_solution_is_the_basis():
+    pole, z = 0.9 * np.exp(0.3j), np.exp(1j * np.linspace(0, 3, 20))
+    np.testing.assert_allclose(
+        pair_response(pole, *kautz_numerators(pole), z), basis_response(Poles([], [pole]), z), rtol=1e-11
+    )
 
 
 @pytest.mark.parametrize("pole", PAIRS)
