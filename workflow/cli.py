@@ -52,7 +52,7 @@ app = typer.Typer(
 
 Jobs = Annotated[
     int | None,
-    typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
+    typer.Option(help="Processes on this machine [default: one per processor]"),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
@@ -76,16 +76,11 @@ def _root(
 def run(
     config: Annotated[
         Path | None,
-        typer.Option(
-            help="TOML file (see examples/ and README); without it the built-in default arm.",
-            show_default=False,
-        ),
+        typer.Option(help="TOML file (see examples/ and README); without it the built-in default arm."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Run directory, new or empty [default: runs/<name>-<date>-<time>]", show_default=False
-        ),
+        typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]"),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in --out; finished stages are taken up.")
@@ -135,44 +130,36 @@ def identify(
     ],
     input_name: Annotated[str, typer.Option("--input", help="Name of the input column.")],
     output_name: Annotated[str, typer.Option("--output", help="Name of the output column.")],
-    time: Annotated[
-        str | None, typer.Option(help="Name of the time column; this or --dt-s.", show_default=False)
-    ] = None,
+    time: Annotated[str | None, typer.Option(help="Name of the time column; this or --dt-s.")] = None,
     time_unit: Annotated[
         str | None,
         typer.Option(
             help="Unit of the time column: s, ms, us, ns, min, h [default: as in its name ('t_ms', "
-            "'Zeit [ms]'), else s]",
-            show_default=False,
+            "'Zeit [ms]'), else s]"
         ),
     ] = None,
-    dt_s: Annotated[
-        float | None, typer.Option(help="Sampling period [s], if there is no --time.", show_default=False)
-    ] = None,
+    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s], if there is no --time.")] = None,
     report_page: Annotated[
         Path | None,
         typer.Option(
             "--report",
             help="Write a one-page report here (HTML, one file): findings in words, then the pictures.",
-            show_default=False,
         ),
     ] = None,
     validation: Annotated[
-        list[Path] | None, typer.Option(help="Log kept for validation (repeatable).", show_default=False)
+        list[Path] | None, typer.Option(help="Log kept for validation (repeatable).")
     ] = None,
     reference: Annotated[
         str | None,
-        typer.Option(
-            help="Reference column of logs made in closed loop: identified in two stages.", show_default=False
-        ),
+        typer.Option(help="Reference column of logs made in closed loop: identified in two stages."),
     ] = None,
     pairs: Annotated[
         int | None,
-        typer.Option(min=0, max=12, help="Pole pairs [default: from the data]", show_default=False),
+        typer.Option(min=0, max=12, help="Pole pairs [default: from the data]"),
     ] = None,
     real: Annotated[
         int | None,
-        typer.Option(min=0, max=8, help="Real poles [default: from the data]", show_default=False),
+        typer.Option(min=0, max=8, help="Real poles [default: from the data]"),
     ] = None,
     integrators: Annotated[int, typer.Option(min=0, max=3, help="Known poles at z = 1.")] = 0,
     delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
@@ -181,16 +168,14 @@ def identify(
         str | None,
         typer.Option(
             help="Known excess of poles over zeros of the continuous plant, 1 to 6, or 'auto': the largest "
-            "of 1 to 3 that the data do not refuse.",
-            show_default=False,
+            "of 1 to 3 that the data do not refuse."
         ),
     ] = None,
     level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
     band: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            help="Fit inside this band only [rad/s, low and high]: leaves out drift and friction below.",
-            show_default=False,
+            help="Fit inside this band only [rad/s, low and high]: leaves out drift and friction below."
         ),
     ] = None,
     noise: Annotated[
@@ -206,32 +191,22 @@ def identify(
             min=1,
             max=100,
             help="Largest order of the noise model behind the ellipses [default: 8, or 32 where needed]",
-            show_default=False,
         ),
     ] = None,
-    omega_min: Annotated[
-        float | None, typer.Option(help="No pole pair below [rad/s].", show_default=False)
-    ] = None,
-    omega_max: Annotated[
-        float | None, typer.Option(help="No pole pair above [rad/s].", show_default=False)
-    ] = None,
-    zeta_min: Annotated[
-        float | None, typer.Option(help="Least damping ratio of a pole pair.", show_default=False)
-    ] = None,
-    zeta_max: Annotated[
-        float | None, typer.Option(help="Largest damping ratio of a pole pair.", show_default=False)
-    ] = None,
+    omega_min: Annotated[float | None, typer.Option(help="No pole pair below [rad/s].")] = None,
+    omega_max: Annotated[float | None, typer.Option(help="No pole pair above [rad/s].")] = None,
+    zeta_min: Annotated[float | None, typer.Option(help="Least damping ratio of a pole pair.")] = None,
+    zeta_max: Annotated[float | None, typer.Option(help="Largest damping ratio of a pole pair.")] = None,
     export: Annotated[
         Path | None,
         typer.Option(
             help="Write the model here for other programs: .json or .mat by the ending (state space, poles, "
-            "ellipses).",
-            show_default=False,
+            "ellipses)."
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Write model and posterior here (npz), for `flexlink design`.", show_default=False),
+        typer.Option(help="Write model and posterior here (npz), for `flexlink design`."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -298,7 +273,6 @@ def design(
             help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis], "
             "[certificate], [achievable_performance], [reference_filter] where needed; for a run directory "
             "its own if left out.",
-            show_default=False,
         ),
     ] = None,
     out: Annotated[
@@ -306,8 +280,7 @@ def design(
         typer.Option(
             help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99, "
             "with its header); or into a directory, as controller.json, .c and .h; "
-            "a reference filter beside it, as NAME_reference_filter.",
-            show_default=False,
+            "a reference filter beside it, as NAME_reference_filter."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
@@ -343,8 +316,7 @@ def study(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            help="Compute the points on a Dask cluster, e.g. tcp://host:8786 (extra 'distributed').",
-            show_default=False,
+            help="Compute the points on a Dask cluster, e.g. tcp://host:8786 (extra 'distributed')."
         ),
     ] = None,
     resume: Annotated[
@@ -382,8 +354,7 @@ def diagnose(
         str | None,
         typer.Option(
             help="Rig file in the case folder, e.g. rig_uncertain.toml [default: what the case file names, "
-            "or rig.toml]",
-            show_default=False,
+            "or rig.toml]"
         ),
     ] = None,
     jobs: Jobs = None,
