@@ -1,9 +1,9 @@
-"""Logs taken in closed loop with a known reference: feedback check, two-stage and indirect identification."""
+"""Logs taken in closed loop with a known reference: two-stage and indirect identification."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,58 +19,6 @@ from ident.uncertainty.embedding import EmbeddingOptions, tangent
 
 # A first stage that explains less of the input than this has gone wrong.
 _EXPLAINED_PERCENT = 50.0
-
-
-@dataclass(frozen=True)
-class FeedbackCheck:
-    """Whether the log obeys u(k) = reference_gain r(k) - feedback_gain y(k) + offset at the same sample.
-
-    largest_error is in input units, over all records; exact when it is within `tolerance`.
-    """
-
-    reference_gain: float
-    feedback_gain: float
-    offset: float
-    largest_error: float
-    tolerance: float
-    exact: bool
-
-    @property
-    def finding(self) -> Finding:
-        return finding(FindingKind.FEEDBACK, **asdict(self))
-
-
-def check_feedback(
-    records: Sequence[Record],
-    *,
-    tolerance: float,
-    reference_gain: float | None = None,
-    feedback_gain: float | None = None,
-) -> FeedbackCheck:
-    """Test a proportional feedback of the (single) output against the log.
-
-    Gains not given are estimated by least squares from all records together. tolerance (input units) is what
-    rounding in the log explains, e.g. half a count. Raises ValueError when a record has not exactly one
-    reference, input and output.
-    """
-    for record in records:
-        _reference(record)
-    u = np.concatenate([record.input[:, 0] for record in records])
-    y = np.concatenate([record.output[:, 0] for record in records])
-    r = np.concatenate([_reference(record) for record in records])
-    known = np.zeros(u.size)
-    free = [np.ones(u.size)]
-    for gain, signal in ((reference_gain, r), (feedback_gain, -y)):
-        if gain is None:
-            free.append(signal)
-        else:
-            known += gain * signal
-    solution, *_ = np.linalg.lstsq(np.column_stack(free), u - known, rcond=None)
-    estimated = [float(value) for value in solution[1:]]
-    a = reference_gain if reference_gain is not None else estimated.pop(0)
-    g = feedback_gain if feedback_gain is not None else estimated.pop(0)
-    error = float(np.abs(u - a * r + g * y - solution[0]).max())
-    return FeedbackCheck(float(a), float(g), float(solution[0]), error, float(tolerance), error <= tolerance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,6 @@ class FindingKind(Enum):
     CHI_SQUARE = auto()
     INVALIDATION = auto()
     # Records made in closed loop.
-    FEEDBACK = auto()
     TWO_STAGE = auto()
     UNEXPLAINED_INPUT = auto()
     FIRST_STAGE_ERROR = auto()

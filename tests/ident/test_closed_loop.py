@@ -1,4 +1,4 @@
-"""Closed-loop logs: feedback check, bias of the direct method, two-stage and indirect without it."""
+"""Closed-loop logs: bias of the direct method, two-stage and indirect without it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from ident.basis.options import IdentOptions
-from ident.closed_loop import check_feedback, indirect, two_stage
+from ident.closed_loop import indirect, two_stage
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.identify import identify
@@ -32,16 +32,6 @@ def log(rng, noise=0.3, n=3000):
     return Record(
         "log", u[:, None], y[:, None], DT, ("u",), ("y",), reference=r[:, None], reference_names=("r",)
     )
-
-
-def test_feedback_check_estimates_the_law_and_notices_when_it_does_not_hold():
-    records = [log(np.random.default_rng(seed), n=400) for seed in range(2)]
-    found = check_feedback(records, tolerance=1e-9)
-    assert found.exact
-    assert (found.reference_gain, found.feedback_gain) == pytest.approx((1.0, GAIN), rel=1e-9)
-    assert check_feedback(records, tolerance=1e-9, reference_gain=1.0, feedback_gain=GAIN).exact
-    wrong = check_feedback(records, tolerance=1e-9, feedback_gain=GAIN + 0.1)
-    assert not wrong.exact
 
 
 def test_two_stage_is_free_of_the_direct_method_s_bias():
@@ -119,7 +109,5 @@ def test_indirect_map_of_centre_and_of_a_small_ellipse():
 def test_records_without_reference_are_refused():
     record = log(np.random.default_rng(4), n=100)
     bare = Record("b", record.input, record.output, DT, ("u",), ("y",))
-    with pytest.raises(ValueError, match="exactly one reference"):
-        check_feedback([bare], tolerance=1.0)
     with pytest.raises(ValueError, match="exactly one reference"):
         two_stage([bare], OPTIONS)

@@ -11,7 +11,7 @@ import scipy.signal
 from ident.basis.functions import free_response
 from ident.basis.options import IdentOptions
 from ident.checks.validation import fit_on_fresh_data, repeat_scatter
-from ident.closed_loop import check_feedback, two_stage
+from ident.closed_loop import two_stage
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.record import Record
@@ -23,7 +23,6 @@ from ident.uncertainty.conditions import combine_posteriors, record_posteriors
 from ident.uncertainty.embedding import EmbeddingOptions
 
 HZ = 2 * np.pi
-COUNTS_PER_RAD = 1024 / (2 * np.pi)
 
 
 def percent(y, residual):
@@ -164,14 +163,6 @@ def test_emps_time_stamps_jitter_within_the_tolerance(flexlink_data):
     )
     assert record.dt_s == pytest.approx(1e-3, rel=1e-6)
     assert record.n_samples == 24841
-
-
-@pytest.mark.slow
-def test_single_link_feedback_is_exact(sweeps):
-    check = check_feedback(channel(sweeps, "theta_rad"), tolerance=1e-3)
-    assert check.exact
-    assert check.reference_gain == pytest.approx(COUNTS_PER_RAD, rel=1e-5)
-    assert check.feedback_gain == pytest.approx(COUNTS_PER_RAD, rel=1e-5)
 
 
 # Weighting of the pole search per channel: the hub angle falls by 80 from 1 to 18 Hz, so its 17.9 Hz mode

@@ -69,12 +69,6 @@ VALUES = {
     "expected": 6,
     "worst_rad_s": 50.123,
     "worst_distance": 3.21,
-    "reference_gain": 1.0,
-    "feedback_gain": 2.5,
-    "offset": 0.1,
-    "largest_error": 0.3,
-    "tolerance": 0.01,
-    "exact": False,
     "least_percent": 90.0,
     "most_percent": 95.0,
     "explained_percent": 12.3,
@@ -94,7 +88,6 @@ OTHERWISE = {
     "NOT_WHITE": [{"independent": False}, {"noise_order": 8}, {"noise_order": 8, "independent": False}],
     "CHI_SQUARE": [{"chi_square": 100.0}, {"chi_square": 400.0}],
     "INVALIDATION": [{"invalidated": True}, {"outside": 2}],
-    "FEEDBACK": [{"exact": True}],
 }
 
 
