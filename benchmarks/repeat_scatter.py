@@ -27,7 +27,7 @@ from ident.closed_loop import indirect, two_stage
 from ident.data.frf_records import FrfRepeats
 from ident.frequency_fit import FrfIdentification, identify_frf
 from ident.uncertainty import FrequencyUncertainty
-from ident.uncertainty.conditions import combine_posteriors, combine_responses, record_posteriors
+from ident.uncertainty.conditions import combine_posteriors, record_posteriors
 from ident.uncertainty.embedding import EmbeddingOptions
 from workflow.text.templates import words
 
@@ -187,9 +187,9 @@ def kyoto(path: Path, say: Print) -> None:
         for other in dates[i + 1 :]:
             inside = together(means[date], means[other])
             say(f"{f'{date} and {other}':<46}{share(inside, omega)}")
-    say("\nDays as conditions (combine_responses over the other three dates; widening for few needs four):")
+    say("\nDays as conditions (scatter of the other three dates; widening for few needs four):")
     for date in dates:
-        others = combine_responses([means[other] for other in dates if other != date])
+        others = conditions([means[other] for other in dates if other != date])
         inside = together(others, means[date])
         say(f"{f'three dates -> {date}':<46}{share(inside, omega)}")
     days(plant, say)
@@ -271,6 +271,16 @@ def scatter_ratios(
         f"expected 1; 95 % interval {low:.2f} - {high:.2f} if a run's error is one gain for all frequencies "
         "(F with one degree of freedom per run and date), narrower the less frequencies move together"
     )
+
+
+def conditions(means: Sequence[FrequencyUncertainty]) -> FrequencyUncertainty:
+    """What `combine_posteriors` makes of posteriors, frequency by frequency."""
+    centres, count = np.stack([mean.centre for mean in means]), len(means)
+    apart = centres - centres.mean(axis=0)
+    pair = np.stack([apart.real, apart.imag])
+    between = (1 + 1 / count) / (count - 1) * np.einsum("akf,bkf->fab", pair, pair)
+    within = np.mean([mean.covariance for mean in means], axis=0) / count
+    return replace(means[0], centre=centres.mean(axis=0), covariance=between + within)
 
 
 def together(one: FrequencyUncertainty, other: FrequencyUncertainty) -> np.ndarray:

@@ -15,7 +15,6 @@ import numpy as np
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
 from ident.data.ellipses import hotelling_widening
-from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.uncertainty.embedding import EmbeddingOptions, common_fir_length, tangent
 
@@ -82,34 +81,6 @@ def combine_posteriors(
     )
     factor = np.asarray(np.linalg.qr(np.hstack([between, within]).T, mode="r")).T
     return replace(first, mean=mean, covariance_factor=factor, report=report)
-
-
-def combine_responses(
-    responses: Sequence[FrequencyUncertainty], *, small_sample_level: float | None = None
-) -> FrequencyUncertainty:
-    """The same for frequency responses of any origin on one grid, frequency by frequency.
-
-    Raises ValueError when there are fewer than two or their grids or sampling times differ.
-    """
-    if len(responses) < 2:
-        raise ValueError(f"a scatter between conditions needs at least two; got {len(responses)}")
-    first = responses[0]
-    for other in responses[1:]:
-        if not np.array_equal(first.omega_rad_s, other.omega_rad_s) or first.dt_s != other.dt_s:
-            raise ValueError("the responses are on different frequency grids or sampling times")
-    count = len(responses)
-    centres = np.stack([response.centre for response in responses])
-    deviation = centres - centres.mean(axis=0)
-    pair = np.stack([deviation.real, deviation.imag])
-    factor = _widening(count, small_sample_level) * (1 + 1 / count) / (count - 1)
-    between = factor * np.einsum("akf,bkf->fab", pair, pair)
-    within = np.mean([response.covariance for response in responses], axis=0) / count
-    return replace(
-        first,
-        centre=centres.mean(axis=0),
-        covariance=between + within,
-        method=f"{first.method}, {count} conditions",
-    )
 
 
 def _widening(count: int, level: float | None) -> float:
