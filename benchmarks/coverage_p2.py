@@ -21,7 +21,7 @@ from benchmarks.p2_plants import Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.posterior import ResponsePosterior
-from ident.uncertainty import FrequencyUncertainty
+from ident.uncertainty import FrequencyUncertainty, offset_disc_radius
 from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
 from ident.uncertainty.nominal import nominal_near
 from tests.ident.benchmark_plants import DT_S, Truth
@@ -127,7 +127,7 @@ def with_joint(outcome: Outcome, posterior: ResponsePosterior, truth: np.ndarray
 
 def disc_outcome(nominal: np.ndarray, ellipses: FrequencyUncertainty, truth: np.ndarray) -> Outcome:
     """The offset disc around the order-4 nominal: |G - G_nom| <= rho."""
-    _, rho = ellipses.offset_disc(nominal)
+    rho = offset_disc_radius(ellipses.centre - nominal, ellipses.covariance, ellipses.level)
     error = np.abs(truth - nominal)
     relative, ratio = rho / np.abs(truth), rho / error
     return Outcome(error <= rho, relative, relative, np.stack([ratio] * 3), False, np.nan, np.nan)

@@ -15,7 +15,6 @@ from ident.data.ellipses import (
     Ellipses,
     chi2_radius,
     ellipse_distance,
-    offset_disc_radius,
     relative_deficit,
     standard_axes,
 )
@@ -118,15 +117,6 @@ class FrequencyUncertainty:
     def enclosing_radius(self) -> RealArray:
         """(F,) radius of the smallest disc around the centre that holds the ellipse."""
         return self.ellipse().semi_major
-
-    def offset_disc(self, nominal_response: npt.ArrayLike) -> tuple[ComplexArray, RealArray]:
-        """Offset m_n = centre - G_nom (F,) and radius rho (F,) with P(|G - G_nom| <= rho) = level.
-
-        For a nominal model of lower order than the identified one: the set around the nominal is an ellipse
-        off centre, and rho is the magnitude of an additive weight that covers it (design 4.5).
-        """
-        offset = self.centre - self._matching(nominal_response)
-        return offset, offset_disc_radius(offset, self.covariance, self.level)
 
     def to_control(self) -> Any:
         """The centre as `control.FrequencyResponseData` (covariances have no place there)."""

@@ -16,19 +16,17 @@ from ident.data.ellipses import standard_axes
 _THINNEST = 1e-4
 
 
-def nominal_near(
-    posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike, *, feedthrough: bool | None = None
-) -> GobfModel:
+def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike) -> GobfModel:
     """GOBF model on given poles whose response stays closest to the posterior mean, in units of its ellipses.
 
-    Coefficients (and the direct term; none given: as the posterior has one) minimise the sum over omega (F,)
+    Coefficients (and the direct term, where the posterior has one) minimise the sum over omega (F,)
     of e^T P^-1 e, e the error of (Re, Im) and P the posterior covariance. Integrators and delay are the
     posterior's. Take the posterior's own poles for the closest model, half of them for a low order; then
-    `posterior.at(omega).normalised_distance(...)` tells how far the nominal is off, and `offset_disc` what to
-    add. Raises ValueError when omega has too few frequencies for the coefficients.
+    `posterior.at(omega).normalised_distance(...)` tells how far the nominal is off, and `offset_disc_radius`
+    what to add. Raises ValueError when omega has too few frequencies for the coefficients.
     """
     uncertainty = posterior.at(omega_rad_s)
-    direct = posterior.has_feedthrough if feedthrough is None else feedthrough
+    direct = posterior.has_feedthrough
     omega = uncertainty.omega_rad_s
     n_coefficients = poles.order + int(direct)
     if 2 * omega.size < n_coefficients:

@@ -106,13 +106,6 @@ def test_offset_disc_radius_against_the_noncentral_chi_square_and_against_sampli
         offset_disc_radius(np.array([1j]), np.zeros((1, 2, 2)), 1.0)
 
 
-def test_offset_disc_of_a_nominal_model_is_never_smaller_than_the_offset_at_high_level():
-    record = FrequencyUncertainty(OMEGA, np.array([1, 1j, -1]), np.stack([0.01 * np.eye(2)] * 3), DT)
-    offset, radius = record.offset_disc(np.array([1.0, 0.9j, 0.0]))
-    np.testing.assert_allclose(offset, [0, 0.1j, -1.0], atol=1e-15)
-    assert np.all(radius > np.abs(offset))
-
-
 def test_to_control_and_round_trip(tmp_path):
     rng = np.random.default_rng(2)
     factor = rng.standard_normal((3, 2, 2))
