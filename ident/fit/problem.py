@@ -73,7 +73,18 @@ class CandidateCost:
         return math.log(max(self._one(unit), self._floor))
 
 
-class PoleProblem(Protocol):
+class Linearised(Protocol):
+    """The part of a `PoleProblem` that a local refinement needs."""
+
+    @property
+    def power(self) -> float:
+        """|y|^2 without the part of constants and the like."""
+
+    def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
+        """Cost and linearisation at these poles; only the cost counts where it is not under `below`."""
+
+
+class PoleProblem(Linearised, Protocol):
     """A least-squares problem, linear in everything but the poles."""
 
     @property
@@ -91,15 +102,8 @@ class PoleProblem(Protocol):
     def n_rows(self) -> int:
         """How many real numbers were measured."""
 
-    @property
-    def power(self) -> float:
-        """|y|^2 without the part of constants and the like."""
-
     def n_parameters(self, order: int) -> int:
         """Free real numbers of a fit with `order` poles: coefficients, poles, nuisances."""
-
-    def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
-        """Cost and linearisation at these poles; only the cost counts where it is not under `below`."""
 
     def residual(self, poles: Poles) -> RealArray:
         """What the fit leaves of the data, (N,)."""

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 from ident.basis.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.basis.options import IdentOptions
 from ident.basis.poles import NO_POLES, Poles
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import RealArray
 from ident.fit.pole_unknowns import (
     chain_rule,
     clip_parameters,
@@ -29,7 +28,7 @@ from ident.fit.pole_unknowns import (
     scaled_system,
     set_poles,
 )
-from ident.fit.problem import Linearisation
+from ident.fit.problem import Linearisation, Linearised
 
 # Damping of the first step in units of the scaled normal matrix. From afar a full step mostly leads too far:
 # half the evaluations of a refinement that starts boldly are steps taken back.
@@ -92,15 +91,6 @@ class Refined:
     rss: float
     iterations: int
     converged: bool
-
-
-class Linearised(Protocol):
-    """The part of `ident.fit.problem.PoleProblem` that a refinement needs."""
-
-    @property
-    def power(self) -> float: ...
-
-    def linearise(self, real: RealArray, pairs: ComplexArray, below: float = ...) -> Linearisation: ...
 
 
 def refine(
