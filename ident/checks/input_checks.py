@@ -19,7 +19,7 @@ from ident.data.record import Record
 from ident.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import pole_system
-from ident.fit.residual_colour import effective_samples
+from ident.fit.residual_colour import residual_colour
 
 # An input is there at a frequency if it has this share of the density that it would have if its power were
 # spread evenly up to Nyquist ...
@@ -159,7 +159,7 @@ def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviati
     if deviation < allowed / 5:  # no colour seen so far makes more of it
         return True
     segment = int(min(256, np.min(np.diff(data.starts))))
-    density = np.mean([_spectrum(residual[data.segment(i)], segment) for i in range(data.n_records)], axis=0)
+    density = np.mean([_spectrum(residual[here], segment) for here in data.segments], axis=0)
     omega = np.linspace(0, np.pi / data.dt_s, density.size)
     there = float(np.interp(omega_rad_s, omega, _smooth(density, 3)))
     return bool(deviation * np.sqrt(there / max(float(density.mean()), 1e-300)) <= allowed)
@@ -222,7 +222,7 @@ def _drifting(
         if not power > 0:
             continue
         share = 1 - float(rest @ rest) / power
-        worth = effective_samples(rest, np.array([0, residual.size]))
+        worth = residual_colour(rest, np.array([0, residual.size])).effective_samples
         if share > _DRIFT_SHARE and -worth * np.log1p(-share) > chdtri(1, _DRIFT_LEVEL):
             found.append(
                 finding(

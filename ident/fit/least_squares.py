@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -112,10 +113,7 @@ class Regression:
     @cached_property
     def segments(self) -> tuple[slice, ...]:
         """The samples of each record."""
-        return tuple(map(self.segment, range(self.n_records)))
-
-    def segment(self, record: int) -> slice:
-        return slice(int(self.starts[record]), int(self.starts[record + 1]))
+        return tuple(slice(low, high) for low, high in pairwise(self.starts.tolist()))
 
     def n_parameters(self, order: int) -> int:
         """Number of free real numbers of a fit with `order` poles: coefficients of each input, poles,

@@ -18,8 +18,14 @@ _LEVEL = 0.99
 
 @dataclass(frozen=True)
 class ResidualColour:
-    """effective_samples: see the function of that name. white: autocorrelations at lags 1 .. 25 no larger,
-    all together, than those of white noise are 99 times in 100 (Box and Pierce)."""
+    """What the autocorrelation of a residual says.
+
+    effective_samples: number of independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or
+    a tenth. Bartlett: that factor is by how much colour widens the scatter of quadratic forms such as J. With
+    N itself a criterion goes on adding poles that describe noise, friction and the like, without end on long
+    records. white: autocorrelations at lags 1 .. 25 no larger, all together, than those of white noise are 99
+    times in 100 (Box and Pierce).
+    """
 
     effective_samples: float
     white: bool
@@ -43,13 +49,3 @@ def residual_colour(residual: RealArray, starts: npt.NDArray[np.int64]) -> Resid
         effective_samples=float(n / (1 + 2 * np.sum(np.maximum(squares - 1 / n, 0.0)))),
         white=few.size == _LAGS_OF_WHITENESS and bool(n * np.sum(few) < chdtri(few.size, 1 - _LEVEL)),
     )
-
-
-def effective_samples(residual: RealArray, starts: npt.NDArray[np.int64]) -> float:
-    """Number of independent samples a residual is worth: N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth.
-
-    Bartlett: that factor is by how much colour widens the scatter of quadratic forms such as J. With N
-    itself a criterion goes on adding poles that describe noise, friction and the like, without end on long
-    records.
-    """
-    return residual_colour(residual, starts).effective_samples

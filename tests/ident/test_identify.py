@@ -10,7 +10,7 @@ import scipy.signal
 
 from ident.basis.options import IdentOptions
 from ident.finding import FindingKind
-from ident.fit.residual_colour import effective_samples
+from ident.fit.residual_colour import residual_colour
 from ident.identify import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
 from tests.ident.findings import kinds
@@ -250,10 +250,11 @@ def test_effective_samples_of_white_and_coloured_noise():
     rng = np.random.default_rng(0)
     white = rng.normal(size=20_000)
     starts = np.array([0, 10_000, 20_000])
-    assert effective_samples(white, starts) > 0.9 * 20_000
+    assert residual_colour(white, starts).effective_samples > 0.9 * 20_000
     coloured = scipy.signal.lfilter([1], [1, -0.9], white)
     # AR(1): 1 + 2 sum 0.81^k = (1 + 0.81)/(1 - 0.81) = 9.5.
-    assert effective_samples(coloured, starts) == pytest.approx(20_000 / 9.53, rel=0.15)
+    worth = residual_colour(coloured, starts).effective_samples
+    assert worth == pytest.approx(20_000 / 9.53, rel=0.15)
 
 
 def test_a_free_decay_is_recognised():

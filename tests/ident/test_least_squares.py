@@ -41,8 +41,7 @@ def records():
 def dense(data, poles):
     """Every column of the regression, record by record, as one explicit matrix; shared columns last."""
     structure, blocks = data.structure, []
-    for i in range(data.n_records):
-        here = data.segment(i)
+    for here in data.segments:
         n = here.stop - here.start
         local = [np.linspace(-1, 1, n) ** k for k in range(structure.n_polynomials)]
         if structure.estimate_initial_state:
@@ -51,7 +50,7 @@ def dense(data, poles):
             whole = np.zeros(data.n_samples)
             whole[here] = column
             blocks.append(whole)
-    shared = [np.concatenate([regressor(poles, data.u[0, data.segment(i)]) for i in range(data.n_records)])]
+    shared = [np.concatenate([regressor(poles, data.u[0, here]) for here in data.segments])]
     if structure.feedthrough:
         shared.append(data.u.T)
     return np.column_stack([*blocks, *shared])
