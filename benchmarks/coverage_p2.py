@@ -77,9 +77,9 @@ class Outcome:
     major: np.ndarray  # over |G|
     mean: np.ndarray  # over |G|
     ratios: np.ndarray  # (3, F): mean radius, radius along the error, semi-major axis, each over the error
-    joint: bool
-    joint_radius2: float
-    cpu_s: float
+    cpu_s: float = np.nan
+    joint: bool = False
+    joint_radius2: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,34 +103,30 @@ def covariance_alone(run: Truth, model: GobfModel) -> ResponsePosterior:
     return ResponsePosterior(model.poles, (inverse @ inner)[:order], s * inverse[:order], DT_S)
 
 
-def judge(run: Truth, ellipses: FrequencyUncertainty, truth: np.ndarray, cpu_s: float) -> Outcome:
+def judge(
+    posterior: ResponsePosterior, truth: np.ndarray, cpu_s: float = np.nan, seed: int | None = None
+) -> Outcome:
+    """Ellipses of a posterior; with a seed also its simultaneous bands."""
+    ellipses = posterior.at(OMEGA, LEVEL)
     axes = ellipses.ellipse()
     distance = ellipses.normalised_distance(truth)
-    error = np.abs(truth - ellipses.centre)
+    error, size = np.abs(truth - ellipses.centre), np.abs(truth)
     mean = np.sqrt(axes.semi_major * axes.semi_minor)
-    return Outcome(
-        inside=distance <= 1,
-        major=axes.semi_major / np.abs(truth),
-        mean=mean / np.abs(truth),
-        ratios=np.stack([mean / error, 1 / distance, axes.semi_major / error]),
-        joint=False,
-        joint_radius2=np.nan,
-        cpu_s=cpu_s,
-    )
-
-
-def with_joint(outcome: Outcome, posterior: ResponsePosterior, truth: np.ndarray, seed: int) -> Outcome:
+    ratios = np.stack([mean / error, 1 / distance, axes.semi_major / error])
+    found = Outcome(distance <= 1, axes.semi_major / size, mean / size, ratios, cpu_s)
+    if seed is None:
+        return found
     level = posterior.joint_level(OMEGA, LEVEL, np.random.default_rng(seed), n_draws=1000)
     everywhere = bool(np.all(posterior.at(OMEGA, level).contains(truth)))
-    return replace(outcome, joint=everywhere, joint_radius2=float(-2 * np.log1p(-level)))
+    return replace(found, joint=everywhere, joint_radius2=float(-2 * np.log1p(-level)))
 
 
 def disc_outcome(nominal: np.ndarray, ellipses: FrequencyUncertainty, truth: np.ndarray) -> Outcome:
     """The offset disc around the order-4 nominal: |G - G_nom| <= rho."""
     rho = offset_disc_radius(ellipses.centre - nominal, ellipses.covariance, ellipses.level)
     error = np.abs(truth - nominal)
-    relative, ratio = rho / np.abs(truth), rho / error
-    return Outcome(error <= rho, relative, relative, np.stack([ratio] * 3), False, np.nan, np.nan)
+    relative = rho / np.abs(truth)
+    return Outcome(error <= rho, relative, relative, np.stack([rho / error] * 3))
 
 
 def one_run(name: str, seed: int) -> RunOutcome:
@@ -140,23 +136,20 @@ def one_run(name: str, seed: int) -> RunOutcome:
     truth = run.response(OMEGA)
     model, cpu_identify_s = timed(lambda: identify([run.record]).model)
     options = EmbeddingOptions(coloured_noise=case.coloured_noise)
-    alone = options.model_copy(update={"prior_missed_mode": 0.0})
     posterior, cpu_s = timed(lambda: tangent([run.record], model, options))
-    ellipses = posterior.at(OMEGA, LEVEL)
-    found = {"tangent": with_joint(judge(run, ellipses, truth, cpu_s), posterior, truth, seed)}
+    found = {"tangent": judge(posterior, truth, cpu_s, seed)}
     if case.coverage is not None:
+        alone = options.model_copy(update={"prior_missed_mode": 0.0})
         other, cpu_s = timed(lambda: tangent([run.record], model, alone))
-        found["no missed mode"] = with_joint(judge(run, other.at(OMEGA), truth, cpu_s), other, truth, seed)
+        found["no missed mode"] = judge(other, truth, cpu_s, seed)
     if case.is_main:
+        ellipses = posterior.at(OMEGA, LEVEL)
         low = identify([run.record], IdentOptions(n_real=2, n_pairs=1)).model
         for name, nominal in (("", low), (", placed", nominal_near(posterior, low.poles, OMEGA))):
             response = nominal.frequency_response(OMEGA)
             found[f"order-4 nominal{name}"] = disc_outcome(response, ellipses, truth)
-        for name, those in (
-            ("classical, n = 4", classical([run.record], low)),
-            ("covariance, n = 4", covariance_alone(run, low)),
-        ):
-            found[name] = judge(run, those.at(OMEGA), truth, np.nan)
+        found["classical, n = 4"] = judge(classical([run.record], low), truth)
+        found["covariance, n = 4"] = judge(covariance_alone(run, low), truth)
     return RunOutcome(model.poles.pairs.size, cpu_identify_s, found)
 
 
@@ -171,6 +164,11 @@ def row(label: str, values: Sequence[float], tail: str = "") -> str:
 
 def verdict(ok: bool) -> str:
     return "met" if ok else "NOT MET"
+
+
+def at_least(value: float, limit: float | None) -> str:
+    """What is asked of a number, in brackets, where something is."""
+    return "" if limit is None else f" (reach >= {limit:g}: {verdict(value >= limit)})"
 
 
 def report(out: Print, case: Case, runs: Sequence[RunOutcome]) -> None:
@@ -205,18 +203,14 @@ def report(out: Print, case: Case, runs: Sequence[RunOutcome]) -> None:
         if not disc:
             out(row("mean radius", per_band(100 * np.array([item.mean for item in found]), np.median)))
         overall, worst = 100 * float(inside.mean()), 100 * float(inside.mean(axis=0).min())
-        text = f"    overall {overall:.1f}"
-        if method == "tangent" and case.overall is not None:
-            text += f" (reach >= {case.overall:g}: {verdict(overall >= case.overall)})"
-        text += f"; worst {worst:.1f}"
-        if method == "tangent" and case.worst is not None:
-            text += f" (reach >= {case.worst:g}: {verdict(worst >= case.worst)})"
         ratios = np.median(np.array([item.ratios for item in found]), axis=(0, 2))
-        text += f"; ratio {ratios[0]:.2f}"
-        if case.is_main and method == "tangent":
-            text += f" (reach 1.8-2.4: {verdict(bool(1.8 <= ratios[0] <= 2.4))})"
-        text += f", along the error {ratios[1]:.2f}, semi-major {ratios[2]:.2f}"
-        out(text)
+        own = method == "tangent"
+        asked = f" (reach 1.8-2.4: {verdict(bool(1.8 <= ratios[0] <= 2.4))})" if case.is_main and own else ""
+        out(
+            f"    overall {overall:.1f}{at_least(overall, case.overall if own else None)}"
+            f"; worst {worst:.1f}{at_least(worst, case.worst if own else None)}; ratio {ratios[0]:.2f}{asked}"
+            f", along the error {ratios[1]:.2f}, semi-major {ratios[2]:.2f}"
+        )
         text = f"    all inside {100 * inside.all(axis=1).mean():.0f}"
         if method in ("tangent", "no missed mode"):
             text += (

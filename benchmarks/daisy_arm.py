@@ -18,7 +18,6 @@ others for the judgement, so that the model has to know the response where it wa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import lfilter
@@ -66,17 +65,9 @@ def largest_pole(model: Model) -> float:
     return float(np.abs(poles_of(model)).max())
 
 
-@dataclass(frozen=True)
-class Score:
-    """Fits in per cent, see the module text; radius is that of the largest pole."""
-
-    first: float
-    own_state: float
-    carried: float
-    through: float
-    whole: float
-    periodic: float
-    radius: float
+# Fits in per cent, see the module text.
+COLUMNS = ("first", "own state", "carried", "through", "whole", "periodic")
+Score = dict[str, float]
 
 
 def own_state_percent(model: Model, u: np.ndarray, y: np.ndarray) -> float:
@@ -86,25 +77,24 @@ def own_state_percent(model: Model, u: np.ndarray, y: np.ndarray) -> float:
 
 
 def score(model: Model, record: Record) -> Score:
-    """All runs of one model; nan where an unstable one has no meaning."""
+    """All runs of one model, by `COLUMNS`; nan where an unstable one has no meaning."""
+    if not largest_pole(model) < 1:
+        return dict.fromkeys(COLUMNS, np.nan)
     u, y = record.input[:, 0], record.output[:, 0]
-    radius = largest_pole(model)
-    if not radius < 1:
-        return Score(*([np.nan] * 6), radius)
     error = y - model.simulate(u)
     free = free_columns(model, y.size)
     start = np.linalg.lstsq(free[:HALF], error[:HALF], rcond=1e-10)[0]
     periods = 12
     steady = y - model.simulate(np.tile(u, periods))[-y.size :]
-    return Score(
+    fits = (
         own_state_percent(model, u[:HALF], y[:HALF]),
         own_state_percent(model, u[HALF:], y[HALF:]),
         percent(y[HALF:], (error - free @ start)[HALF:]),
         percent(y[HALF:], error[HALF:]),
         percent(y, error),
         percent(y, steady),
-        radius,
     )
+    return dict(zip(COLUMNS, fits, strict=True))
 
 
 def gobf(record: Record, order: int) -> GobfModel:
@@ -155,10 +145,10 @@ PEERS: dict[str, Callable[[Record, int], Model]] = {
 }
 
 
-def numbers(item: Score) -> str:
+def numbers(item: Score, model: Model) -> str:
     """One line of the tables."""
-    values = (item.first, item.own_state, item.carried, item.through, item.whole, item.periodic)
-    return "".join(f"{'unstable' if np.isnan(v) else f'{v:.2f}':>10}" for v in values)
+    cells = "".join(f"{'unstable' if np.isnan(v) else f'{v:.2f}':>10}" for v in item.values())
+    return f"{cells}   {largest_pole(model):.5f}"
 
 
 def minima(record: Record, say: Print) -> None:
@@ -188,7 +178,7 @@ def minima(record: Record, say: Print) -> None:
         names = ", ".join(
             f"{w:.3f} {z:.4f}" for w, z in zip(poles.omega_rad_s(1.0), poles.zeta(), strict=True)
         )
-        say(f"{rss:>14.6f} {item.own_state:>11.2f} {item.through:>9.2f}   {names}")
+        say(f"{rss:>14.6f} {item['own state']:>11.2f} {item['through']:>9.2f}   {names}")
         if shown == 5:
             break
 
@@ -245,16 +235,14 @@ def run(say: Print) -> None:
     y, u = record.output[:, 0], record.input[:, 0]
     first = record.slice(0, HALF)
     say("Fit in per cent, GOBF with order / 2 pairs and a direct term, fitted to samples 0-511")
-    head = "".join(
-        f"{name:>10}" for name in ("first", "own state", "carried", "through", "whole", "periodic")
-    )
+    head = "".join(f"{name:>10}" for name in COLUMNS)
     say(f"order   reach own / through{head}   largest |pole|")
     for order in ORDERS:
-        item = score(gobf(first, order), record)
+        model = gobf(first, order)
+        item = score(model, record)
         # Both to the two decimals printed.
-        met = "met " if round(item.own_state, 2) >= REACH[order] and item.through >= THROUGH else "FAIL"
-        reach = f"{REACH[order]:.1f} / {THROUGH:.1f}"
-        say(f"{order:>5}   {reach}  {met}   {numbers(item)}   {item.radius:.5f}")
+        met = "met " if round(item["own state"], 2) >= REACH[order] and item["through"] >= THROUGH else "FAIL"
+        say(f"{order:>5}   {REACH[order]:.1f} / {THROUGH:.1f}  {met}   {numbers(item, model)}")
     mirrored = percent(y[HALF:], y[HALF:] + y[:HALF])
     say(
         f"No model at all, the first half with its sign turned: {mirrored:.2f} (input: "
@@ -265,8 +253,8 @@ def run(say: Print) -> None:
     say(f"{'method':<30}{'order':>6}{head}   largest |pole|")
     for name, method in PEERS.items():
         for order in (*ORDERS, 12) if name.startswith("ARX") else ORDERS:
-            item = score(method(first, order), record)
-            say(f"{name:<30}{order:>6}{numbers(item)}   {item.radius:.5f}")
+            fitted = method(first, order)
+            say(f"{name:<30}{order:>6}{numbers(score(fitted, record), fitted)}")
     for order in ORDERS:
         mean = posterior_mean_fit(record, order)
         say(f"{'tangent posterior mean around':<30}{order:>6}{'':>10}{mean:>10.2f}")

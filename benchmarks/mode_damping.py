@@ -20,10 +20,11 @@ it needs slycot, which pip does not install without a Fortran compiler.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import control
 import numpy as np
+import pandas as pd
 
 from benchmarks.harness import RESULTS, Print, main, reading
 from control_design import (
@@ -53,30 +54,11 @@ OPTIONS = SynthesisOptions(starts=2)
 BAND = (10.0, 22.5)
 
 
-@dataclass(frozen=True)
-class Point:
-    """One design: r (None: no W4), cost, gamma with W4, damping nearest 15 rad/s, least damping in the band,
-    frequency of that pole, least damping of the controller's own poles, Youla values with W4."""
-
-    ratio: float | None
-    cost: float
-    gamma: float
-    nearest: float
-    least: float
-    where: float
-    own: float
-    floor: float
-    reachable: float
-    stable: bool
-
-    def line(self, part: str) -> str:
-        """As in the results file."""
-        name = "none" if self.ratio is None else f"{self.ratio:.2f}"
-        return (
-            f"{part:9s}  {name:4s}  {self.cost:6.4f}  {self.gamma:6.4f}  {self.nearest:7.4f}  "
-            f"{self.least:6.4f}  {self.where:8.2f}  {self.own:10.4f}  {self.floor:10.4f}  "
-            f"{self.reachable:9.4f}  {self.stable!s:>6}"
-        )
+# One design as a line; r "none": no W4.
+LINE = (
+    "{part:9s}  {r:4s}  {cost:6.4f}  {gamma:6.4f}  {nearest:7.4f}  {least:6.4f}  {where:8.2f}  "
+    "{own:10.4f}  {floor:10.4f}  {reachable:9.4f}  {stable!s:>6}"
+)
 
 
 def damping(controller: Controller, plant: UncertainPlant) -> tuple[float, float, float, bool]:
@@ -113,8 +95,9 @@ def nominal_cost(controller: Controller, plant: UncertainPlant, specification: S
     return float(np.max(np.maximum(w1, w3 * np.abs(k.reshape(-1))) * sensitivity))
 
 
-def design(part: str, ratio: float | None, seed: int) -> Point:
-    """Synthesise and measure one point."""
+def design(part: str, ratio: float | None, seed: int) -> dict[str, Any]:
+    """Synthesise and measure one point: cost, gamma with W4, damping nearest 15 rad/s, least damping in the
+    band, frequency of that pole, least damping of the controller's own poles, Youla values with W4."""
     scenario, _, damped = part.partition("-")
     plant = flexible_link("A" if part == "exact" else scenario)
     if part == "exact":
@@ -135,21 +118,22 @@ def design(part: str, ratio: float | None, seed: int) -> Point:
     nearest, least, where, stable = damping(result.controller, plant)
     verdict = certificate.plants[0]
     bracket = youla_bracket(plant, specification)
-    return Point(
-        ratio,
-        cost,
-        certificate.gamma,
-        nearest,
-        least,
-        where,
-        own_damping(result.controller),
-        bracket.inscribed,
-        bracket.ellipse,
-        stable and verdict.stable and verdict.nyquist.matches,
-    )
+    return {
+        "part": part,
+        "r": "none" if ratio is None else f"{ratio:.2f}",
+        "cost": cost,
+        "gamma": certificate.gamma,
+        "nearest": nearest,
+        "least": least,
+        "where": where,
+        "own": own_damping(result.controller),
+        "floor": bracket.inscribed,
+        "reachable": bracket.ellipse,
+        "stable": stable and verdict.stable and verdict.nyquist.matches,
+    }
 
 
-def draw(curves: dict[str, list[Point]]) -> None:
+def draw(curves: dict[str, pd.DataFrame]) -> None:
     """Cost over damping as benchmarks/results/mode_damping.png."""
     import matplotlib
 
@@ -165,8 +149,8 @@ def draw(curves: dict[str, list[Point]]) -> None:
     for part, points in curves.items():
         best = pareto(points)
         axes.plot(
-            [p.least for p in best],
-            [p.cost for p in best],
+            best.least,
+            best.cost,
             "o:" if part.endswith("damped") else "o-",
             color={"e": "C0", "A": "C1", "B": "C2"}[part[0]],
             label=f"order 6, {NAMES[part]}",
@@ -182,39 +166,35 @@ def draw(curves: dict[str, list[Point]]) -> None:
     plt.close(figure)
 
 
-def pareto(points: list[Point]) -> list[Point]:
+def pareto(points: pd.DataFrame) -> pd.DataFrame:
     """Points that no other one beats in both cost and least damping, by damping."""
-    kept = [p for p in points if not any(q.cost < p.cost and q.least > p.least for q in points)]
-    return sorted(kept, key=lambda p: p.least)
+    beaten = [((points.cost < p.cost) & (points.least > p.least)).any() for p in points.itertuples()]
+    return points[~np.array(beaten)].sort_values("least", kind="stable")
 
 
-def summarise(out: Print, curves: dict[str, list[Point]]) -> None:
+def summarise(out: Print, curves: dict[str, pd.DataFrame]) -> None:
     """Least cost of a damping over all parts, whose pole is the least damped one, distance from Youla."""
     out("least cost max(|W1 S|, |W3 K S|) of order 6 with at least the damping (nearest and least pole)")
     names = "  ".join(f"{zeta:>7.3f}" for zeta, _ in PUBLISHED)
     out(f"{'damping':30s}  {names}")
     out(f"{'hinfsyn, full order (reach)':30s}  " + "  ".join(f"{cost:7.3f}" for _, cost in PUBLISHED))
     for part, points in curves.items():
-        costs = [
-            min((p.cost for p in points if p.stable and min(p.least, p.nearest) >= zeta), default=np.inf)
-            for zeta, _ in PUBLISHED
-        ]
+        damped = points[["least", "nearest"]].min(axis=1).where(points.stable)
+        costs = [points.cost[damped >= zeta].min() for zeta, _ in PUBLISHED]
         told = "  ".join(f"{cost:7.4f}" if np.isfinite(cost) else "      -" for cost in costs)
         out(f"{NAMES[part]:30s}  {told}")
     out()
     out("gamma with W4 against the Youla values (none goes below the first, the second is reached),")
     out("and the least damped pole pair of the controller itself where it is best damped:")
     for part, points in curves.items():
-        weighted = [p for p in points if p.ratio is not None]
-        floor = max(100 * (p.gamma / p.floor - 1) for p in weighted)
-        over = max(100 * (p.gamma / p.reachable - 1) for p in weighted)
-        ringing = max(p.own for p in weighted)
-        out(f"{NAMES[part]:30s}  at most {floor:5.1f} % and {over:5.1f} % above;  {ringing:.3f}")
+        weighted = points[points.r != "none"]
+        floor, over = (100 * (weighted.gamma / weighted[key] - 1).max() for key in ("floor", "reachable"))
+        out(f"{NAMES[part]:30s}  at most {floor:5.1f} % and {over:5.1f} % above;  {weighted.own.max():.3f}")
     out()
     out(reading("mode_damping", damping=CONTROLLER_DAMPING))
 
 
-def measure(out: Print, part: str, ratios: tuple[float, ...], seed: int) -> list[Point]:
+def measure(out: Print, part: str, ratios: tuple[float, ...], seed: int) -> pd.DataFrame:
     """Table of one part."""
     out(f"{NAMES[part]}: cost = largest max(|W1 S|, |W3 K S|); gamma = with |W4 G S| as well")
     out("damping of closed-loop poles: nearest 15 rad/s, least in 10..22.5 rad/s and its frequency;")
@@ -226,9 +206,9 @@ def measure(out: Print, part: str, ratios: tuple[float, ...], seed: int) -> list
     points = []
     for ratio in (None, *ratios):
         points.append(design(part, ratio, seed))
-        out(points[-1].line(part))
+        out(LINE.format(**points[-1]))
     out()
-    return points
+    return pd.DataFrame(points)
 
 
 def run(
