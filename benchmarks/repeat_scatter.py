@@ -13,7 +13,7 @@ opened point by point. Predicted from one date, held against the points and mean
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +45,7 @@ POINTS_PER_BAND = 20
 
 KYOTO_DT_S = 0.002
 KYOTO_BANDS = ((0.6, 3), (3, 20), (20, 28), (28, 60), (60, 200), (200, 600), (600, 1200))
+KYOTO_HEAD = f"{'':<46}" + "".join(f"{f'{a:g}-{b:g}':>9}" for a, b in KYOTO_BANDS) + "   rad/s"
 OUTLIER = 6.0
 
 
@@ -134,6 +135,12 @@ def row_median(runs: np.ndarray) -> np.ndarray:
     return np.asarray(np.median(runs.real, axis=0) + 1j * np.median(runs.imag, axis=0))
 
 
+def outlying(runs: np.ndarray) -> np.ndarray:
+    """Points (R, F) that Hampel's rule drops: `OUTLIER` robust deviations from the median of the runs."""
+    distance = np.abs(runs - row_median(runs))
+    return distance > OUTLIER * np.median(distance, axis=0) / 1.1774
+
+
 def runs_of(points: FrfRepeats, omega: np.ndarray) -> np.ndarray:
     """(R, F) points of a date; within a frequency sorted by gain, so a row is a rank and not a run."""
     return np.array([points.response[points.omega_rad_s == w] for w in omega]).T
@@ -156,22 +163,21 @@ def kyoto(path: Path, say: Print) -> None:
     dates = plant.labels
     omega = np.unique(plant.omega_rad_s)
     counts = {date: plant.label.count(date) // omega.size for date in dates}
-    long = [date for date in dates if counts[date] >= 10]
+    long = {date: count for date, count in counts.items() if count >= 10}
     say(f"\nKyoto arm: {', '.join(f'{date}: {counts[date]} runs' for date in dates)}")
     dropped_points(plant, long, omega, say)
-    head = f"{'':<46}" + "".join(f"{f'{a:g}-{b:g}':>9}" for a, b in KYOTO_BANDS) + "   rad/s"
     say(
         "\nOne more run, predicted by the runs of one date (Hotelling's region, its outliers dropped):"
         "\nshare of the other date's points inside 95 %, its own outliers kept. Reach 0.95."
     )
-    say(head)
+    say(KYOTO_HEAD)
     for date in long:
         region = plant.only(date).mean(KYOTO_DT_S, outlier_threshold=OUTLIER, of="next run")
         for other in dates:
             if other != date:
                 inside = np.array([region.contains(run) for run in runs_of(plant.only(other), omega)])
                 say(f"{f'{date} -> {other} ({counts[other]} runs)':<46}{share(inside, omega)}")
-    scatter_ratios(plant, long, omega, counts, say, head)
+    scatter_ratios(plant, long, omega, say)
     means = {
         date: plant.only(date).mean(
             KYOTO_DT_S, outlier_threshold=OUTLIER, pool_neighbours=0 if date in long else 3
@@ -182,7 +188,7 @@ def kyoto(path: Path, say: Print) -> None:
         "\nMean of one date against the mean of another, both with ellipses: share inside 95 %. Reach 0.95 if"
     )
     say("days are alike.")
-    say(head)
+    say(KYOTO_HEAD)
     for i, date in enumerate(dates):
         for other in dates[i + 1 :]:
             inside = together(means[date], means[other])
@@ -193,7 +199,7 @@ def kyoto(path: Path, say: Print) -> None:
         inside = together(others, means[date])
         say(f"{f'three dates -> {date}':<46}{share(inside, omega)}")
     days(plant, say)
-    parametric(plant, long, means, omega, counts, say, head)
+    parametric(plant, long, means, omega, say)
     say(
         "\nOpening the loop: largest semi-axis by the delta method (ident.closed_loop.indirect) over that of"
         "\npoints mapped one by one, median and largest in the band."
@@ -226,14 +232,12 @@ def days(plant: FrfRepeats, say: Print) -> None:
         )
 
 
-def dropped_points(plant: FrfRepeats, dates: Sequence[str], omega: np.ndarray, say: Print) -> None:
+def dropped_points(plant: FrfRepeats, dates: Iterable[str], omega: np.ndarray, say: Print) -> None:
     """How many points the outlier rule drops, and how many gross ones it leaves."""
     for date in dates:
         runs = runs_of(plant.only(date), omega)
-        centre = row_median(runs)
-        distance = np.abs(runs - centre)
-        dropped = distance > OUTLIER * np.median(distance, axis=0) / 1.1774
-        gross = np.abs(np.log(np.abs(runs) / np.abs(centre))) > np.log(2)
+        dropped = outlying(runs)
+        gross = np.abs(np.log(np.abs(runs) / np.abs(row_median(runs)))) > np.log(2)
         say(
             f"{date}: {dropped.sum()} of {dropped.size} points dropped (Hampel's rule across repeats, "
             f"{OUTLIER:g} robust deviations), {dropped[:, omega < 600].sum()} below 600 rad/s; off by "
@@ -242,31 +246,20 @@ def dropped_points(plant: FrfRepeats, dates: Sequence[str], omega: np.ndarray, s
         )
 
 
-def scatter_ratios(
-    plant: FrfRepeats,
-    dates: Sequence[str],
-    omega: np.ndarray,
-    counts: dict[str, int],
-    say: Print,
-    head: str,
-) -> None:
-    """Standard deviation of a run predicted by one date over that measured on the other."""
+def scatter_ratios(plant: FrfRepeats, dates: Mapping[str, int], omega: np.ndarray, say: Print) -> None:
+    """Standard deviation of a run predicted by one date over that measured on the other; runs by date."""
     say("\nStandard deviation of a run, one date over the other (outliers dropped on both).")
-    say(head)
-    first, second = dates
+    say(KYOTO_HEAD)
     size = []
-    for date in (first, second):
+    for date in dates:
         points = plant.only(date)
         mean = points.mean(KYOTO_DT_S, outlier_threshold=OUTLIER)
         runs = runs_of(points, omega)
-        distance = np.abs(runs - row_median(runs))
-        kept = np.where(distance <= OUTLIER * np.median(distance, axis=0) / 1.1774, runs, np.nan)
-        spread = np.nanvar(kept, axis=0, ddof=1)
+        spread = np.nanvar(np.where(outlying(runs), np.nan, runs), axis=0, ddof=1)
         size.append(spread / np.abs(mean.centre) ** 2)
     cells = per_band(omega, lambda here: f"{np.sqrt(size[0][here].mean() / size[1][here].mean()):.2f}")
-    say(f"{f'{first} / {second}':<46}{cells}")
-    freedom = counts[first] - 1, counts[second] - 1
-    low, high = np.sqrt(f_distribution.ppf([0.025, 0.975], *freedom))
+    say(f"{' / '.join(dates):<46}{cells}")
+    low, high = np.sqrt(f_distribution.ppf([0.025, 0.975], *(count - 1 for count in dates.values())))
     say(
         f"expected 1; 95 % interval {low:.2f} - {high:.2f} if a run's error is one gain for all frequencies "
         "(F with one degree of freedom per run and date), narrower the less frequencies move together"
@@ -291,43 +284,34 @@ def together(one: FrequencyUncertainty, other: FrequencyUncertainty) -> np.ndarr
 
 def parametric(
     plant: FrfRepeats,
-    dates: Sequence[str],
+    dates: Mapping[str, int],
     means: dict[str, FrequencyUncertainty],
     omega: np.ndarray,
-    counts: dict[str, int],
     say: Print,
-    head: str,
 ) -> None:
-    """Ellipses of a GOBF model fitted to one date, held against the means of all others."""
+    """Ellipses of a GOBF model fitted to one date, held against the means of all others; runs by date."""
     say(
         "\nGOBF model fitted to one date up to 600 rad/s (one integrator, order from data): its ellipses and"
         "\nthose of the other date's mean together, share inside 95 %; semi-axes over |G|. With 'gain', the"
         "\nerror the runs of a date share (deviation of a gain / sqrt(runs)) is added to the posterior."
     )
-    say(head)
+    say(KYOTO_HEAD)
     limited = omega <= 600
-    for date in dates:
+    for date, count in dates.items():
         points = plant.only(date)
         gain = run_gain_std(points, omega)
         frf = points.band(0, 600).mean(KYOTO_DT_S, outlier_threshold=OUTLIER)
-        for name, shared in (("", 0.0), (", gain", gain / np.sqrt(counts[date]))):
+        for name, shared in (("", 0.0), (", gain", gain / np.sqrt(count))):
             found = identify_frf(frf, IdentOptions(integrators=1), shared_gain_std=shared)
-            ellipses = found.posterior.at(omega[limited])
+            ellipses = found.posterior.at(omega)
             if not shared:
                 describe(date, found, gain, say)
             for other in means:
                 if other != date:
-                    measured = means[other]
-                    part = FrequencyUncertainty(
-                        measured.omega_rad_s[limited],
-                        measured.centre[limited],
-                        measured.covariance[limited],
-                        KYOTO_DT_S,
-                    )
-                    inside = together(ellipses, part)
+                    inside = together(ellipses, means[other])[limited]
                     say(f"{f'{date}{name} -> {other}':<46}{share(inside, omega[limited])}")
             relative = 100 * ellipses.enclosing_radius() / np.abs(ellipses.centre)
-            cells = per_band(omega[limited], lambda here, r=relative: f"{np.median(r[here]):.1f} %")
+            cells = per_band(omega[limited], lambda here, r=relative[limited]: f"{np.median(r[here]):.1f} %")
             say(f"{f'{date}{name}: median semi-axis / |G|':<46}{cells}")
 
 
