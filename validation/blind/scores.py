@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import binomtest
 
 from plant.effects import EFFECTS
@@ -27,84 +28,65 @@ _BINS = 10
 _LEAST_GAP = 0.02
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """One case: what was said and what is true."""
+def _case(said: Document, true: Document) -> dict[str, Any]:
+    """One row: what was said and what is true.
 
-    said: Document
-    true: Document
-
-    @property
-    def kind(self) -> str:
-        """none, single, several or unknown."""
-        if self.true["verdict"] != "effect":
-            return str(self.true["verdict"])
-        return "single" if len(self.names) == 1 else "several"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """True effects."""
-        return tuple(str(effect["name"]) for effect in self.true.get("effects", ()))
-
-    @property
-    def ratio(self) -> float:
-        return float(self.true.get("max_ratio", math.nan))
-
-    @property
-    def nominal(self) -> str:
-        return str(self.true.get("nominal", "exact"))
-
-    @property
-    def verdict(self) -> str:
-        return str(self.said["verdict"])
-
-    @property
-    def first(self) -> str:
-        """The answer in one word: none, unknown, or the first effect."""
-        if self.verdict != "effect":
-            return self.verdict
-        named = [e["name"] for e in self.said.get("effects", ()) if e["name"] not in ("none", "unknown")]
-        return str(named[0]) if named else "effect"
-
-    @property
-    def ranking(self) -> list[str]:
-        """Answers, the given one first."""
-        order = [self.first, *(str(e["name"]) for e in self.said.get("effects", ()))]
-        return list(dict.fromkeys(order))
-
-    @property
-    def accepted(self) -> frozenset[str]:
-        if self.verdict != "effect":
-            return frozenset()
-        return frozenset(self.said.get("combination") or (self.first,))
-
-    @property
-    def answer(self) -> str:
-        """All that was accepted, or the verdict."""
-        return " + ".join(sorted(self.accepted)) or self.verdict
-
-    @property
-    def probability(self) -> float:
-        """Of the first answer; a document that gives none for it is taken to be sure."""
-        listed = {str(e["name"]): e.get("probability") for e in self.said.get("effects", ())}
-        value = listed.get(self.first)
-        if value is None and self.verdict == "none" and listed:
-            value = 1.0 - sum(float(p or 0.0) for p in listed.values())
-        return 1.0 if value is None else float(value)
-
-    @property
-    def first_is_right(self) -> bool:
-        """The word is right; with several effects, any of them."""
-        if self.kind in ("single", "several"):
-            return self.first in self.names
-        return self.first == self.kind
-
-    @property
-    def all_right(self) -> bool:
-        """Verdict and exact set."""
-        return self.verdict == self.true["verdict"] and (
-            self.verdict != "effect" or self.accepted == frozenset(self.names)
-        )
+    kind: none, single, several or unknown. first: the answer in one word, none, unknown or the first effect.
+    accepted: the effects that were; answer: these, or the verdict. probability: of the first answer; a
+    document that gives none for it is taken to be sure. first_is_right: the word is; with several effects,
+    any of them. all_right: verdict and exact set. top_1, top_2: the true effect is among the first answers.
+    errors, covered: of every parameter of an effect that was rightly accepted, see `_off`.
+    """
+    names = [str(effect["name"]) for effect in true.get("effects", ())]
+    kind = str(true["verdict"])
+    if kind == "effect":
+        kind = "single" if len(names) == 1 else "several"
+    verdict = str(said["verdict"])
+    effects = {str(e["name"]): e for e in said.get("effects", ())}
+    first = verdict
+    if verdict == "effect":
+        first = next((name for name in effects if name not in ("none", "unknown")), "effect")
+    accepted = frozenset(said.get("combination") or (first,)) if verdict == "effect" else frozenset()
+    probability = effects.get(first, {}).get("probability")
+    if probability is None and verdict == "none" and effects:
+        probability = 1.0 - sum(float(e.get("probability") or 0.0) for e in effects.values())
+    ranking = list(dict.fromkeys([first, *effects]))
+    family, *families = (EFFECTS[name].group if name in EFFECTS else name for name in (first, *names))
+    hidden = ", ".join(str(e["name"]) for e in true.get("unlisted") or ())
+    matches = [
+        (key, float(value), effects[effect["name"]], float(estimate))
+        for effect in true.get("effects", ())
+        if effect["name"] in accepted and effect["name"] in effects
+        for key, value in effect["parameters"].items()
+        if (estimate := (effects[effect["name"]].get("parameters") or {}).get(key)) is not None
+    ]
+    return {
+        "case": true["case"],
+        "nominal": str(true.get("nominal", "exact")),
+        "ratio": float(true.get("max_ratio", math.nan)),
+        "kind": kind,
+        "true": " + ".join(names) or hidden or kind,
+        "verdict": verdict,
+        "first": first,
+        "answer": " + ".join(sorted(accepted)) or verdict,
+        "probability": 1.0 if probability is None else float(probability),
+        "first_is_right": first in names if kind in ("single", "several") else first == kind,
+        "all_right": verdict == true["verdict"] and (verdict != "effect" or accepted == frozenset(names)),
+        "top_1": first in names,
+        "top_2": bool(set(ranking[:2]) & set(names)),
+        "family": family in families,
+        "common": len(accepted & set(names)) / max(len(names), 1),
+        "errors": [
+            _error(key, value, estimate) for key, value, _, estimate in matches if key == "phase_rad" or value
+        ],
+        "covered": [
+            _inside(key, value, estimate, interval)
+            for key, value, effect, estimate in matches
+            if (interval := (effect.get("intervals") or {}).get(key)) is not None and None not in interval
+        ],
+        "closed": _closed(said, true),
+        "cpu_s": said.get("cpu_s"),
+    }
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
@@ -136,113 +118,75 @@ def scores(predictions: Sequence[Document], answers: Sequence[Document]) -> dict
         raise ValueError(
             f"predictions and answers must name the same cases, each once; differing: {', '.join(odd) or '-'}"
         )
-    pairs = [Pair(said[name], true[name]) for name in sorted(true)]
-    slices = {
-        "all": pairs,
-        "exact": [p for p in pairs if p.nominal == "exact"],
-        "uncertain": [p for p in pairs if p.nominal == "uncertain"],
-    }
+    cases = pd.DataFrame([_case(said[name], true[name]) for name in sorted(true)])
+    several, unknown = cases[cases.kind == "several"], cases[cases.kind == "unknown"]
+    named = cases[cases.kind != "several"]
+    columns = ["case", "true", "answer", "probability", "ratio", "nominal"]
+    wrong = cases.loc[~cases.all_right, columns]
     return {
-        "n_cases": len(pairs),
-        "table": {name: _rows(part) for name, part in slices.items()},
-        "confusion": _counted(
-            (p.names[0] if p.kind == "single" else p.kind, p.first) for p in pairs if p.kind != "several"
-        ),
-        "unlisted": _counted((_cause(p), p.answer) for p in pairs if p.kind == "unknown"),
-        "several": dict(Counter(_set_found(p) for p in pairs if p.kind == "several")),
-        "calibration": _calibration(pairs),
-        "wrong": [
-            {
-                "case": p.true["case"],
-                "true": " + ".join(p.names) or _cause(p),
-                "said": p.answer,
-                "probability": p.probability,
-                "max_ratio": p.ratio,
-                "nominal": p.nominal,
-            }
-            for p in pairs
-            if not p.all_right
-        ],
+        "n_cases": len(cases),
+        "table": {
+            "all": _rows(cases),
+            "exact": _rows(cases[cases.nominal == "exact"]),
+            "uncertain": _rows(cases[cases.nominal == "uncertain"]),
+        },
+        "confusion": _counted(named.true.where(named.kind == "single", named.kind), named["first"]),
+        "unlisted": _counted(unknown.true, unknown.answer),
+        "several": dict(Counter(_set_found(case) for case in several.itertuples())),
+        "calibration": _calibration(cases),
+        "wrong": wrong.rename(columns={"answer": "said", "ratio": "max_ratio"}).to_dict("records"),
     }
 
 
-def _rows(pairs: Sequence[Pair]) -> dict[str, Any]:
-    single = [p for p in pairs if p.kind == "single"]
-    clear = [p for p in single if p.ratio >= CLEAR]
-    faint = [p for p in single if FAINT[0] <= p.ratio <= FAINT[1]]
-    several = [p for p in pairs if p.kind == "several"]
-    listed = single + several
-    unlisted = [p for p in pairs if p.kind == "unknown"]
-    nothing = [p for p in pairs if p.kind == "none"]
+def _rows(cases: pd.DataFrame) -> dict[str, Any]:
+    single, several = cases[cases.kind == "single"], cases[cases.kind == "several"]
+    clear, faint = single[single.ratio >= CLEAR], single[single.ratio.between(*FAINT)]
+    listed = pd.concat([single, several])
+    unlisted, nothing = cases[cases.kind == "unknown"], cases[cases.kind == "none"]
     return {
-        "top-1, ratio >= 3": _share([_top(p, 1) for p in clear]),
-        "top-2, ratio >= 3": _share([_top(p, 2) for p in clear]),
-        "family, ratio >= 3": _share([_family(p) for p in clear]),
-        "top-1, ratio 0.3 to 1.5": _share([_top(p, 1) for p in faint]),
-        "top-1, every single effect": _share([_top(p, 1) for p in single]),
-        "top-2, every single effect": _share([_top(p, 2) for p in single]),
-        "family, every single effect": _share([_family(p) for p in single]),
-        "false alarms": _share([p.verdict != "none" for p in nothing]),
-        "missed effects": _share([p.verdict == "none" for p in listed]),
-        "unknown: recall": _share([p.verdict == "unknown" for p in unlisted]),
-        "unknown: precision": _share([p.kind == "unknown" for p in pairs if p.verdict == "unknown"]),
-        "two effects, exact set": _share([p.all_right for p in several]),
-        "two effects, first is one of them": _share([p.first_is_right for p in several]),
-        "verdict and set right, every case": _share([p.all_right for p in pairs]),
-        "95 % intervals cover": _share([hit for p in listed for hit in _covered(p)]),
-        "confident and wrong (p > 0.8)": _share(
-            [p.probability > CONFIDENT and not p.first_is_right for p in pairs]
-        ),
-        "parameter error": _spread([e for p in listed for e in _parameter_errors(p)]),
-        "parameter error, ratio >= 3": _spread([e for p in clear for e in _parameter_errors(p)]),
-        "gap closed over oracle": _spread([c for p in listed if (c := _closed(p)) is not None]),
-        "Brier of the first answer": _mean([(p.probability - p.first_is_right) ** 2 for p in pairs]),
-        "expected calibration error": {"value": _calibration_error(pairs), "count": len(pairs)},
-        "CPU per case [s]": _spread([float(p.said["cpu_s"]) for p in pairs if "cpu_s" in p.said]),
+        "top-1, ratio >= 3": _share(clear.top_1),
+        "top-2, ratio >= 3": _share(clear.top_2),
+        "family, ratio >= 3": _share(clear.family),
+        "top-1, ratio 0.3 to 1.5": _share(faint.top_1),
+        "top-1, every single effect": _share(single.top_1),
+        "top-2, every single effect": _share(single.top_2),
+        "family, every single effect": _share(single.family),
+        "false alarms": _share(nothing.verdict != "none"),
+        "missed effects": _share(listed.verdict == "none"),
+        "unknown: recall": _share(unlisted.verdict == "unknown"),
+        "unknown: precision": _share(cases.kind[cases.verdict == "unknown"] == "unknown"),
+        "two effects, exact set": _share(several.all_right),
+        "two effects, first is one of them": _share(several.first_is_right),
+        "verdict and set right, every case": _share(cases.all_right),
+        "95 % intervals cover": _share(chain(*listed.covered)),
+        "confident and wrong (p > 0.8)": _share((cases.probability > CONFIDENT) & ~cases.first_is_right),
+        "parameter error": _spread(chain(*listed.errors)),
+        "parameter error, ratio >= 3": _spread(chain(*clear.errors)),
+        "gap closed over oracle": _spread(listed.closed.dropna()),
+        "Brier of the first answer": _mean((cases.probability - cases.first_is_right) ** 2),
+        "expected calibration error": {"value": _calibration_error(cases), "count": len(cases)},
+        "CPU per case [s]": _spread(cases.cpu_s.dropna()),
     }
 
 
-def _share(hits: Sequence[bool]) -> dict[str, Any]:
-    count, right = len(hits), sum(map(bool, hits))
+def _share(hits: Iterable[bool]) -> dict[str, Any]:
+    found = list(hits)
+    count, right = len(found), sum(map(int, found))
     share = right / count if count else math.nan
     return {"share": share, "hits": right, "count": count, "interval": list(wilson(right, count))}
 
 
-def _spread(values: Sequence[float]) -> dict[str, Any]:
+def _spread(numbers: Iterable[float]) -> dict[str, Any]:
+    values = [float(value) for value in numbers]
     if not values:
         return {"median": math.nan, "p10": math.nan, "p90": math.nan, "mean": math.nan, "count": 0}
     low, middle, high = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
     return {"median": middle, "p10": low, "p90": high, "mean": float(np.mean(values)), "count": len(values)}
 
 
-def _mean(values: Sequence[float]) -> dict[str, Any]:
-    return {"value": float(np.mean(values)) if values else math.nan, "count": len(values)}
-
-
-def _top(pair: Pair, depth: int) -> bool:
-    """The true effect is among the first answers, and the verdict is that there is one (depth 1)."""
-    return bool(set(pair.ranking[:depth]) & set(pair.names))
-
-
-def _family(pair: Pair) -> bool:
-    said, *true = (EFFECTS[name].group if name in EFFECTS else name for name in (pair.first, *pair.names))
-    return said in true
-
-
-def _matches(pair: Pair) -> list[tuple[str, float, float, Any]]:
-    """(parameter, true value, estimate, interval) of every effect that was rightly accepted."""
-    found = []
-    said = {str(e["name"]): e for e in pair.said.get("effects", ())}
-    for effect in pair.true.get("effects", ()):
-        name = str(effect["name"])
-        if name not in pair.accepted or name not in said:
-            continue
-        for key, value in effect["parameters"].items():
-            estimate = (said[name].get("parameters") or {}).get(key)
-            if estimate is not None:
-                interval = (said[name].get("intervals") or {}).get(key)
-                found.append((key, float(value), float(estimate), interval))
-    return found
+def _mean(values: pd.Series) -> dict[str, Any]:
+    value = float(np.mean(values.to_numpy(dtype=np.float64))) if len(values) else math.nan
+    return {"value": value, "count": len(values)}
 
 
 def _off(key: str, value: float, other: float) -> float:
@@ -251,74 +195,58 @@ def _off(key: str, value: float, other: float) -> float:
     return math.remainder(difference, 2 * math.pi) if key == "phase_rad" else difference
 
 
-def _parameter_errors(pair: Pair) -> list[float]:
+def _error(key: str, value: float, estimate: float) -> float:
     """Relative to the true value; of a phase, to a full turn."""
-    return [
-        abs(_off(key, value, estimate)) / (2 * math.pi if key == "phase_rad" else abs(value))
-        for key, value, estimate, _ in _matches(pair)
-        if key == "phase_rad" or value != 0
-    ]
+    return abs(_off(key, value, estimate)) / (2 * math.pi if key == "phase_rad" else abs(value))
 
 
-def _covered(pair: Pair) -> list[bool]:
-    hits = []
-    for key, value, estimate, interval in _matches(pair):
-        if interval is not None and all(end is not None for end in interval):
-            low, high = (_off(key, estimate, float(end)) for end in interval)
-            hits.append(low <= _off(key, estimate, value) <= high)
-    return hits
+def _inside(key: str, value: float, estimate: float, interval: Sequence[float]) -> bool:
+    low, high = (_off(key, estimate, float(end)) for end in interval)
+    return low <= _off(key, estimate, value) <= high
 
 
-def _closed(pair: Pair) -> float | None:
+def _closed(said: Document, true: Document) -> float | None:
     """(before - after) / (before - oracle), held-out; before is the true rig without the effect."""
-    sizes = pair.true.get("pooled_gap", {})
+    sizes = true.get("pooled_gap", {})
     before, oracle = sizes.get("held_out_gap_before"), sizes.get("held_out_gap_after_oracle")
-    after = pair.said.get("gap_after")
+    after = said.get("gap_after")
     if before is None or oracle is None or after is None or before - oracle < _LEAST_GAP:
         return None
     return float((before - after) / (before - oracle))
 
 
-def _calibration(pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+def _calibration(cases: pd.DataFrame) -> list[dict[str, Any]]:
     """Ten bins of the first answer's probability: how often it was right."""
     bins = []
+    place = (cases.probability * _BINS).astype(int).clip(upper=_BINS - 1)
     for k in range(_BINS):
-        inside = [p for p in pairs if min(int(p.probability * _BINS), _BINS - 1) == k]
-        right = _share([p.first_is_right for p in inside])
-        said = _mean([p.probability for p in inside])["value"]
+        inside = cases[place == k]
+        said = _mean(inside.probability)["value"]
+        right = _share(inside.first_is_right)
         bins.append({"low": k / _BINS, "high": (k + 1) / _BINS, "probability": said, **right})
     return bins
 
 
-def _calibration_error(pairs: Sequence[Pair]) -> float:
-    filled = [b for b in _calibration(pairs) if b["count"]]
-    return (
-        float(sum(b["count"] * abs(b["share"] - b["probability"]) for b in filled) / len(pairs))
-        if pairs
-        else math.nan
-    )
+def _calibration_error(cases: pd.DataFrame) -> float:
+    filled = [b for b in _calibration(cases) if b["count"]]
+    gaps = [b["count"] * abs(b["share"] - b["probability"]) for b in filled]
+    return float(sum(gaps) / len(cases)) if len(cases) else math.nan
 
 
-def _counted(cells: Iterable[tuple[str, str]]) -> dict[str, dict[str, int]]:
+def _counted(rows: pd.Series, columns: pd.Series) -> dict[str, dict[str, int]]:
     """Row -> column -> how often."""
     table: dict[str, dict[str, int]] = {}
-    for (row, column), n in Counter(cells).items():
+    for (row, column), n in Counter(zip(rows, columns, strict=True)).items():
         table.setdefault(row, {})[column] = n
     return table
 
 
-def _cause(pair: Pair) -> str:
-    hidden = pair.true.get("unlisted") or ()
-    return ", ".join(str(e["name"]) for e in hidden) or pair.kind
-
-
-def _set_found(pair: Pair) -> str:
+def _set_found(case: Any) -> str:
     """How much of several effects was named."""
-    if pair.verdict != "effect":
-        return pair.verdict
-    if pair.all_right:
+    if case.verdict != "effect":
+        return str(case.verdict)
+    if case.all_right:
         return "exact set"
-    common = len(pair.accepted & set(pair.names))
-    if common == len(pair.names):
+    if case.common == 1:
         return "all of them and more"
-    return "some of them" if common else "none of them"
+    return "some of them" if case.common else "none of them"
