@@ -9,8 +9,9 @@ the worst case of ellipses at one level, found by bisection: the worst case grow
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -32,6 +33,7 @@ _CHUNK = 250  # draws at a time: bounds the memory
 _LARGEST_RADIUS = 8.0  # standard deviations: level 1 - 1e-14
 
 Responses = Callable[[Real], Complex]
+Draw = Callable[[np.random.Generator, int], Responses]
 
 
 @runtime_checkable
@@ -95,11 +97,8 @@ def joint_coverage(
         raise ValueError(f"joint coverage needs at least 100 draws; got {draws}")
     if not plants:
         raise ValueError("joint coverage needs at least one plant")
-    for plant in plants:
-        for channel in (plant.channel, plant.performance):
-            _refuse_undrawable(channel)
-    loops = [_Sampled.build(controller, plant, specification, omega_min_rad_s) for plant in plants]
-    found = [sampled_gamma(loop, rng, draws) for loop in loops]
+    loops = [_Sampled(controller, plant, specification, omega_min_rad_s) for plant in plants]
+    found = [loop.gamma(rng, draws) for loop in loops]
     gamma = np.max([one.gamma for one in found], axis=0)
     outside = np.max([one.distance for one in found], axis=0)
     # The worst case at a radius is compared in standard deviations, common to all plants.
@@ -149,27 +148,21 @@ class SampledGamma:
     distance: Real
 
 
-@dataclass(frozen=True, eq=False)
 class _Sampled:
-    """One plant on one grid, ellipses of radius 1 (standard deviation)."""
+    """One plant on one grid, ellipses of radius 1 (standard deviation).
 
-    plant: UncertainPlant
-    controller: Controller
-    data: PlantData
-    unit: Ellipses
-    unit_performance: dict[str, Ellipses]
-    loop: Complex
-    integrators: int
-    unstable: int
+    Raises ValueError if an uncertainty cannot be drawn from.
+    """
 
-    @classmethod
-    def build(
-        cls,
+    def __init__(
+        self,
         controller: Controller,
         plant: UncertainPlant,
         specification: Specification,
         omega_min_rad_s: float,
-    ) -> _Sampled:
+    ) -> None:
+        self.plant, self.controller = plant, controller
+        self.draw = _drawn(plant.channel)
         poles = closed_loop_poles(controller, plant)
         modes = (*plant.modes, *modes_of(poles, plant.dt_s), *modes_of(controller.poles, plant.dt_s))
         light = [
@@ -178,24 +171,17 @@ class _Sampled:
         grid = frequency_grid(
             plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=500, n_mode=80 * len(light)
         )
-        data = PlantData.build(plant, specification, grid)
-        performance: dict[str, Ellipses] = {}
-        for each in data.weightings:
+        self.omega_rad_s, self.data = grid, PlantData.build(plant, specification, grid)
+        self.unit = self.data.ellipses.scaled(1 / radius_of(plant.level))
+        self.unit_performance: dict[str, Ellipses] = {}
+        for each in self.data.weightings:
             channel = each.requirement.channel
             if channel is not None and np.any(each.own > 0):
                 asked = channel.at(grid[each.own > 0])
-                performance[each.requirement.name] = asked.scaled(1 / radius_of(channel.level))
+                self.unit_performance[each.requirement.name] = asked.scaled(1 / radius_of(channel.level))
+        self.loop = controller.response(grid, with_delay=False)
         integrators, unstable = loop_integrators(controller, plant)
-        return cls(
-            plant,
-            controller,
-            data,
-            data.ellipses.scaled(1 / radius_of(plant.level)),
-            performance,
-            controller.response(grid, with_delay=False),
-            integrators,
-            unstable,
-        )
+        self._required = {"integrators": integrators, "unstable_poles": unstable}
 
     def worst(self, radius: float) -> float:
         """Largest weighted worst case over ellipses of a radius in standard deviations."""
@@ -221,7 +207,7 @@ class _Sampled:
                 continue
             weight = (each.own * size if each.requirement.function.of_controller else each.own)[use]
             if each.channel is not None and performance is not None:
-                weight = weight * np.abs(performance(self.unit.omega_rad_s[use]))
+                weight = weight * np.abs(performance(self.omega_rad_s[use]))
             elif each.function.of_plant:
                 weight = weight * np.abs(members[:, use])
             largest = np.maximum(largest, np.max(weight * inverse[:, use], axis=1))
@@ -238,33 +224,27 @@ class _Sampled:
 
     def stable_of(self, responses: Responses, members: Complex) -> npt.NDArray[np.bool_]:
         """Whether 1 + K G winds as it must, (D,); on a ten times finer grid where a step is wide."""
-        omega = self.unit.omega_rad_s
-        required = {"integrators": self.integrators, "unstable_poles": self.unstable}
-        stable, wide = winds(members * (self.loop * self.data.delay), **required)
+        omega = self.omega_rad_s
+        stable, wide = winds(members * (self.loop * self.data.delay), **self._required)
         if np.any(wide):
             share = np.linspace(0, 1, 11)[:-1]
             fine = np.append((omega[:-1, None] + np.diff(omega)[:, None] * share).ravel(), omega[-1])
             loop = self.controller.response(fine)
-            stable[wide], _ = winds(responses(fine)[wide] * loop, **required)
+            stable[wide], _ = winds(responses(fine)[wide] * loop, **self._required)
         return stable
 
-
-def sampled_gamma(loop: _Sampled, rng: np.random.Generator, draws: int) -> SampledGamma:
-    """Draw whole responses and evaluate them, a chunk at a time."""
-    gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
-    omega = loop.unit.omega_rad_s
-    for start in range(0, draws, _CHUNK):
-        here = slice(start, min(start + _CHUNK, draws))
-        count = here.stop - here.start
-        responses = _responses(loop.plant.channel, rng, count)
-        members = responses(omega)
-        performance = None
-        if loop.plant.performance is not None and loop.unit_performance:
-            performance = _responses(loop.plant.performance, rng, count)
-        stable[here] = loop.stable_of(responses, members)
-        gamma[here] = np.where(stable[here], loop.gamma_of(members, performance), np.inf)
-        distance[here] = loop.distance_of(members)
-    return SampledGamma(gamma, stable, distance)
+    def gamma(self, rng: np.random.Generator, draws: int) -> SampledGamma:
+        """Draw whole responses and evaluate them."""
+        other = None if self.plant.performance is None else _drawn(self.plant.performance)
+        gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
+        for here, count in _chunks(draws):
+            responses = self.draw(rng, count)
+            members = responses(self.omega_rad_s)
+            performance = None if other is None or not self.unit_performance else other(rng, count)
+            stable[here] = self.stable_of(responses, members)
+            gamma[here] = np.where(stable[here], self.gamma_of(members, performance), np.inf)
+            distance[here] = self.distance_of(members)
+        return SampledGamma(gamma, stable, distance)
 
 
 def unstable_draws(
@@ -288,13 +268,11 @@ def unstable_draws(
     unstable = np.zeros(draws, dtype=bool)
     guards: list[Guard] = []
     for number, plant in enumerate(plants):
-        _refuse_undrawable(plant.channel)
-        loop = _Sampled.build(controller, plant, specification, omega_min_rad_s)
+        loop = _Sampled(controller, plant, specification, omega_min_rad_s)
         grid, found = guard_grid(plant, omega_min_rad_s), list[Complex]()
-        for start in range(0, draws, _CHUNK):
-            here = slice(start, min(start + _CHUNK, draws))
-            responses = _responses(plant.channel, rng, here.stop - here.start)
-            bad = ~loop.stable_of(responses, responses(loop.unit.omega_rad_s))
+        for here, count in _chunks(draws):
+            responses = loop.draw(rng, count)
+            bad = ~loop.stable_of(responses, responses(loop.omega_rad_s))
             unstable[here] |= bad
             if np.any(bad):
                 found.append(responses(grid)[bad])
@@ -314,32 +292,36 @@ def gamma_of_draws(
     omega_min_rad_s: float = 1e-4,
 ) -> SampledGamma:
     """gamma(G), stability and distance of sampled responses of one plant (a Monte Carlo check)."""
-    return sampled_gamma(_Sampled.build(controller, plant, specification, omega_min_rad_s), rng, draws)
+    return _Sampled(controller, plant, specification, omega_min_rad_s).gamma(rng, draws)
 
 
-def _refuse_undrawable(channel: Channel | None) -> None:
-    uncertainty: Any = None if channel is None else channel.uncertainty
-    known = (ResponsePosterior, ResponseDraws, FirstOrderUncertainty)
-    if uncertainty is not None and not isinstance(uncertainty, known):
-        raise ValueError(
-            "joint coverage needs draws of whole responses: the uncertainty must be a ResponsePosterior or "
-            f"have a method draw(rng, draws); got {type(uncertainty).__name__}"
-        )
+def _chunks(draws: int) -> Iterator[tuple[slice, int]]:
+    """Positions and number of the draws made together."""
+    for start in range(0, draws, _CHUNK):
+        count = min(_CHUNK, draws - start)
+        yield slice(start, start + count), count
 
 
-def _responses(channel: Channel, rng: np.random.Generator, draws: int) -> Responses:
+def _drawn(channel: Channel) -> Draw:
+    """How whole responses of a channel are drawn; ValueError where they cannot be."""
     uncertainty: Any = channel.uncertainty
+    if uncertainty is None:
+        return lambda rng, draws: (
+            lambda omega: np.broadcast_to(channel.nominal_response(omega), (draws, omega.size))
+        )
     if isinstance(uncertainty, ResponsePosterior):
-        posterior, drawn = uncertainty, uncertainty.sample(rng, draws)
-        return lambda omega: posterior.response_of(drawn, omega)
+        return lambda rng, draws: partial(uncertainty.response_of, uncertainty.sample(rng, draws))
     if isinstance(uncertainty, ResponseDraws):
-        return uncertainty.draw(rng, draws)
+        return uncertainty.draw
     if isinstance(uncertainty, FirstOrderUncertainty):
-        return linear_responses(uncertainty, channel.dt_s, rng, draws)
-    return lambda omega: np.broadcast_to(channel.nominal_response(omega), (draws, omega.size))
+        return partial(_linear_responses, uncertainty, channel.dt_s)
+    raise ValueError(
+        "joint coverage needs draws of whole responses: the uncertainty must be a ResponsePosterior or "
+        f"have a method draw(rng, draws); got {type(uncertainty).__name__}"
+    )
 
 
-def linear_responses(
+def _linear_responses(
     uncertainty: FirstOrderUncertainty, dt_s: float, rng: np.random.Generator, draws: int
 ) -> Responses:
     """Gaussian draws on the generators of an uncertainty: the linear model whose ellipses they are."""
