@@ -12,13 +12,12 @@ The quotient is then largest at an end, and the remainders are added there. Ever
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.stability import loop_integrators
 from control_design.analysis.worst_case import WorstCase
@@ -34,7 +33,7 @@ from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.plants.rational_response import RationalResponse
-from control_design.plants.set_expansion import ExpandableSet, OwnGridSet, SetExpansion, expandable
+from control_design.plants.set_expansion import Expand, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.specification.requirement import WeightedRequirement
 
@@ -85,32 +84,25 @@ class AllFrequencies:
         return cls(tried, False, obstacle, at, **found)
 
 
-@dataclass(frozen=True, eq=False)
-class _Bounds:
-    """Per interval (F,): upper bounds by kind, the worst case at the middle (to the accuracy of the normal),
-    lower bound of the distance, 1 + L cleared at both ends."""
+class _Bounds(NamedTuple):
+    """Per interval: its middle (F,), upper bounds of each requirement (K, F), their worst cases at the middle
+    (K, F) (to the accuracy of the normal), lower bound of the distance (F,), 1 + L cleared at both ends
+    (F,)."""
 
-    intervals: Intervals
-    upper: dict[str, Real]
-    middle: dict[str, Real]
+    centre: Real
+    upper: Real
+    middle: Real
     distance: Real
     start: Complex
     end: Complex
 
-    def part(self, index: npt.NDArray[np.bool_]) -> _Bounds:
-        intervals = self.intervals.part(index)
-        upper = {kind: value[index] for kind, value in self.upper.items()}
-        middle = {kind: value[index] for kind, value in self.middle.items()}
-        return _Bounds(intervals, upper, middle, self.distance[index], self.start[index], self.end[index])
 
-
-@dataclass(frozen=True, eq=False)
-class _Asked:
+class _Asked(NamedTuple):
     """One weighted requirement, its weight as a rational response, its independent channel."""
 
     requirement: WeightedRequirement
     weight: RationalResponse
-    channel: ExpandableSet | None
+    channel: Expand | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +112,14 @@ class _Loop:
     plant: UncertainPlant
     specification: Specification
     controller: RationalResponse  # without delay
-    members: ExpandableSet
+    members: Expand
     asked: tuple[_Asked, ...]
 
     def bounds(self, intervals: Intervals) -> _Bounds:
         """Upper bounds on every interval."""
         own, i_plant = self.controller.integrators, self.plant.n_integrators
         delay = self.specification.computational_delay_samples
-        loop = self.members.expand(intervals, i_plant).times(
-            self.controller.delayed(delay).expand(intervals, own)
-        )
+        loop = self.members(intervals, i_plant).times(self.controller.delayed(delay).expand(intervals, own))
         clear = intervals.cleared(own + i_plant)
         loop = SetExpansion(clear + loop.centre, loop.groups)
         normal = _normal(loop.centre.value, loop.gram())
@@ -139,20 +129,18 @@ class _Loop:
             for side in (-1, 1)
         }
         at_middle = np.real(np.conj(normal) * loop.centre.value) - loop.support(normal, 0)
-        upper: dict[str, Real] = {}
-        middle: dict[str, Real] = {}
-        for each in self.asked:
-            name, band = each.requirement.name, each.requirement.band or (-np.inf, np.inf)
-            h = intervals.half_width
+        h = intervals.half_width
+        upper, middle = np.zeros((2, len(self.asked), h.size))
+        for row, each in enumerate(self.asked):
+            band = each.requirement.band or (-np.inf, np.inf)
             use = (intervals.centre - h < band[1]) & (intervals.centre + h > band[0])
-            upper[name], middle[name] = np.zeros(h.size), np.zeros(h.size)
             if np.any(use):
                 below = {side: value[use] for side, value in ends.items()}
                 bound = self._with_member if each.requirement.of_member.of_plant else self._alone
-                upper[name][use], middle[name][use] = bound(each, intervals.part(use), below, at_middle[use])
+                upper[row, use], middle[row, use] = bound(each, intervals.part(use), below, at_middle[use])
         low = np.minimum(ends[-1], ends[1])
         distance = np.where(low > 0, low / clear.largest(), 0.0)
-        return _Bounds(intervals, upper, middle, distance, loop.centre.end(-1), loop.centre.end(1))
+        return _Bounds(intervals.centre, upper, middle, distance, loop.centre.end(-1), loop.centre.end(1))
 
     def _alone(
         self, each: _Asked, intervals: Intervals, ends: dict[int, Real], at_middle: Real
@@ -166,11 +154,12 @@ class _Loop:
             numerator = weight.expand(intervals, own + i_plant)
         upper, middle = _quotient(numerator, ends), _ratio(np.abs(numerator.value), at_middle)
         if each.channel is not None:
-            channel = each.channel.expand(intervals, 0)
+            channel = each.channel(intervals, 0)
             largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
             upper, middle = largest * upper, _farthest(channel, 0) * middle
         if each.requirement.above > 0:  # where it asks for less, another requirement is bounded instead
-            least = each.requirement.above * _least(intervals.cleared(weight.integrators))
+            cleared = intervals.cleared(weight.integrators)
+            least = each.requirement.above * np.maximum(np.abs(cleared.value) - cleared.change(), 0.0)
             more = weight.expand(intervals, weight.integrators).largest() > least
             upper, middle = np.where(more, upper, 0.0), np.where(more, middle, 0.0)
         return upper, middle
@@ -186,8 +175,9 @@ class _Loop:
         """
         own, i_plant = self.controller.integrators, self.plant.n_integrators
         k = self.controller.delayed(self.specification.computational_delay_samples).expand(intervals)
-        members = self.members.expand(intervals, 0)
-        most = largest_disturbance_gain(k.value, _ellipses(intervals, members))
+        members = self.members(intervals, 0)
+        ellipses = Ellipses(intervals.centre, members.centre.value, *_axes(members.gram()))
+        most = largest_disturbance_gain(k.value, ellipses)
         moved = members.centre.change() + sum(group.change() for group in members.groups)
         nearest = np.minimum(ends[-1], ends[1]) / intervals.cleared(own + i_plant).largest()
         turn = most * k.change()
@@ -199,11 +189,6 @@ class _Loop:
         if each.requirement.function.of_controller:
             factor = factor.times(k)
         return np.where(good, factor.largest() * bound, np.inf), np.abs(factor.value) * most
-
-
-def _least(factor: FirstOrder) -> Real:
-    """Lower bound of the modulus of (z - 1)^i over the intervals (0 where the linear part may vanish)."""
-    return np.maximum(np.abs(factor.value) - factor.change(), 0.0)
 
 
 def _quotient(numerator: FirstOrder, ends: dict[int, Real]) -> Real:
@@ -251,11 +236,6 @@ def _axes(shape: Real) -> tuple[Real, Real, Complex]:
     large = (a + d) / 2 + half_gap
     small = np.maximum((a + d) / 2 - half_gap, 0.0)
     return np.sqrt(large), np.sqrt(small), np.exp(0.5j * np.arctan2(2 * b, a - d))
-
-
-def _ellipses(intervals: Intervals, members: SetExpansion) -> Ellipses:
-    """The ellipses at the centres, which come in ascending order."""
-    return Ellipses(intervals.centre, members.centre.value, *_axes(members.gram()))
 
 
 def _farthest(members: SetExpansion, side: int) -> Real:
@@ -321,15 +301,13 @@ def bound_all_frequencies(
     difference = _model_error(loop, controller, edges[1:])
     if difference > _MODEL_ERROR:
         return AllFrequencies.ended_by(Obstacle.INEXACT, difference)
-    targets = {}
-    for each in loop.asked:
-        most = worst.peak(each.requirement.name)[0]
-        target = most * (1.0 + _EXCESS)
-        if most <= 1.0 < target:
-            target = max(1.0, most * (1.0 + _LEAST_EXCESS))
-        targets[each.requirement.name] = target if np.isfinite(most) else np.inf
+    names = [each.requirement.name for each in loop.asked]
+    most = np.array([worst.peak(name)[0] for name in names])
+    targets = most * (1.0 + _EXCESS)
+    close = (most <= 1.0) & (targets > 1.0)
+    targets[close] = np.maximum(1.0, most[close] * (1.0 + _LEAST_EXCESS))
     found, used = _bisect(loop.bounds, edges, plant.dt_s, targets)
-    result = _verdict(found, used, own + plant.n_integrators, unstable)
+    result = _verdict(found, names, used, own + plant.n_integrators, unstable)
     if result.distance > 0:  # the modulus was bisected, the distance only came along
         nearest = specification.modulus_margin / result.bounds["modulus"]
         result = replace(result, distance=max(result.distance, nearest))
@@ -348,10 +326,10 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
         if each.channel is not None and each.requirement.channel is not None:
             sets.append((each.channel, each.requirement.channel))
     for members, channel in sets:
-        if isinstance(members, OwnGridSet):
+        if channel.own_grid is not None:
             continue
         given = channel.at(omega)
-        expansion = members.expand(Intervals(omega, np.zeros(omega.size), loop.plant.dt_s), 0)
+        expansion = members(Intervals(omega, np.zeros(omega.size), loop.plant.dt_s), 0)
         largest = max(largest, _difference(expansion.centre.value, given.centre))
         major, minor = given.direction * given.semi_major, 1j * given.direction * given.semi_minor
         rows = np.stack([[major.real, minor.real], [major.imag, minor.imag]]).transpose(2, 0, 1)
@@ -368,47 +346,42 @@ def _difference(form: Complex, value: Complex) -> float:
 
 
 def _bisect(
-    evaluate: Callable[[Intervals], _Bounds], edges: Real, dt_s: float, targets: dict[str, float]
-) -> tuple[list[_Bounds], int]:
-    """Refine until every interval is under every target or the budget is spent; the accepted pieces, and how
-    many were looked at. A middle above its target shows that the dense check missed the maximum: the target
-    rises to it."""
+    evaluate: Callable[[Intervals], _Bounds], edges: Real, dt_s: float, targets: Real
+) -> tuple[_Bounds, int]:
+    """Refine until every interval is under every target (K,) or the budget is spent; the accepted pieces in
+    ascending order, and how many were looked at. A middle above its target shows that the dense check missed
+    the maximum: the target rises to it."""
     low, high = edges[:-1], edges[1:]
-    targets = dict(targets)
     accepted: list[_Bounds] = []
     used = 0
     while low.size:
         found = evaluate(Intervals(0.5 * (low + high), 0.5 * (high - low), dt_s))
         used += low.size
-        wide = ~(found.distance > 0)
-        for kind in targets:
-            seen = found.middle[kind][np.isfinite(found.middle[kind])]
-            targets[kind] = max(targets[kind], (1.0 + _EXCESS) * float(np.max(seen, initial=0.0)))
-            wide |= found.upper[kind] > targets[kind]
+        seen = np.max(found.middle, axis=1, initial=0.0, where=np.isfinite(found.middle))
+        targets = np.maximum(targets, (1.0 + _EXCESS) * seen)
+        wide = ~(found.distance > 0) | np.any(found.upper > targets[:, None], axis=0)
         # An interval at the limit of double precision is as good as it gets.
         wide &= high - low > 1e-11 * high
         if used + _PARTS * int(np.sum(wide)) > _MOST_INTERVALS:
             wide[:] = False
-        accepted.append(found.part(~wide))
+        accepted.append(_Bounds._make(value[..., ~wide] for value in found))
         step = (high[wide] - low[wide]) / _PARTS
         starts = low[wide][:, None] + step[:, None] * np.arange(_PARTS)
         ends = np.concatenate([starts[:, 1:], high[wide][:, None]], axis=1)
         low, high = starts.reshape(-1), ends.reshape(-1)
-    return accepted, used
+    together = [np.concatenate(parts, axis=-1) for parts in zip(*accepted, strict=True)]
+    order = np.argsort(together[0], kind="stable")
+    return _Bounds._make(value[..., order] for value in together), used
 
 
-def _verdict(found: list[_Bounds], used: int, integrators: int, unstable: int) -> AllFrequencies:
-    centre = np.concatenate([part.intervals.centre for part in found])
-    order = np.argsort(centre, kind="stable")
-    bounds = {
-        name: float(np.max(np.concatenate([part.upper[name] for part in found]))) for name in found[0].upper
-    }
-    distances = np.concatenate([part.distance for part in found])[order]
-    start = np.concatenate([part.start for part in found])[order]
-    end = np.concatenate([part.end for part in found])[order]
-    distance = float(np.min(distances))
+def _verdict(
+    found: _Bounds, names: Sequence[str], used: int, integrators: int, unstable: int
+) -> AllFrequencies:
+    bounds = dict(zip(names, np.max(found.upper, axis=1).tolist(), strict=True))
+    start, end = found.start, found.end
+    distance = float(np.min(found.distance))
     if distance <= 0:
-        omega = float(centre[order][np.argmin(distances)])
+        omega = float(found.centre[np.argmin(found.distance)])
         return AllFrequencies.ended_by(Obstacle.NO_DISTANCE, omega, bounds=bounds, intervals=used)
     # Within an interval 1 + L stays in a half-plane, so the principal value of the turn from its start to its
     # end is the turn; at a joint the two estimates of one value differ by less than a quarter turn each.

@@ -3,13 +3,14 @@
 The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, generators scaled to the level. A
 posterior over coefficients is linear in them, so its generators are rational with known poles and everything
 between two frequencies can be bounded. A response known on its own frequencies only says nothing between
-them; the one assumption offered here is stated in `OwnGridSet`.
+them; the one assumption offered here is stated in `own_grid_set`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -57,10 +58,8 @@ class SetExpansion:
         return total
 
 
-class ExpandableSet(Protocol):
-    """Ellipses that can be bounded between frequencies."""
-
-    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion: ...
+Expand = Callable[[Intervals, int], SetExpansion]
+"""Ellipses bounded between frequencies: their expansion times (z - 1)^cleared on intervals."""
 
 
 @runtime_checkable
@@ -75,95 +74,77 @@ class FirstOrderUncertainty(Protocol):
         ...
 
 
-def expandable(channel: Channel, integrators: int, between_own_points: str) -> ExpandableSet | None:
-    """The channel's ellipses in expandable form, or None if nothing can be said between frequencies."""
+def expandable(channel: Channel, integrators: int, between_own_points: str) -> Expand | None:
+    """How the channel's ellipses expand, or None if nothing can be said between frequencies."""
     uncertainty = channel.uncertainty
-    if uncertainty is None:
-        return ExactSet(RationalResponse.from_state_space(channel.nominal, integrators))
-    if channel.own_grid is not None:
-        if between_own_points != "linear":
-            return None
-        return OwnGridSet(channel, RationalResponse.from_state_space(channel.nominal, integrators))
-    radius = radius_of(channel.level)
+    if channel.own_grid is not None and between_own_points != "linear":
+        return None
+    if uncertainty is None or channel.own_grid is not None:
+        nominal = RationalResponse.from_state_space(channel.nominal, integrators)
+        if uncertainty is None:
+            return lambda intervals, cleared: SetExpansion(nominal.expand(intervals, cleared), ())
+        return partial(own_grid_set, channel, nominal)
+    first_order: Callable[[Intervals, int], tuple[FirstOrder, FirstOrder]]
     if isinstance(uncertainty, ResponsePosterior):
-        return PosteriorSet(uncertainty, radius)
-    if isinstance(uncertainty, FirstOrderUncertainty):
-        return GivenSet(uncertainty, radius)
-    return None
+        first_order = partial(posterior_expansion, uncertainty)
+    elif isinstance(uncertainty, FirstOrderUncertainty):
+        first_order = uncertainty.first_order
+    else:
+        return None
+
+    def expand(intervals: Intervals, cleared: int) -> SetExpansion:
+        centre, generators = first_order(intervals, cleared)
+        return SetExpansion(centre, (generators.scaled(radius_of(channel.level)),))
+
+    return expand
 
 
-@dataclass(frozen=True, eq=False)
-class ExactSet:
-    """A plant without uncertainty."""
-
-    response: RationalResponse
-
-    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
-        return SetExpansion(self.response.expand(intervals, cleared), ())
-
-
-@dataclass(frozen=True, eq=False)
-class GivenSet:
-    """An uncertainty that expands itself."""
-
-    uncertainty: FirstOrderUncertainty
-    radius: float
-
-    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
-        centre, generators = self.uncertainty.first_order(intervals, cleared)
-        return SetExpansion(centre, (generators.scaled(self.radius),))
+def posterior_expansion(
+    posterior: ResponsePosterior, intervals: Intervals, cleared: int
+) -> tuple[FirstOrder, FirstOrder]:
+    """`FirstOrderUncertainty.first_order` of a Gaussian over coefficients of basis functions and impulse
+    response: every column is rational."""
+    value, slope, remainder = _columns(posterior, intervals)
+    factor = np.array(posterior.covariance_factor)
+    mean = np.array(posterior.mean)
+    h = intervals.half_width
+    centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), h)
+    spread = FirstOrder(value @ factor, slope @ factor, remainder @ np.linalg.norm(factor, axis=1), h)
+    # 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i
+    common = intervals.shift(posterior.integrators - posterior.input_delay_samples)
+    common = common.times(intervals.cleared(cleared - posterior.integrators))
+    return common.times(centre), common.times(spread)
 
 
-@dataclass(frozen=True, eq=False)
-class PosteriorSet:
-    """A Gaussian over coefficients of basis functions and impulse response: every column is rational."""
-
-    posterior: ResponsePosterior
-    radius: float
-
-    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
-        posterior = self.posterior
-        value, slope, remainder = self._columns(intervals)
-        factor = np.array(posterior.covariance_factor)
-        mean = np.array(posterior.mean)
-        h = intervals.half_width
-        centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), h)
-        spread = FirstOrder(value @ factor, slope @ factor, remainder @ np.linalg.norm(factor, axis=1), h)
-        # 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i
-        common = intervals.shift(posterior.integrators - posterior.input_delay_samples)
-        common = common.times(intervals.cleared(cleared - posterior.integrators))
-        return SetExpansion(common.times(centre), (common.times(spread).scaled(self.radius),))
-
-    def _columns(self, intervals: Intervals) -> tuple[Complex, Complex, Real]:
-        """Value, slope and remainder (F, P) of the columns of `ResponsePosterior.frequency_rows`, without
-        integrators and delay."""
-        posterior = self.posterior
-        columns: list[FirstOrder] = []
-        all_pass = intervals.constant(1.0)
-        for a in posterior.poles.real:
-            driven = all_pass.times(intervals.pole(complex(a - 1.0)))
-            columns.append(driven.scaled(float(np.sqrt((1 - a) * (1 + a)))))
-            all_pass = driven.times(_reflected_zero(complex(a), intervals))
-        for p in posterior.poles.pairs:
-            gamma = abs(p) ** 2
-            beta = 2 * p.real / (1 + gamma)
-            one_minus_gamma = (1 - abs(p.real)) * (1 + abs(p.real)) - p.imag**2
-            gain = float(np.sqrt(one_minus_gamma * (1 + gamma)))
-            other = float(np.sqrt(one_minus_gamma**2 + 4 * p.imag**2) / (1 + gamma))
-            driven = all_pass.times(intervals.pole(p - 1.0))
-            driven = driven.times(intervals.pole(p.conjugate() - 1.0))
-            columns.append(driven.times(intervals.zero(complex(beta - 1.0))).scaled(gain))
-            columns.append(driven.scaled(gain * other))
-            all_pass = driven.times(_reflected_zero(p, intervals))
-            all_pass = all_pass.times(_reflected_zero(p.conjugate(), intervals))
-        if posterior.has_feedthrough:
-            columns.append(intervals.constant(1.0))
-        columns += [intervals.shift(-lag) for lag in range(1, posterior.fir_length + 1)]
-        return (
-            np.stack([column.value for column in columns], axis=1),
-            np.stack([column.slope for column in columns], axis=1),
-            np.stack([column.remainder for column in columns], axis=1),
-        )
+def _columns(posterior: ResponsePosterior, intervals: Intervals) -> tuple[Complex, Complex, Real]:
+    """Value, slope and remainder (F, P) of the columns of `ResponsePosterior.frequency_rows`, without
+    integrators and delay."""
+    columns: list[FirstOrder] = []
+    all_pass = intervals.constant(1.0)
+    for a in posterior.poles.real:
+        driven = all_pass.times(intervals.pole(complex(a - 1.0)))
+        columns.append(driven.scaled(float(np.sqrt((1 - a) * (1 + a)))))
+        all_pass = driven.times(_reflected_zero(complex(a), intervals))
+    for p in posterior.poles.pairs:
+        gamma = abs(p) ** 2
+        beta = 2 * p.real / (1 + gamma)
+        one_minus_gamma = (1 - abs(p.real)) * (1 + abs(p.real)) - p.imag**2
+        gain = float(np.sqrt(one_minus_gamma * (1 + gamma)))
+        other = float(np.sqrt(one_minus_gamma**2 + 4 * p.imag**2) / (1 + gamma))
+        driven = all_pass.times(intervals.pole(p - 1.0))
+        driven = driven.times(intervals.pole(p.conjugate() - 1.0))
+        columns.append(driven.times(intervals.zero(complex(beta - 1.0))).scaled(gain))
+        columns.append(driven.scaled(gain * other))
+        all_pass = driven.times(_reflected_zero(p, intervals))
+        all_pass = all_pass.times(_reflected_zero(p.conjugate(), intervals))
+    if posterior.has_feedthrough:
+        columns.append(intervals.constant(1.0))
+    columns += [intervals.shift(-lag) for lag in range(1, posterior.fir_length + 1)]
+    return (
+        np.stack([column.value for column in columns], axis=1),
+        np.stack([column.slope for column in columns], axis=1),
+        np.stack([column.remainder for column in columns], axis=1),
+    )
 
 
 def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
@@ -173,44 +154,40 @@ def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
     return FirstOrder(factor.value + (1.0 - q), factor.slope, factor.remainder, factor.half_width)
 
 
-@dataclass(frozen=True, eq=False)
-class OwnGridSet:
+def own_grid_set(
+    channel: Channel, nominal: RationalResponse, intervals: Intervals, cleared: int
+) -> SetExpansion:
     """Ellipses on a user's own frequencies, with an assumption between them.
 
     Assumed: between neighbouring frequencies, at fraction x of the way, the response lies in (1 - x) E_k + x
     E_{k+1} (Minkowski sum): on a straight line between a member of one ellipse and a member of the next.
     Outside the range the nominal response stands alone.
     """
-
-    channel: Channel
-    nominal: RationalResponse
-
-    def expand(self, intervals: Intervals, cleared: int) -> SetExpansion:
-        own = self.channel.own_grid
-        assert own is not None
-        low, high = intervals.centre - intervals.half_width, intervals.centre + intervals.half_width
-        inside = (low >= own[0] * (1 - 1e-9)) & (high <= own[-1] * (1 + 1e-9))
-        left = np.clip(np.searchsorted(own, intervals.centre) - 1, 0, own.size - 2)
-        gap = own[left + 1] - own[left]
-        share = (intervals.centre - own[left]) / gap
-        ellipses = self.channel.at(own)
-        h = intervals.half_width
-        none = np.zeros(h.size)
-        clear = intervals.cleared(cleared)
-        c0, c1 = ellipses.centre[left], ellipses.centre[left + 1]
-        between = clear.times(FirstOrder(c0 + share * (c1 - c0), (c1 - c0) / gap, none, h))
-        alone = self.nominal.expand(intervals, cleared)
-        pairs = ((getattr(between, name), getattr(alone, name)) for name in ("value", "slope", "remainder"))
-        value, slope, remainder = (np.where(inside, here, there) for here, there in pairs)
-        centre = FirstOrder(value, slope, remainder, h)
-        axes = ellipses.direction[:, None] * np.stack(
-            [ellipses.semi_major + 0j, 1j * ellipses.semi_minor], axis=1
-        )
-        groups = []
-        for index, weight, rate in ((left, 1.0 - share, -1.0 / gap), (left + 1, share, 1.0 / gap)):
-            here = axes[index] * inside[:, None]
-            groups.append(clear.times(FirstOrder(here * weight[:, None], here * rate[:, None], none, h)))
-        return SetExpansion(centre, tuple(groups))
+    own = channel.own_grid
+    assert own is not None
+    low, high = intervals.centre - intervals.half_width, intervals.centre + intervals.half_width
+    inside = (low >= own[0] * (1 - 1e-9)) & (high <= own[-1] * (1 + 1e-9))
+    left = np.clip(np.searchsorted(own, intervals.centre) - 1, 0, own.size - 2)
+    gap = own[left + 1] - own[left]
+    share = (intervals.centre - own[left]) / gap
+    ellipses = channel.at(own)
+    h = intervals.half_width
+    none = np.zeros(h.size)
+    clear = intervals.cleared(cleared)
+    c0, c1 = ellipses.centre[left], ellipses.centre[left + 1]
+    between = clear.times(FirstOrder(c0 + share * (c1 - c0), (c1 - c0) / gap, none, h))
+    alone = nominal.expand(intervals, cleared)
+    pairs = ((getattr(between, name), getattr(alone, name)) for name in ("value", "slope", "remainder"))
+    value, slope, remainder = (np.where(inside, here, there) for here, there in pairs)
+    centre = FirstOrder(value, slope, remainder, h)
+    axes = ellipses.direction[:, None] * np.stack(
+        [ellipses.semi_major + 0j, 1j * ellipses.semi_minor], axis=1
+    )
+    groups = []
+    for index, weight, rate in ((left, 1.0 - share, -1.0 / gap), (left + 1, share, 1.0 / gap)):
+        here = axes[index] * inside[:, None]
+        groups.append(clear.times(FirstOrder(here * weight[:, None], here * rate[:, None], none, h)))
+    return SetExpansion(centre, tuple(groups))
 
 
 def stacked(columns: Sequence[FirstOrder]) -> FirstOrder:

@@ -12,7 +12,7 @@ from control_design import Channel, LoopFunction, RationalWeight, Specification,
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import frequency_response
 from control_design.plants.rational_response import RationalResponse
-from control_design.plants.set_expansion import OwnGridSet, PosteriorSet
+from control_design.plants.set_expansion import SetExpansion, own_grid_set, posterior_expansion
 from ident import Poles
 from ident.uncertainty import ResponsePosterior
 from validation.example_plants import LinkUncertainty
@@ -181,7 +181,8 @@ def test_posterior_expansion_holds_and_has_its_covariance(integrators):
     rng = np.random.default_rng(4)
     posterior = _posterior(rng, integrators)
     intervals = _intervals(rng)
-    expansion = PosteriorSet(posterior, 2.0).expand(intervals, 0)
+    centre, generators = posterior_expansion(posterior, intervals, 0)
+    expansion = SetExpansion(centre, (generators.scaled(2.0),))
     record = posterior.at(intervals.centre)
     np.testing.assert_allclose(expansion.centre.value, record.centre, rtol=1e-10)
     # covariance (F, 2, 2) of size |G|^2; entries near zero carry the rounding of the largest
@@ -221,13 +222,13 @@ def test_own_grid_with_the_straight_line_assumption_is_the_sum_of_neighbours():
         {"omega_rad_s": own, "centre": frequency_response(arm, own), "covariance": covariance, "level": 0.95},
     )()
     channel = Channel(arm, record)
-    members = OwnGridSet(channel, RationalResponse.from_state_space(arm, 1))
+    nominal = RationalResponse.from_state_space(arm, 1)
     left, right = channel.at(own[2:3]), channel.at(own[3:4])
     for share in (0.0, 0.3, 1.0):
         omega = own[2:3] + share * (own[3] - own[2])
         middle = 0.5 * (own[2:3] + own[3:4])
         intervals = Intervals(middle, 0.5 * (own[3:4] - own[2:3]), _DT)
-        expansion = members.expand(intervals, 0)
+        expansion = own_grid_set(channel, nominal, intervals, 0)
         x = omega - middle
         centre = expansion.centre.value + expansion.centre.slope * x
         np.testing.assert_allclose(centre, (1 - share) * left.centre + share * right.centre)
