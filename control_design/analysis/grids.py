@@ -11,7 +11,6 @@ from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import GridOptions, dense_grid, lean_grid
 from control_design.plants.plant_set import Mode, UncertainPlant
 from control_design.specification import Specification
-from control_design.specification.specification import performance_modes
 
 
 class Grids:
@@ -57,7 +56,7 @@ def _grid_modes(plant: UncertainPlant, specification: Specification) -> tuple[Mo
     if specification.mode_peak_ratio is not None:
         modes += [
             m
-            for m in performance_modes(plant)
+            for m in plant.damped.modes
             if all(abs(m.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
         ]
     return tuple(modes)

@@ -78,6 +78,18 @@ class Channel:
             return None
         return np.asarray(self.uncertainty.omega_rad_s, dtype=np.float64)
 
+    @cached_property
+    def poles(self) -> Complex:
+        """Nominal poles in z, (n,)."""
+        if self.nominal.nstates == 0:
+            return np.zeros(0, complex)
+        return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """Flexible modes of the nominal, below the Nyquist frequency."""
+        return tuple(m for m in modes_of(self.poles, self.dt_s) if m.omega_rad_s < np.pi / self.dt_s)
+
     def nominal_response(self, omega_rad_s: Real) -> Complex:
         """G_nom(e^{j omega dt}), (F,); see `frequency_response`."""
         return frequency_response(self.nominal, omega_rad_s)
@@ -262,12 +274,15 @@ class UncertainPlant:
     def nyquist_rad_s(self) -> float:
         return float(np.pi / self.dt_s)
 
-    @cached_property
+    @property
+    def damped(self) -> Channel:
+        """The channel whose |Gp S| the damping requirement bounds."""
+        return self.channel if self.performance is None else self.performance
+
+    @property
     def poles(self) -> Complex:
         """Nominal poles in z, (n,)."""
-        if self.nominal.nstates == 0:
-            return np.zeros(0, complex)
-        return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
+        return self.channel.poles
 
     @cached_property
     def zeros(self) -> Complex:
@@ -293,10 +308,10 @@ class UncertainPlant:
         nearest_first = np.argsort(np.abs(self.poles - 1.0), kind="stable")
         return self.poles[nearest_first][self.n_integrators :]
 
-    @cached_property
+    @property
     def modes(self) -> tuple[Mode, ...]:
         """Flexible modes of the nominal, below the Nyquist frequency."""
-        return tuple(m for m in modes_of(self.poles, self.dt_s) if m.omega_rad_s < self.nyquist_rad_s)
+        return self.channel.modes
 
     @property
     def own_grid(self) -> npt.NDArray[np.float64] | None:

@@ -22,8 +22,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
-from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, modes_of
+from control_design.plants.ellipses import Real
+from control_design.plants.plant_set import UncertainPlant, count_integrators
 from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight
 from control_design.specification.requirement import (
     Findings,
@@ -279,7 +279,7 @@ class ModePeak(WeightedRequirement):
         """SpecificationError if the plant has no flexible mode and no band is given."""
         if spec.mode_peak_ratio is None:
             return None
-        band, modes = spec.mode_band_rad_s, performance_modes(plant)
+        band, modes = spec.mode_band_rad_s, plant.damped.modes
         if band is None:
             if not modes:
                 raise SpecificationError(
@@ -292,8 +292,7 @@ class ModePeak(WeightedRequirement):
             width = max(mode.zeta * mode.omega_rad_s, 1e-9)
             omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
         omega = np.unique(omega[(omega >= band[0]) & (omega <= high)])
-        channel = plant.channel if plant.performance is None else plant.performance
-        peak = float(np.max(np.abs(channel.nominal_response(omega))))
+        peak = float(np.max(np.abs(plant.damped.nominal_response(omega))))
         weight = constant_weight(1.0 / (spec.mode_peak_ratio * peak))
         return cls(weight, band, channel=plant.performance)
 
@@ -439,12 +438,3 @@ def _refuse_effort(spec: Specification, plant: UncertainPlant) -> None:
             f"{needed:.4g}, the effort limit there is {1.0 / effort[worst]:.4g}; the two contradict each "
             f"other: both would have to be relaxed by a factor of {bound[worst]:.3g}"
         )
-
-
-def performance_modes(plant: UncertainPlant) -> tuple[Mode, ...]:
-    """Flexible modes of the channel the damping requirement looks at."""
-    if plant.performance is None:
-        return plant.modes
-    nominal = plant.performance.nominal
-    poles: Complex = np.asarray(nominal.poles(), dtype=np.complex128)
-    return tuple(m for m in modes_of(poles, plant.dt_s) if m.omega_rad_s < plant.nyquist_rad_s)

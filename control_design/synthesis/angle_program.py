@@ -21,6 +21,7 @@ from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.interrupts import interrupts_kept
+from control_design.synthesis.synthesis_result import StartReport
 
 Symbol = Any  # casadi.SX; its stubs disagree with its own arithmetic on numpy arrays
 
@@ -44,18 +45,6 @@ class Rows:
     reaches_nyquist: bool
 
 
-@dataclass(frozen=True, eq=False)
-class NlpPoint:
-    """A solution or start of the programme: controller parameters, g = 1/gamma, angles per plant
-    (unwrapped)."""
-
-    parameters: Real
-    g: float
-    angles: tuple[Real, ...]
-    status: str = ""
-    iterations: int = 0
-
-
 class AngleProgram:
     """One NLP for fixed structure and grid; `solve` may be called from many starts."""
 
@@ -72,13 +61,8 @@ class AngleProgram:
         self.plants = tuple(plants)
         x = ca.SX.sym("x", cascade.parameters)
         g = ca.SX.sym("g")
-        variables, lower, upper = (
-            [x, g],
-            [-np.inf] * cascade.parameters + [1e-4],
-            [np.inf] * cascade.parameters + [1e4],
-        )
-        bound = parameter_bounds(cascade)
-        lower[: cascade.parameters], upper[: cascade.parameters] = list(bound[0]), list(bound[1])
+        low, high = parameter_bounds(cascade)
+        variables, lower, upper = [x, g], [*low, 1e-4], [*high, 1e4]
         rows: list[Symbol] = []
         row_lower: list[Real] = []
         row_upper: list[Real] = []
@@ -128,11 +112,7 @@ class AngleProgram:
                 if function.of_controller:
                     row = row * ca.sqrt(k_re**2 + k_im**2 + 1e-16)
                 add((margin - row)[use], 0.0, np.inf)
-        nlp: dict[str, Any] = {
-            "x": ca.vertcat(*variables),
-            "f": -ca.log(g),
-            "g": ca.vertcat(*rows),
-        }
+        nlp: dict[str, Any] = {"x": ca.vertcat(*variables), "f": -ca.log(g), "g": ca.vertcat(*rows)}
         self._bounds = np.array(lower), np.array(upper)
         self._row_bounds = np.concatenate(row_lower), np.concatenate(row_upper)
         options: dict[str, Any] = {
@@ -167,29 +147,29 @@ class AngleProgram:
             re, im = re * f_re - im * f_im, re * f_im + im * f_re
         return re, im
 
-    def solve(self, start: NlpPoint) -> NlpPoint:
-        """Maximise log g from a start; KeyboardInterrupt if one came meanwhile (IPOPT would end early)."""
-        initial = np.concatenate([start.parameters, [start.g], *start.angles])
-        initial = np.clip(initial, self._bounds[0], self._bounds[1])
+    def solve(self, parameters: Real, gamma: float) -> tuple[Real, StartReport]:
+        """Maximise log g from controller parameters and their gamma; KeyboardInterrupt if one came meanwhile
+        (IPOPT would end early).
+
+        The angles start along the nearest unwrapped phase of 1 + L.
+        """
+        initial: list[Real] = [parameters, np.array([1.0 / min(max(gamma, 1e-3), 1e3)])]
+        for plant in self.plants:
+            loop = self.cascade.response(parameters, plant.ellipses.omega_rad_s) * plant.delay
+            phase = np.unwrap(np.angle(1.0 + plant.ellipses.centre * loop))
+            middle = 0.5 * (plant.start_window[0] + plant.start_window[1])
+            initial.append(phase - 2 * np.pi * np.round((phase[0] - middle) / (2 * np.pi)))
         with interrupts_kept():
             answer = self._solver(
-                x0=initial,
+                x0=np.clip(np.concatenate(initial), *self._bounds),
                 lbx=self._bounds[0],
                 ubx=self._bounds[1],
                 lbg=self._row_bounds[0],
                 ubg=self._row_bounds[1],
             )
-        values = np.asarray(answer["x"]).ravel()
-        stats = self._solver.stats()
-        n = self.cascade.parameters
-        angles, at = [], n + 1
-        for plant in self.plants:
-            size = plant.ellipses.omega_rad_s.size
-            angles.append(values[at : at + size])
-            at += size
-        return NlpPoint(
-            values[:n], float(values[n]), tuple(angles), str(stats["return_status"]), int(stats["iter_count"])
-        )
+        values, stats, n = np.asarray(answer["x"]).ravel(), self._solver.stats(), self.cascade.parameters
+        gamma = 1.0 / float(values[n])
+        return values[:n], StartReport(str(stats["return_status"]), int(stats["iter_count"]), gamma, None)
 
 
 def _over(coefficients: Sequence[Symbol], v: Real, size: Real) -> tuple[Symbol, Symbol]:

@@ -14,7 +14,8 @@ Newton's method: good for a direction, not for a certificate.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,15 +33,6 @@ _PATIENCE, _SLOW = 15, 1e-3  # give up where so many steps gain less than this s
 _LEAST_GAIN = 1e-7  # predicted gain of a step, in the logarithm, not worth taking
 _FAR_BELOW = 2.5  # rows this far (in log) below the worst cannot become it within one step and are left out
 _REFINEMENTS = 2  # Newton steps from the vertex of the parabola to the worst member
-
-
-@dataclass(frozen=True, eq=False)
-class Descended:
-    """Where the descent ended: parameters, the worst case it saw (boundary points, its grid), steps taken."""
-
-    parameters: Real
-    gamma: float
-    steps: int
 
 
 class MinimaxDescent:
@@ -69,12 +61,13 @@ class MinimaxDescent:
         logs = self._logs(parameters)
         return float("inf") if logs is None else float(np.exp(np.max(logs)))
 
-    def run(self, start: Real, steps: int) -> Descended:
-        """At most `steps` steps from a start with stable nominal loops."""
+    def run(self, start: Real, steps: int) -> tuple[Real, float, int]:
+        """At most `steps` steps from a start with stable nominal loops: parameters where it ended, the worst
+        case seen there (boundary points, own grid; inf: the start is unstable), steps taken."""
         x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
         logs = self._logs(x)
         if logs is None:
-            return Descended(x, float("inf"), 0)
+            return x, float("inf"), 0
         best, box, taken = float(np.max(logs)), _FIRST_BOX, 0
         local: _Local | None = None
         multipliers: Real | None = None
@@ -113,7 +106,7 @@ class MinimaxDescent:
                 box *= 0.35
             if box < _SMALLEST_BOX:
                 break
-        return Descended(x, float(np.exp(best)), taken)
+        return x, float(np.exp(best)), taken
 
     def _logs(self, x: Real) -> Real | None:
         """Logarithms (R,) of all weighted values; None for an unstable loop or an ellipse over -1."""
@@ -154,26 +147,16 @@ class MinimaxDescent:
             return None
         multipliers = np.zeros(log.size)
         multipliers[near] = step.multipliers
-        return MinimaxStep(step.step, step.level, multipliers)
+        return replace(step, multipliers=multipliers)
 
 
-@dataclass(frozen=True, eq=False)
-class _Local:
+class _Local(NamedTuple):
     """Model at a point: log (R,), slope (R, n), curvature (n, n), natural unit of each parameter (n,)."""
 
     log: Real
     slope: Real
     curvature: Real
     unit: Real
-
-
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """Rows of one closed-loop function: positions of its frequencies and weights there, (D,) each."""
-
-    function: LoopFunction
-    index: npt.NDArray[np.int64]
-    weight: Real
 
 
 class _Boundary:
@@ -191,13 +174,14 @@ class _Boundary:
         )
         self._powers = 1j * tustin_frequency(self._omega, cascade.dt_s) / cascade.scale_rad_s
         self._powers = np.where(np.abs(self._powers) > 1e6, 1e6j, self._powers)
-        self._blocks: list[_Block] = []
+        # Of one closed-loop function each: positions of its frequencies and weights there, (D,).
+        self._blocks: list[tuple[LoopFunction, npt.NDArray[np.int64], Real]] = []
         for function in LoopFunction:
             sizes = [size for of, size in rows.weights if of is function]
             weight = np.max(sizes, axis=0) if sizes else np.zeros(0)
             if np.any(weight > 0):
                 index = np.flatnonzero(weight > 0)
-                self._blocks.append(_Block(function, index, weight[index]))
+                self._blocks.append((function, index, weight[index]))
 
     def covers_minus_one(self, x: Real) -> bool:
         """Whether some ellipse contains -1/K; its boundary alone would not show it."""
@@ -219,18 +203,17 @@ class _Boundary:
         relative = self._relative_slope(x) if gradient else np.zeros((k.size, 0))  # dK/K
         turned = -(nearest * k / back)[:, None] * relative
         logs, slopes = [], []
-        for block in self._blocks:
-            at = block.index
-            of_k = size[at] if block.function.of_controller else 0.0
-            if block.function.of_plant:
+        for function, at, weight in self._blocks:
+            of_k = size[at] if function.of_controller else 0.0
+            if function.of_plant:
                 worst, _, _ = self._loudest(k[at], at)
                 here = 1.0 + worst * k[at]
                 gain = np.abs(worst) / np.maximum(np.abs(here), 1e-300)
-                log = np.log(block.weight * gain) + of_k
+                log = np.log(weight * gain) + of_k
                 slope = -(worst * k[at] / here)[:, None] * relative[at]
             else:
-                log, slope = np.log(block.weight) + of_k + distance[at], turned[at]
-            if block.function.of_controller:
+                log, slope = np.log(weight) + of_k + distance[at], turned[at]
+            if function.of_controller:
                 slope = slope + relative[at]
             logs.append(log)
             slopes.append(slope.real)
@@ -247,12 +230,12 @@ class _Boundary:
         shared, of_controller = np.zeros(k.size), np.zeros(k.size)
         total, second = np.zeros((x.size, x.size)), np.zeros(k.size, dtype=np.complex128)
         start = 0
-        for block in self._blocks:
-            at, own = block.index, multipliers[start : start + block.index.size]
+        for function, at, _ in self._blocks:
+            own = multipliers[start : start + at.size]
             start += at.size
-            if block.function.of_controller:
+            if function.of_controller:
                 of_controller[at] += own
-            if block.function.of_plant:
+            if function.of_plant:
                 more, factor = self._bent(
                     relative[at], k[at], own, self._loudest(k[at], at), np.ones(at.size)
                 )

@@ -21,7 +21,6 @@ Told = Callable[[float, str], None]
 _DRAWS = 200  # shaped loops drawn; each costs 1 ms
 _EASED = 4  # with tracking: low-gain starts given to the interior point first
 _SHAPED_TRACKING = 3
-_STEPS = 100
 _CARRIED = 3  # candidates carried through the exchange
 _HOPS, _LATER_HOPS = 4, 2
 _HALVINGS = 20  # natural units of a section far from the loop's crossover are far too large
@@ -136,7 +135,7 @@ class OrderSearch:
         return best <= self.options.sufficient_gamma
 
     def _task(self, parameters: Real, *, eased: bool = False) -> StartTask:
-        return StartTask(self.cascade, parameters, tuple(self.problem.grids), _STEPS, eased)
+        return StartTask(self.cascade, parameters, tuple(self.problem.grids), eased)
 
     def _taken(self, end: Candidate) -> Candidate:
         self.reports += end.reports

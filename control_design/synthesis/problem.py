@@ -17,7 +17,7 @@ from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
-from control_design.synthesis.angle_program import NlpPoint, Rows
+from control_design.synthesis.angle_program import Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
 _LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points of a dense grid
@@ -165,17 +165,6 @@ class Problem(Grids):
             input_limit=self.spec.input_limit,
             rate_limit=self.spec.rate_limit,
         )
-
-    def at(self, cascade: Cascade, parameters: Real, rows: Sequence[Rows], gamma: float) -> NlpPoint:
-        """Programme point for given controller parameters: angles along the nearest unwrapped phase of 1 +
-        L."""
-        angles = []
-        for plant in rows:
-            loop = cascade.response(parameters, plant.ellipses.omega_rad_s) * plant.delay
-            phase = np.unwrap(np.angle(1.0 + plant.ellipses.centre * loop))
-            middle = 0.5 * (plant.start_window[0] + plant.start_window[1])
-            angles.append(phase - 2 * np.pi * np.round((phase[0] - middle) / (2 * np.pi)))
-        return NlpPoint(np.asarray(parameters), 1.0 / min(max(gamma, 1e-3), 1e3), tuple(angles))
 
     def add_violated(self, cascade: Cascade, parameters: Real, gamma_grid: float, most: int = 12) -> int:
         """Put maxima of the dense check that exceed the grid's gamma on the grids; how many were new."""

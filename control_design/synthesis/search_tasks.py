@@ -16,6 +16,8 @@ from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
 
+_STEPS = 100  # of the descent
+
 
 @dataclass(frozen=True, eq=False)
 class StartTask:
@@ -28,7 +30,6 @@ class StartTask:
     cascade: Cascade
     parameters: Real
     grids: tuple[Real, ...]
-    steps: int
     eased: bool = False
 
 
@@ -70,17 +71,16 @@ class Workshop:
         descent = self.descent(task.cascade, task.grids)
         start, reports = task.parameters, []
         if task.eased:
-            program = self._eased_program(task)
             gamma = self.problem.gamma(task.cascade, start, eased=True)
-            point = program.solve(self.problem.at(task.cascade, start, program.plants, gamma))
-            reports.append(StartReport(point.status, point.iterations, 1.0 / point.g, None))
-            if np.isfinite(descent.value(point.parameters)):
-                start = point.parameters
-        end = descent.run(start, task.steps)
-        dense = self.problem.gamma(task.cascade, end.parameters) if np.isfinite(end.gamma) else float("inf")
-        seen = min(end.gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
-        reports.append(StartReport("descent", end.steps, *seen))
-        return Candidate(end.parameters, end.gamma, dense, tuple(reports))
+            found, report = self._eased_program(task).solve(start, gamma)
+            reports.append(report)
+            if np.isfinite(descent.value(found)):
+                start = found
+        end, gamma, steps = descent.run(start, _STEPS)
+        dense = self.problem.gamma(task.cascade, end) if np.isfinite(gamma) else float("inf")
+        seen = min(gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
+        reports.append(StartReport("descent", steps, *seen))
+        return Candidate(end, gamma, dense, tuple(reports))
 
     def _eased_program(self, task: StartTask) -> AngleProgram:
         if self._program is None:

@@ -27,13 +27,12 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
     margin, lies deepest over -1; a guard by the frequency where it comes nearest to -1; a controller that
     rings too much by its own least damped pair.
     """
-    unstable: list[tuple[float, BlockingPoint]] = []
-    covered: list[tuple[float, BlockingPoint]] = []
+    found: list[tuple[int, float, BlockingPoint]] = []
     loops = problem.closed_loop_poles(cascade, parameters)
     for plant, z in zip(problem.plants, loops, strict=True):
         for pole in z[(np.abs(z) >= 1.0) & (z.imag >= 0) & np.isfinite(z)]:
             frequency = float(np.abs(np.log(pole))) / problem.dt_s
-            unstable.append((-float(np.abs(pole)), BlockingPoint(plant.name, NOMINAL, frequency, np.inf)))
+            found.append((0, -float(np.abs(pole)), BlockingPoint(plant.name, NOMINAL, frequency, np.inf)))
     for _, data in problem.checks(cascade, parameters):
         name, omega = data.plant.name, data.ellipses.omega_rad_s
         k = cascade.response(parameters, omega)
@@ -44,11 +43,9 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
             scale = scale_to_minus_one(k * data.delay * delay, data.ellipses)
             for at in local_maxima(-scale)[:_PLACES]:
                 if scale[at] <= 1.0:
-                    point = BlockingPoint(name, word, float(omega[at]), np.inf)
-                    covered.append((float(scale[at]), point))
-    found = [point for _, point in sorted(unstable, key=lambda entry: entry[0])]
-    found += [point for _, point in sorted(covered, key=lambda entry: entry[0])]
-    return tuple(found or _guards(problem, cascade, parameters) or _ringing(problem, cascade, parameters))
+                    found.append((1, float(scale[at]), BlockingPoint(name, word, float(omega[at]), np.inf)))
+    points = [point for *_, point in sorted(found, key=lambda entry: entry[:2])]
+    return tuple(points or _guards(problem, cascade, parameters) or _ringing(problem, cascade, parameters))
 
 
 def _guards(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:

@@ -291,10 +291,8 @@ def _in_sections(
         if kind == "second_order" and pairs:
             numerators.append(pairs.pop())
         else:
-            take, singles = (
-                singles[: 2 if kind == "second_order" else 1],
-                singles[2 if kind == "second_order" else 1 :],
-            )
+            count = 2 if kind == "second_order" else 1
+            take, singles = singles[:count], singles[count:]
             numerators.append(np.atleast_1d(np.real(np.poly(take))))
     x: list[float] = []
     for number, (kind, top, bottom) in enumerate(zip(sections, numerators, denominators, strict=True)):

@@ -24,12 +24,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 solves, delay = int(sys.argv[1]), float(sys.argv[2])
 plain, count = AngleProgram.solve, 0
 
-def solve(self, start):
+def solve(self, parameters, gamma):
     global count
     count += 1
     if count == solves:
         threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT)).start()
-    return plain(self, start)
+    return plain(self, parameters, gamma)
 
 AngleProgram.solve = solve
 try:

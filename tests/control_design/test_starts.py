@@ -81,9 +81,9 @@ def test_shaped_starts_damp_already_where_random_ones_do_not():
 def test_descent_never_loses_and_stays_stable():
     problem, cascade, descent = _search(_damping(4))
     for start, score in _starts(problem, cascade, descent, 2).shaped(60, 3):
-        end = descent.run(start, 25)
-        assert end.gamma <= score
-        assert problem.stable(cascade, end.parameters)
+        end, gamma, _ = descent.run(start, 25)
+        assert gamma <= score
+        assert problem.stable(cascade, end)
 
 
 def test_descent_sees_the_exact_worst_case_of_the_ellipses():
