@@ -15,13 +15,14 @@ from typing import Literal
 import control
 import numpy as np
 
-from control_design.plants.ellipses import Complex, Real, readonly_complex, readonly_real
+from control_design.plants.ellipses import Complex, Real
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.plant_set import UncertainPlant, frequency_response
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
+from ident.data.arrays import lock
 
 Scenario = Literal["A", "B", "C"]
 
@@ -62,9 +63,8 @@ class ResponseRecord:
     level: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "omega_rad_s", readonly_real(self.omega_rad_s))
-        object.__setattr__(self, "centre", readonly_complex(self.centre))
-        object.__setattr__(self, "covariance", readonly_real(self.covariance))
+        lock(self, "omega_rad_s", "covariance")
+        lock(self, "centre", dtype=np.complex128)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real, readonly_complex, readonly_real
+from control_design.plants.ellipses import Complex, Real
+from ident.data.arrays import lock
 
 
 class SampledMachine(Protocol):
@@ -89,11 +90,8 @@ class ClosedLoopTrajectory:
     measured_index: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "reference", "output", "command"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        limited = np.array(self.limited, dtype=np.bool_)
-        limited.setflags(write=False)
-        object.__setattr__(self, "limited", limited)
+        lock(self, "time_s", "reference", "output", "command")
+        lock(self, "limited", dtype=np.bool_)
         n = self.time_s.size
         shapes = {f.name: np.shape(getattr(self, f.name)) for f in fields(self)[:5]}
         if self.output.ndim != 2 or any(shape[0] != n for shape in shapes.values()):
@@ -212,9 +210,8 @@ class MeasuredSensitivity:
     limited_fraction: float
 
     def __post_init__(self) -> None:
-        for name in ("omega_rad_s", "std"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        object.__setattr__(self, "response", readonly_complex(self.response))
+        lock(self, "omega_rad_s", "std")
+        lock(self, "response", dtype=np.complex128)
         if not self.omega_rad_s.shape == self.response.shape == self.std.shape == (self.omega_rad_s.size,):
             raise ValueError("omega_rad_s, response and std must be (F,)")
 

@@ -14,8 +14,9 @@ import scipy.io
 import scipy.linalg
 
 from control_design.controllers.law import Law
-from control_design.plants.ellipses import Complex, Real, readonly_real
+from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import delayed
+from ident.data.arrays import lock
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,8 @@ class Controller(Law):
         )
         if gain.shape != (n, 1) or not np.all(np.isfinite(gain)):
             raise ValueError(f"anti_windup_gain must be finite and ({n}, 1); got shape {gain.shape}")
-        object.__setattr__(self, "anti_windup_gain", readonly_real(gain))
+        object.__setattr__(self, "anti_windup_gain", gain)
+        lock(self, "anti_windup_gain")
         if n and (self.input_limit is not None or self.rate_limit is not None):
             radius = float(np.max(np.abs(np.linalg.eigvals(self.A - gain @ self.C))))
             if not radius < 1:

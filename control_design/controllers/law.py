@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Self
 import control
 import numpy as np
 
-from control_design.plants.ellipses import Complex, Real, readonly_real
+from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import frequency_response
+from ident.data.arrays import lock
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,7 @@ class Law:
     dt_s: float
 
     def __post_init__(self) -> None:
-        for name in ("A", "B", "C", "D"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
+        lock(self, *"ABCD")
         n = self.A.shape[0]
         shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
         if shapes != {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}:

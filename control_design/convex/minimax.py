@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +63,12 @@ class PlaneRows:
             self.e + np.einsum("rj,rj->r", self.E, y[self.at]) - np.hypot(vector[:, 0], vector[:, 1])
         )
 
+    def ratio(self, y: Real) -> Real:
+        """Numerator over denominator for y (F, 2): (R,); infinite where the denominator is not positive."""
+        below = self.denominator(y)
+        with np.errstate(divide="ignore"):
+            return np.where(below > 0, self.numerator(y) / np.maximum(below, 1e-300), np.inf)
+
 
 def turning(factor: Complex) -> Real:
     """Multiplication by complex factors (R,) as matrices (R, 2, 2) on (real, imaginary)."""
@@ -75,17 +82,14 @@ def plane(value: Complex) -> Real:
     return np.stack([value.real, value.imag], axis=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class MinimaxPoint:
-    """x (n,) of the original basis, gamma = largest ratio there, y (F,) complex; steps: Newton steps spent.
+class MinimaxPoint(NamedTuple):
+    """x (n,) of the original basis, gamma = largest ratio there.
 
     gamma is infinite if no x was found for which every denominator is positive.
     """
 
     x: Real
     gamma: float
-    y: Complex
-    steps: int
 
 
 def smallest_ratio(
@@ -104,25 +108,18 @@ def smallest_ratio(
             if np.min(rows.denominator(step.y(z))) > 0.05:
                 break
             z = 0.7 * z
-    spent = 0
-    if not np.min(rows.denominator(step.y(z))) > 0:
-        z, spent = step.lower(z, 0.0, np.ones(rows.at.size), stop_below=-1e-3, feasibility=True)
-        if not np.min(rows.denominator(step.y(z))) > 0:
-            y = step.y(z)
-            return MinimaxPoint(step.original(z), float("inf"), y[:, 0] + 1j * y[:, 1], spent)
+    if not np.isfinite(step.ratio(z)):
+        z = step.lower(z, 0.0, np.ones(rows.at.size), stop_below=-1e-3, feasibility=True)
     gamma = step.ratio(z)
-    for _ in range(most_rounds):
-        scale = rows.denominator(step.y(z))
-        new, used = step.lower(z, gamma, scale)
-        spent += used
+    for _ in range(most_rounds if np.isfinite(gamma) else 0):
+        new = step.lower(z, gamma, rows.denominator(step.y(z)))
         reached = step.ratio(new)
         if not reached < gamma:
             break
         gain, z, gamma = gamma - reached, new, reached
         if gain < _GAP * gamma or step.constant:
             break
-    y = step.y(z)
-    return MinimaxPoint(step.original(z), gamma, y[:, 0] + 1j * y[:, 1], spent)
+    return MinimaxPoint(step.original(z), gamma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +205,12 @@ class _Scaled:
         return np.asarray(np.linalg.lstsq(seen, -self.rows.a.reshape(-1), rcond=None)[0])
 
     def ratio(self, z: Real) -> float:
-        y = self.y(z)
-        below = self.rows.denominator(y)
-        return float(np.max(self.rows.numerator(y) / below)) if np.min(below) > 0 else float("inf")
+        return float(np.max(self.rows.ratio(self.y(z))))
 
     def lower(
         self, z: Real, gamma: float, scale: Real, *, stop_below: float = -np.inf, feasibility: bool = False
-    ) -> tuple[Real, int]:
-        """Minimise max h, h = (|A y + a| - gamma m(y))/scale; for feasibility h = -m(y).
+    ) -> Real:
+        """z with the smallest max h, h = (|A y + a| - gamma m(y))/scale; for feasibility h = -m(y).
 
         Primal-dual interior point for min v, h - v + slack = 0, with predictor and corrector. The slacks are
         variables of their own: with h < v kept throughout, one early row at its boundary stopped all others.
@@ -232,10 +227,9 @@ class _Scaled:
         slack = v - h
         dual = 1.0 / slack
         dual /= np.sum(dual)
-        best, best_value, spent = z, begin, 0
+        best, best_value = z, begin
         final = feasibility or self.constant
-        while spent < _MOST_STEPS:
-            spent += 1
+        for _ in range(_MOST_STEPS):
             by_row, hessian = self._derivatives(z, weight, factor, scale, dual)
             miss = h - v + slack
             ratio = dual / slack
@@ -286,7 +280,7 @@ class _Scaled:
                 and np.max(h - v + slack) < enough
             ):
                 break
-        return best, spent
+        return best
 
     def _parts(self, z: Real, rounding: Real) -> tuple[Real, Real, Real, Real, Real]:
         """Vectors A y + a and C y + c, their rounded sizes, and e + E y."""

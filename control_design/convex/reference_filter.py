@@ -274,8 +274,7 @@ class _Matching:
         rows = PlaneRows.stacked(parts)
         whole = np.concatenate(bases)
         if whole.shape[1] == 0:
-            nothing = np.zeros(whole.shape[0], complex)
-            return MinimaxPoint(np.zeros(0), float(np.max(rows.numerator(plane(nothing)))), nothing, 0)
+            return MinimaxPoint(np.zeros(0), float(np.max(rows.numerator(np.zeros((whole.shape[0], 2))))))
         return smallest_ratio(whole, rows)
 
     def _full(self, poles: Poles, x: Real) -> Real:

@@ -223,21 +223,16 @@ class BracketProblem:
         return found.worst, found.gamma, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
     def _disc(self, data: PlantData, region: Region, start: Real | None) -> MinimaxPoint:
-        basis = self._basis(data)
-        if start is not None and not np.min(self._rows(data, region).denominator(plane(basis @ start))) > 0:
+        basis, rows = self._basis(data), self._rows(data, region)
+        if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
             start = None
-        return smallest_ratio(basis, self._rows(data, region), start)
+        return smallest_ratio(basis, rows, start)
 
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
-        basis = self._basis(data)
-        loop = self._loop(data)
+        basis, loop = self._basis(data), self._loop(data)
         point: MinimaxPoint | None = None
         for _ in range(self.options.ellipse_rounds):
-            angles = (
-                np.zeros(data.ellipses.omega_rad_s.size)
-                if start is None
-                else _best_angles(loop, data, basis @ start)
-            )
+            angles = None if start is None else _best_angles(loop, data, basis @ start)
             rows = self._rows(data, "ellipse", angles)
             if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
                 start = None
@@ -308,12 +303,8 @@ class BracketProblem:
             sensitivity = loop.sensitivity + loop.sensitivity_slope * y
             k = (loop.effort + loop.effort_slope * y) / np.where(sensitivity == 0, 1e-300, sensitivity)
             return worst_of(self.dense.weighted(k))
-        rows = self._rows(self.dense, region)
-        below = rows.denominator(plane(y))
-        with np.errstate(divide="ignore"):
-            ratio = np.where(below > 0, rows.numerator(plane(y)) / np.maximum(below, 1e-300), np.inf)
-        values = np.zeros(y.size)
-        np.maximum.at(values, rows.at, ratio)
+        rows, values = self._rows(self.dense, region), np.zeros(y.size)
+        np.maximum.at(values, rows.at, rows.ratio(plane(y)))
         return values
 
 

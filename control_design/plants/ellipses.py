@@ -13,22 +13,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from ident.data.arrays import lock
+
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
-
-
-def readonly_real(value: npt.ArrayLike) -> Real:
-    """Copy to float64 and lock."""
-    array = np.array(value, dtype=np.float64)
-    array.setflags(write=False)
-    return array
-
-
-def readonly_complex(value: npt.ArrayLike) -> Complex:
-    """Copy to complex128 and lock."""
-    array = np.array(value, dtype=np.complex128)
-    array.setflags(write=False)
-    return array
 
 
 def radius_of(level: float) -> float:
@@ -74,10 +62,8 @@ class Ellipses:
     direction: Complex
 
     def __post_init__(self) -> None:
-        for name in ("omega_rad_s", "semi_major", "semi_minor"):
-            object.__setattr__(self, name, readonly_real(getattr(self, name)))
-        for name in ("centre", "direction"):
-            object.__setattr__(self, name, readonly_complex(getattr(self, name)))
+        lock(self, "omega_rad_s", "semi_major", "semi_minor")
+        lock(self, "centre", "direction", dtype=np.complex128)
         shapes = {field.name: getattr(self, field.name).shape for field in fields(self)}
         if self.omega_rad_s.ndim != 1 or len(set(shapes.values())) != 1:
             raise ValueError(f"ellipses need arrays of one shape (F,); got {shapes}")

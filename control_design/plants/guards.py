@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from control_design.plants.ellipses import Complex, Ellipses, Real, readonly_complex, readonly_real
+from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import UncertainPlant
+from ident.data.arrays import lock
 
 GUARD_MODULUS = 0.1  # distance from -1 asked of a guard: stability with something to spare
 
@@ -33,8 +34,8 @@ class Guard:
     response: Complex
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "omega_rad_s", readonly_real(self.omega_rad_s))
-        object.__setattr__(self, "response", readonly_complex(self.response))
+        lock(self, "omega_rad_s")
+        lock(self, "response", dtype=np.complex128)
         omega = self.omega_rad_s
         if omega.ndim != 1 or self.response.shape != omega.shape or omega.size < 2:
             raise ValueError(

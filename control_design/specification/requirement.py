@@ -21,8 +21,8 @@ import numpy as np
 
 from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import Channel, Mode, UncertainPlant
+from control_design.plants.ellipses import Real
+from control_design.plants.plant_set import Channel, Mode
 from control_design.plants.weights import RationalWeight
 
 _PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
@@ -149,14 +149,3 @@ class WeightedRequirement(Requirement):
 def constant_weight(value: float) -> RationalWeight:
     """W = value at all frequencies."""
     return RationalWeight(numerator=(value,), denominator=(1.0,))
-
-
-def tustin_zeros(plant: UncertainPlant, samples_of_delay: int) -> Complex:
-    """Zeros of the loop outside the circle in the Tustin plane, where S(w) = 1 for every stabilising K: the
-    plant's, and the one at z = infinity (last, w = 2/dt) that a sample of delay makes."""
-    dt = plant.dt_s
-    outside = plant.zeros[np.abs(plant.zeros) > 1.0 + 1e-9]
-    w = 2.0 / dt * (outside - 1.0) / (outside + 1.0) if outside.size else np.zeros(0, complex)
-    if float(np.asarray(plant.nominal.D)[0, 0]) == 0.0 or samples_of_delay > 0:
-        w = np.append(w, 2.0 / dt)
-    return np.asarray(w, dtype=np.complex128)

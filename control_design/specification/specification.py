@@ -32,7 +32,6 @@ from control_design.specification.requirement import (
     SpecificationItem,
     WeightedRequirement,
     constant_weight,
-    tustin_zeros,
 )
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -394,7 +393,11 @@ def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
 
 
 def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
-    w = tustin_zeros(plant, spec.computational_delay_samples)
+    # In the Tustin plane; the sample of delay's zero at z = infinity is w = 2/dt, the last.
+    outside = plant.zeros[np.abs(plant.zeros) > 1.0 + 1e-9]
+    w = 2.0 / plant.dt_s * (outside - 1.0) / (outside + 1.0)
+    if float(np.asarray(plant.nominal.D)[0, 0]) == 0.0 or spec.computational_delay_samples > 0:
+        w = np.append(w, 2.0 / plant.dt_s)
     weight = spec.tracking_weight(plant.n_integrators)
     bound = np.zeros(0) if weight is None else np.abs(weight.at(w))
     if not np.any(bound > 1.0):
