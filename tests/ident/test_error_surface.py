@@ -10,7 +10,6 @@ from ident.fit.least_squares import fit
 from ident.fit.regression import prepare
 from ident.search.error_surface import error_surface
 from tests.ident.benchmark_plants import as_record, max_length_sequence, run
-from tests.ident.storage import stored_and_read
 
 POLE = Poles.from_continuous(omega_rad_s=[15.0], zeta=[0.015], dt_s=0.005)
 TRUE = GobfModel(POLE, [1.0, 0.5], 0.005)
@@ -57,11 +56,6 @@ def test_frozen_poles_stay():
     surface = error_surface([record], model, Structure(), first=np.array([15.0]), second=np.array([0.015]))
     expected = fit(prepare([record], Structure()), model.poles).rss / 1000
     assert surface.mean_square[0, 0] == pytest.approx(expected, rel=1e-6)
-
-
-def test_round_trip_through_arrays():
-    surface = error_surface([resonant_record()], TRUE, Structure(), n_points=5)
-    assert stored_and_read(surface).names == surface.names
 
 
 def test_what_cannot_be_drawn_is_refused():

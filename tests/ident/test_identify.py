@@ -14,7 +14,7 @@ from ident.fit.residual_colour import residual_colour
 from ident.identify import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
 from tests.ident.findings import kinds
-from tests.ident.storage import same, stored_and_read
+from tests.workflow.test_codec import same
 
 OMEGA = np.geomspace(0.1, 600, 400)
 MIDDLE = (OMEGA >= 1) & (OMEGA <= 100)
@@ -105,13 +105,6 @@ def test_p2_residuals_and_fit_belong_together(p2_fit):
     )
     assert not result.structure.estimate_initial_state
     np.testing.assert_allclose(y - result.model.simulate(truth.record.input[:, 0]), residual, atol=1e-12)
-
-
-def test_identification_round_trip_through_npz(p2_fit):
-    _, result = p2_fit
-    again = stored_and_read(result)
-    assert again.structure == result.structure
-    assert again.order_table == result.order_table
 
 
 def test_the_same_data_give_the_same_numbers():

@@ -7,7 +7,6 @@ import pytest
 from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from tests.ident.storage import stored_and_read
 
 MODEL = GobfModel(
     poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]),
@@ -44,12 +43,6 @@ def test_simulation_of_a_sine_settles_to_the_frequency_response():
     G = model.frequency_response(np.array([7.0]))[0]
     # The slowest pole has decayed by 0.98^3000 = 5e-27.
     np.testing.assert_allclose(y[3000:], np.abs(G) * np.sin(7.0 * k[3000:] * 0.01 + np.angle(G)), atol=1e-9)
-
-
-def test_round_trip_through_arrays_is_exact():
-    again = stored_and_read(MODEL)
-    np.testing.assert_array_equal(again.frequency_response(OMEGA), MODEL.frequency_response(OMEGA))
-    assert (again.input_name, again.output_name) == ("voltage", "angle")
 
 
 def test_model_without_poles_is_a_gain():

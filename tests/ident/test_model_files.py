@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ident import GobfModel, Poles
 from ident.basis.model_files import FORMAT, ModelFile
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from tests.ident.storage import same
+from tests.workflow.test_codec import same
 
 numbers = st.floats(-1e6, 1e6)
 inside = st.floats(-0.99, 0.99)

@@ -9,7 +9,6 @@ from scipy import signal
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.uncertainty import EmbeddingReport, ResponsePosterior
-from tests.ident.storage import stored_and_read
 
 DT = 0.02
 POLES = Poles([0.9], [0.8 + 0.5j])
@@ -116,15 +115,6 @@ def test_integrator_is_accurate_close_to_zero_frequency():
         p.at(np.array([0.0]))
     with pytest.raises(ValueError, match="omega"):
         p.at(np.array([200.0]))
-
-
-@pytest.mark.parametrize("with_report", [True, False])
-def test_round_trip_is_exact(with_report):
-    p = posterior(11)
-    if not with_report:
-        p = ResponsePosterior(POLES, p.mean, p.covariance_factor, DT, 4, True)
-    again = stored_and_read(p)
-    np.testing.assert_array_equal(again.at(OMEGA).covariance, p.at(OMEGA).covariance)
 
 
 def test_bad_shapes_are_refused():

@@ -13,7 +13,6 @@ from ident.finding import FindingKind
 from ident.identify import identify
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction
 from tests.ident.findings import kinds, only
-from tests.ident.storage import stored_and_read
 
 OMEGA = np.geomspace(0.1, 600, 400)
 KNOWN = {"integrators": 2, "relative_degree": 2, "n_real": 0, "n_pairs": 1}
@@ -175,13 +174,6 @@ def test_noise_free_data_speak_against_nothing_true():
     result = identify([as_record(truth.record.input[:, 0], truth.clean)], IdentOptions(**KNOWN))
     assert not any(refused(result).values())
     assert relative_error(truth, result.model) < 1e-5
-
-
-def test_tests_survive_storage():
-    result = identify([p1_friction(0).record], IdentOptions(**KNOWN))
-    again = stored_and_read(result)
-    assert again.prior_tests == result.prior_tests
-    assert again.structure == result.structure
 
 
 @pytest.mark.parametrize(

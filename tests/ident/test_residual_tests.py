@@ -12,7 +12,6 @@ from ident.checks.residual_tests import (
     whiteness_test,
 )
 from ident.finding import FindingKind, finding
-from tests.ident.storage import stored_and_read
 
 
 def coloured(rng, n, pole):
@@ -96,9 +95,7 @@ def test_the_tail_may_underflow():
     assert result.probability == 0.0  # underflow of the chi-squared tail
 
 
-def test_round_trip_and_bad_input():
-    result = whiteness_test([np.random.default_rng(6).standard_normal(100)])
-    assert stored_and_read(result).passed == result.passed
+def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="T > 50"):
         whiteness_test([np.zeros(20)])
     with pytest.raises(ValueError, match="constant"):

@@ -19,7 +19,6 @@ from ident.several_inputs import identify_miso
 from ident.uncertainty.miso_uncertainty import response_uncertainty
 from tests.ident.benchmark_plants import p3
 from tests.ident.findings import kinds
-from tests.ident.storage import stored_and_read
 
 DT_S = 0.01
 OMEGA = np.geomspace(0.5, 200.0, 80)
@@ -255,8 +254,7 @@ def test_initial_state_is_noticed():
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
 
 
-def test_round_trip_and_frozen(fitted):
-    assert stored_and_read(fitted).order_table == fitted.order_table
+def test_a_model_is_locked_and_gives_its_channels(fitted):
     with pytest.raises(ValueError, match="read-only"):
         fitted.model.coefficients[0, 0] = 1.0
     assert fitted.model.channel(1).input_name == "motor_2"

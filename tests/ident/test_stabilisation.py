@@ -10,7 +10,6 @@ import pytest
 from ident import IdentOptions, identify
 from ident.stabilisation import DAMPING_TOLERANCE, FREQUENCY_TOLERANCE, stabilisation
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, p1, p2
-from tests.ident.storage import stored_and_read
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +68,6 @@ def test_the_chosen_fit_is_the_models():
     here = plot.n_pairs == plot.chosen
     np.testing.assert_allclose(plot.omega_rad_s[here], found.model.poles.omega_rad_s(0.005), rtol=1e-4)
     assert plot.rss[plot.chosen] <= found.rss * (1 + 1e-9)
-
-
-def test_round_trip_through_npz(p2_plot):
-    assert stored_and_read(p2_plot).columns() == p2_plot.columns()
 
 
 def test_growth_ends_where_the_data_end():

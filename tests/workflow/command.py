@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -31,3 +34,25 @@ def start_flexlink(*arguments: object, stdout: IO[bytes] | int = subprocess.PIPE
         stdout=stdout,
         stderr=subprocess.PIPE,
     )
+
+
+def finish(process: subprocess.Popen[bytes], code: int = 0, *, seconds: float = 600.0) -> str:
+    """Standard error of a process that ends with this code."""
+    _, error = process.communicate(timeout=seconds)
+    assert process.returncode == code, error.decode()
+    return error.decode()
+
+
+def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
+    """Return once the condition holds; fail when the process ends before."""
+    deadline = time.monotonic() + 300
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened"
+        assert process.poll() is None, process.communicate()[1].decode()
+        time.sleep(0.002)
+
+
+def kill(process: subprocess.Popen[bytes]) -> None:
+    """SIGKILL, and wait for the end."""
+    process.kill()
+    finish(process, -signal.SIGKILL)

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.workflow.command import FAST_ARM
+from workflow.figures.style import Picture
+from workflow.report import rendering
 from workflow.tasks.summary import RunSummary
 
 
@@ -17,3 +19,10 @@ def fast_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary
 
     out = tmp_path_factory.mktemp("fast") / "run"
     return out, run_from_files(FAST_ARM, out)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are built but not rendered: what a page says does not depend on its pictures."""
+    empty = Picture("svg", b'<svg viewBox="0 0 1 1"><path id="a"/><use href="#a"/></svg>')
+    monkeypatch.setattr(rendering, "render", lambda figure: empty)

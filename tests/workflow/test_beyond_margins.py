@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.io
-from pydantic import ValidationError
 
 from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import JointCoverage
@@ -212,17 +211,6 @@ def test_what_cannot_be_drawn_says_why():
     assert "no uncertainty is stated" in said("sampled", found.sampled, {})
 
 
-def test_options_that_contradict_themselves():
-    with pytest.raises(ValidationError, match="joint_draws must be 0 or at least 100"):
-        CertificateOptions.model_validate({"joint_draws": 20})
-    with pytest.raises(ValidationError, match="calibrate needs joint_draws"):
-        CertificateOptions.model_validate({"joint_draws": 0, "calibrate": True})
-    with pytest.raises(ValidationError, match="either corner_rad_s or model"):
-        ReferenceFilterSettings.model_validate({})
-    with pytest.raises(ValidationError, match="improper"):
-        ReferenceFilterSettings.model_validate({"model": {"numerator": [1, 1], "denominator": [1]}})
-
-
 def test_model_of_a_corner_is_a_power_of_a_lag():
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "model_order": 3})
     s = 1j * np.array([0.1, 3.0, 20.0])
@@ -275,14 +263,12 @@ def test_reference_filter_follows_the_model_better_than_none(filtered):
     assert "times smaller" in said("reference_filter", filtered)
 
 
-def test_reference_filter_of_an_unstable_loop_is_a_reason_and_a_bad_corner_an_error():
+def test_reference_filter_of_an_unstable_loop_is_a_reason_and_a_bad_pole_an_error():
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0})
     result = find_filter(controller(500.0), [plant()], settings)
     assert result.filter is None
     assert said("reference_filter", result).startswith("no reference filter: plant 'hub'")
     assert find_filter(controller(), [plant()], None).reason is None
-    with pytest.raises(InputError, match=r"reference_filter\.corner_rad_s: 1000 lies beyond the Nyquist"):
-        find_filter(controller(), [plant()], ReferenceFilterSettings.model_validate({"corner_rad_s": 1e3}))
     late = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0, "poles_rad_s": [900.0]})
     with pytest.raises(InputError, match=r"reference_filter\.poles_rad_s: 900 is not between"):
         find_filter(controller(), [plant()], late)

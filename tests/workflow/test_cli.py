@@ -69,15 +69,9 @@ def without(name):
 # What is wrong with the log, and what the line must say (file lines count from 1, the header included).
 BAD_LOGS = {
     "nan": (with_value("y", 10, "nan"), ["log.csv", "line 12", "'y'", "finite number"]),
-    "inf": (with_value("u", 4, "inf"), ["log.csv", "line 6", "'u'", "finite number"]),
-    "text": (with_value("y", 0, "high"), ["log.csv", "line 2", "'y'", "'high'"]),
-    "empty": (with_value("y", 3, ""), ["log.csv", "line 5", "empty"]),
     "missing column": (without("y"), ["log.csv", "no column 'y'", "t_s", "u"]),
-    "missing time": (without("t_s"), ["log.csv", "no column 't_s'"]),
-    "time goes back": (with_value("t_s", 20, 0.05), ["log.csv", "line 22", "t_s"]),
     "time jumps": (with_value("t_s", 199, 2.5), ["log.csv", "line 201", "t_s"]),
     "constant input": (lambda t: {**t, "u": np.ones(t["u"].size)}, ["log.csv", "'u'", "constant"]),
-    "constant output": (lambda t: {**t, "y": np.ones(t["y"].size)}, ["log.csv", "'y'", "constant"]),
     "no rows": (lambda t: {key: column[:0] for key, column in t.items()}, ["log.csv"]),
 }
 
@@ -115,14 +109,11 @@ BAD_CONFIGS = {
         "[synthesis]\nstart = 3",
         ["own.toml", "unknown key synthesis.start", "did you mean starts?"],
     ),
-    "unknown table": ("[sythesis]\nstarts = 3", ["unknown key sythesis", "did you mean synthesis?"]),
     "bad value": ("[closed_loop]\ndraws = 0", ["closed_loop.draws", "greater than or equal to 1", "got 0"]),
-    "bad type": ("[closed_loop]\ndraws = 'many'", ["closed_loop.draws", "integer", "'many'"]),
     "contradiction": (
         "effort_rolloff_rad_s = 3.0",
         ["specification", "effort_rolloff_rad_s needs effort_limit"],
     ),
-    "nan": ("modulus_margin = nan", ["specification.modulus_margin"]),
     "syntax": ("[closed_loop\n", ["own.toml", "not valid TOML", "line"]),
     "wrong machine": (
         "[closed_loop]\nmachine = 'simulated'",
@@ -141,22 +132,17 @@ def test_bad_config_is_one_line_naming_the_key(refused, tmp_path, case):
     ("old", "new", "words"),
     [
         ('time = "t_s"', "dt_s = 0.0", ["source.dt_s", "greater than 0", "got 0.0"]),
-        ('time = "t_s"', "dt_s = -1.0", ["source.dt_s", "greater than 0"]),
         ('time = "t_s"', "", ["source", "no time base"]),
         ('"log.csv"', '"absent.csv"', ["source.records[0].path", "no such file", "absent.csv"]),
-        ('"log.csv"', '"${NO_SUCH_VARIABLE}/log.csv"', ["NO_SUCH_VARIABLE is not set"]),
         ('"log.csv"', '"own.toml"', ["own.toml", "unknown kind of file"]),
         (
             "n_pairs = 0",
             "fixed_poles = [[1.2, 0.0]]",
             ["channels[0].identification", "inside the unit circle"],
         ),
-        ('kind = "files"', 'kind = "file"', ["source.kind", "'file'"]),
-        ('output = "y"', "", ["missing key channels[0].output"]),
     ],
 )
-def test_bad_source(refused, tmp_path, monkeypatch, old, new, words):
-    monkeypatch.delenv("NO_SUCH_VARIABLE", raising=False)
+def test_bad_source(refused, tmp_path, old, new, words):
     config = write_case(tmp_path, good_table())
     text = config.read_text()
     assert old in text

@@ -147,12 +147,6 @@ def test_examples_are_valid_and_say_what_is_not_known(path, monkeypatch, request
     assert tomllib.loads(text)["run"]["name"] == path.stem
 
 
-def test_examples_name_the_variable_when_it_is_not_set(monkeypatch):
-    monkeypatch.delenv("FLEXLINK_DATA", raising=False)
-    with pytest.raises(InputError, match="environment variable FLEXLINK_DATA is not set"):
-        load_config(ROOT / "examples" / "daisy_robot_arm.toml")
-
-
 def test_rig_file_is_read_relative_to_the_configuration(tmp_path):
     from plant.presets import paper_link
 

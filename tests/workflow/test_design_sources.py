@@ -282,6 +282,7 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
         ("[reference_filter]\nmodel = { numerator = [1.0], denominator = [1.0, -1.0] }", "unstable"),
         ("[certificate]\njoint_draws = 5", "joint_draws must be 0 or at least 100"),
         ("[certificate]\njoint_coverage = 1.0", "joint_coverage"),
+        ("[certificate]\njoint_draws = 0\ncalibrate = true", "calibrate needs joint_draws"),
         ("[achievable_performance]\ncompute = true\nreal_pole = 3", "did you mean real_poles"),
         ("bandwidth_rad_s = nan", "bandwidth_rad_s: input should be a finite number"),
         ("controller_order = 0", "controller_order"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import signal
 import time
 import tomllib
 from functools import partial
@@ -15,7 +14,7 @@ import pytest
 from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects import GroundSpring
-from tests.workflow.command import start_flexlink
+from tests.workflow.command import finish, kill, start_flexlink, wait_until
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.config.run_config import SimulatedSource
 from workflow.diagnose import command, outputs
@@ -24,8 +23,6 @@ from workflow.diagnose.command import diagnose_cases
 from workflow.diagnose.outputs import Work
 from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import LocalProcesses, attempt
-from workflow.figures.style import Picture
-from workflow.report import rendering
 
 QUESTIONS = (
     "Is there a gap beyond noise?",
@@ -58,12 +55,6 @@ def files(folder):
 @pytest.fixture(scope="module")
 def document(files):
     return json.loads(files["arm.json"])
-
-
-@pytest.fixture
-def blank(monkeypatch):
-    """Pages with empty pictures."""
-    monkeypatch.setattr(rendering, "render", lambda figure: Picture("svg", b'<svg viewBox="0 0 1 1"></svg>'))
 
 
 # One case
@@ -150,14 +141,14 @@ def test_the_page_answers_in_order(files):
     ],
     ids=["none", "parametric", "unknown", "not_converged", "ambiguous", "two"],
 )
-def test_every_verdict_has_its_words(folder, engine, words, blank):
+def test_every_verdict_has_its_words(folder, engine, words, undrawn):
     files = made(folder, engine)
     assert words in files["arm.html"].decode()
     answer = json.loads(files["arm.json"])
     assert (answer["verdict"], answer["detail_verdict"]) == (engine.verdict, engine.detail)
 
 
-def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, blank):
+def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, undrawn):
     spring = GroundSpring(stiffness_Nm_rad=0.25)
     files = made(folder, KnownAnswer((), "unknown", "unknown", unlisted=(spring,)))
     html = files["arm.html"].decode()
@@ -170,7 +161,7 @@ def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, blank):
     assert json.loads(files["arm.json"])["unlisted"] == [{"name": "ground_spring", "stiffness_Nm_rad": 0.25}]
 
 
-def test_what_was_suspected_is_spoken_of(tmp_path, blank):
+def test_what_was_suspected_is_spoken_of(tmp_path, undrawn):
     folder = write_case(tmp_path / "arm", FRICTION)
     text = (folder / "case.toml").read_text()
     (folder / "case.toml").write_text('suspected = ["backlash", "coulomb_friction"]\n' + text)
@@ -340,31 +331,18 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
     assert "died" in found.failures[0][1].reason
 
 
-def _wait_for(path, process, seconds=300.0):
-    deadline = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < deadline, f"{path.name} did not appear"
-        assert process.poll() is None, process.communicate()[1].decode()
-        time.sleep(0.01)
-
-
 @pytest.mark.slow
 def test_killed_and_resumed_ends_with_the_same_bytes(cases, tmp_path):
     quiet, killed = tmp_path / "quiet", tmp_path / "killed"
     call = ("diagnose", *cases, "--jobs", 1, "--out")
-    process = start_flexlink(*call, quiet)
-    _, error = process.communicate()
-    assert process.returncode == 0, error.decode()
+    finish(start_flexlink(*call, quiet))
     process = start_flexlink(*call, killed)
-    _wait_for(killed / "one.json", process)
+    wait_until((killed / "one.json").exists, process)
     time.sleep(2.0)  # the second case is being computed
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    kill(process)
     assert not (killed / "two.json").exists()
     before = (killed / "one.json").stat().st_mtime_ns
-    process = start_flexlink(*call, killed, "--resume")
-    _, error = process.communicate()
-    assert process.returncode == 0, error.decode()
+    finish(start_flexlink(*call, killed, "--resume"))
     assert (killed / "one.json").stat().st_mtime_ns == before
     assert everything(killed) == everything(quiet)
 

@@ -14,8 +14,6 @@ from control_design.convex.reference_filter import ReferenceFilter
 from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
-from workflow.figures.style import Picture
-from workflow.report import rendering
 from workflow.report.run_report import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
 from workflow.text.templates import environment, words
@@ -52,13 +50,6 @@ class Page(HTMLParser):
         return " ".join(" ".join(self._parts).split())
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Figures are built but not rendered: what a page says does not depend on its pictures."""
-    empty = Picture("svg", b'<svg viewBox="0 0 1 1"><path id="a"/><use href="#a"/></svg>')
-    monkeypatch.setattr(rendering, "render", lambda figure: empty)
-
-
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory) -> RunDirectory:
     settings = example.config()
@@ -70,6 +61,10 @@ def drawn(tmp_path_factory) -> RunDirectory:
 def page_for(path: Path, settings, **how) -> Page:
     run = example.build_run(path / "run", settings, **how)
     return Page(write_report(RunResults(run), settings).read_text(encoding="utf-8"))
+
+
+def text_of(run: RunDirectory, settings) -> str:
+    return Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
 
 
 def test_page_and_pictures_are_written(drawn):
@@ -98,9 +93,10 @@ def test_page_and_pictures_are_written(drawn):
     assert len(text) < 5_000_000
 
 
-def test_page_fetches_nothing(drawn):
-    text = drawn.report_path.read_text(encoding="utf-8")
-    for tag, attributes in Page(text).tags:
+def is_one_file(text: str) -> None:
+    """The page fetches nothing and runs nothing; ids are unique and every reference has its target."""
+    tags = Page(text).tags
+    for tag, attributes in tags:
         assert tag not in ("script", "link", "iframe", "object", "embed", "base"), tag
         for name, value in attributes.items():
             if name in ("src", "href", "xlink:href", "data", "action", "poster", "srcset"):
@@ -109,14 +105,14 @@ def test_page_fetches_nothing(drawn):
             assert not name.startswith("on")
     assert "@import" not in text
     assert not re.search(r"url\((?!#)", text)
-
-
-def test_ids_are_unique_and_every_reference_has_its_target(drawn):
-    text = drawn.report_path.read_text(encoding="utf-8")
-    ids = [value for _, attributes in Page(text).tags if (value := attributes.get("id"))]
+    ids = [value for _, attributes in tags if (value := attributes.get("id"))]
     assert len(ids) == len(set(ids))
     references = set(re.findall(r'href="#([^"]+)"', text)) | set(re.findall(r"url\(#([^)]+)\)", text))
     assert references <= set(ids)
+
+
+def test_page_is_one_file_that_fetches_nothing(drawn):
+    is_one_file(drawn.report_path.read_text(encoding="utf-8"))
 
 
 def test_same_bytes_twice(drawn):
@@ -138,7 +134,7 @@ def test_pictures_of_an_earlier_report_go(drawn, undrawn, tmp_path):
 def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+    text = text_of(run, settings)
     results = RunResults(run)
     for channel in results.identify.channels:
         for mode in channel.modes:
@@ -247,7 +243,7 @@ def test_a_command_beyond_the_records_is_told(undrawn, tmp_path):
     words = "times the largest input in the records of the fit"
     for factor, told in ((1.4, False), (7.0, True)):
         change_prediction(run, peak_command=factor * seen)
-        text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+        text = text_of(run, settings)
         assert (f"{factor:.2g} {words}" in text) == told
 
 
@@ -256,7 +252,7 @@ def test_an_error_that_stays_is_told(undrawn, tmp_path):
     run = example.build_run(tmp_path / "run", settings)
     for left, told in ((0.01, False), (-0.2, True)):
         change_prediction(run, disturbance_left=left)
-        text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+        text = text_of(run, settings)
         assert ("of error for good, 40 % of the reference step" in text) == told
         assert ("integrator = true" in text) == told
 
@@ -322,7 +318,7 @@ def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn
     sensitivity = replace(loop.sensitivity, measured=rows)
     conditions = tuple(replace(row, settled=False) for row in loop.conditions)
     change_loop(run, sensitivity=sensitivity, conditions=conditions)
-    text = Page(write_report(RunResults(run), example.config()).read_text(encoding="utf-8")).text
+    text = text_of(run, example.config())
     assert "The loop on the arm is not the predicted one" in text
     assert "dry friction takes" not in text
     assert "The loop does not come to rest with: payload 200 % and push at the tip." in text
@@ -337,7 +333,7 @@ def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, und
 def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, undrawn):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+    text = text_of(run, settings)
     gamma = RunResults(run).design.gamma
     # Made up: 0.8 reached by any order, and the worst case of the ellipses holds for 990 of 1000 draws.
     off = f"{100 * abs(gamma / 0.8 - 1):.2g}"
@@ -358,5 +354,5 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
     )
     with run.locked():
         run.save_stage("reference_filter", ReferenceFilterResult(filtered), "x")
-    text = Page(write_report(RunResults(run), settings).read_text(encoding="utf-8")).text
+    text = text_of(run, settings)
     assert "0.19 with it, 0.95 without, 5 times smaller" in text

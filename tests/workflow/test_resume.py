@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from control_design.controllers.controller import Controller
-from tests.workflow.command import FAST_ARM, start_flexlink
+from tests.workflow.command import FAST_ARM, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
 from workflow.config.run_config import load_config
 from workflow.engine import storage
@@ -40,20 +40,6 @@ def assert_same_run(left: Path, right: Path) -> None:
         assert first[name] == second[name], f"{name} differs"
 
 
-def wait_for(path: Path, process, seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < deadline, f"{path.name} did not appear"
-        assert process.poll() is None, process.communicate()[1].decode()
-        time.sleep(0.002)
-
-
-def kill(process) -> None:
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
-
-
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     """The run nobody disturbed, in a process of its own like the one that is killed.
@@ -61,9 +47,7 @@ def reference(tmp_path_factory):
     A test process has other compiled variants of the kernels in memory, and those may round otherwise.
     """
     out = tmp_path_factory.mktemp("reference") / "run"
-    process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
-    _, error = process.communicate()
-    assert process.returncode == 0, error.decode()
+    finish(start_flexlink("run", "--config", FAST_ARM, "--out", out))
     return out
 
 
@@ -80,7 +64,7 @@ def reference(tmp_path_factory):
 def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears, pause_s):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
-    wait_for(out / appears, process)
+    wait_until((out / appears).exists, process)
     time.sleep(pause_s)
     kill(process)
     done_before = {
@@ -90,10 +74,7 @@ def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears,
         storage.read_npz(path)  # whatever has its final name is whole
     assert not (out / "report.html").exists()
 
-    resumed = start_flexlink("run", "--config", FAST_ARM, "--out", out, "--resume")
-    _, error = resumed.communicate()
-    assert resumed.returncode == 0, error.decode()
-
+    finish(start_flexlink("run", "--config", FAST_ARM, "--out", out, "--resume"))
     assert_same_run(reference, out)
     after = {path.name: path.stat().st_mtime_ns for path in (out / "stages").iterdir()}
     assert {name: after[name] for name in done_before} == done_before, "a finished stage was made again"
@@ -171,16 +152,13 @@ def test_interrupted_run_says_how_to_resume_and_ends_with_the_same_numbers(
 ):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
-    wait_for(out / appears, process)
+    wait_until((out / appears).exists, process)
     time.sleep(pause_s)
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode == 130, error.decode()
+    error = finish(process, 130, seconds=60)
     call = f"flexlink run --config {FAST_ARM} --out {out} --resume"
-    assert error.decode() == f"flexlink: interrupted; {call} continues\n"
-    again = start_flexlink(*call.split()[1:])
-    _, error = again.communicate()
-    assert again.returncode == 0, error.decode()
+    assert error == f"flexlink: interrupted; {call} continues\n"
+    finish(start_flexlink(*call.split()[1:]))
     assert_same_run(reference, out)
 
 

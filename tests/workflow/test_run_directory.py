@@ -80,13 +80,6 @@ def test_replace_keeps_what_is_not_ours(tmp_path):
     assert (run.path / "my notes.txt").read_text() == "mine"
 
 
-def test_changed_config_is_refused_naming_the_key(tmp_path):
-    begin(tmp_path / "run")
-    changed = {"run": {"name": "a", "seed": 2}, "channels": CONFIG["channels"]}
-    with pytest.raises(InputError, match=r"configuration changed at run\.seed \(was 1, now 2\)"):
-        begin(tmp_path / "run", config=changed, resume=True)
-
-
 def test_changed_input_file_is_refused_naming_the_file(tmp_path):
     begin(tmp_path / "run", inputs={"log.csv": "00"})
     with pytest.raises(InputError, match=r"log\.csv changed"):
@@ -100,14 +93,6 @@ def test_directory_killed_before_its_manifest_is_begun_afresh(tmp_path):
         begin(tmp_path / "run", config={"run": {"name": "b"}}, resume=True).config_document()["run"]["name"]
         == "b"
     )
-
-
-def test_output_below_a_file_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"cannot write.*is not a directory"):
-        RunDirectory(tmp_path / "file" / "run").refuse_unless_free()
-    with pytest.raises(InputError, match="cannot write"):
-        RunDirectory(tmp_path / "file").refuse_unless_free()
 
 
 def test_open_refuses_what_is_no_run(tmp_path):

@@ -25,7 +25,7 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
-from workflow.tasks.records import read_record, refuse_constant_input, with_common_sampling_time
+from workflow.tasks.records import read_record, with_common_sampling_time
 from workflow.tasks.results import RunRecord, RunResults
 from workflow.tasks.simulated_rig import EncodedArm, rig_of
 from workflow.tasks.stage import StageInput
@@ -285,29 +285,6 @@ def test_sampling_times_that_differ_are_refused_and_jitter_is_not():
         with_common_sampling_time([make_record("a"), make_record("b", 0.02)])
     alike = with_common_sampling_time([make_record("a"), make_record("b", 0.01 * (1 + 1e-9))])
     assert alike[0].dt_s == alike[1].dt_s
-
-
-def test_constant_input_is_refused():
-    with pytest.raises(InputError, match="'u' is constant"):
-        refuse_constant_input(make_record(u=np.full((6, 1), 2.0)))
-
-
-def test_files_of_three_kinds_give_the_same_record(tmp_path):
-    from scipy.io import savemat
-
-    t = np.arange(50) * 0.02
-    table = {"t": t, "u": np.sin(t), "y": np.cos(t)}
-    lines = ["t,u,y", *(",".join(repr(float(v)) for v in row) for row in zip(*table.values(), strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
-    np.savez(tmp_path / "log.npz", **table)
-    savemat(tmp_path / "log.mat", table)
-    records = [
-        Record.from_file(tmp_path / name, ["u"], ["y"], time="t")
-        for name in ("log.csv", "log.npz", "log.mat")
-    ]
-    for record in records:
-        np.testing.assert_array_equal(record.output, records[0].output)
-        assert record.dt_s == pytest.approx(0.02)
 
 
 def test_slice_and_mirror(tmp_path, flexlink_data):

@@ -7,13 +7,12 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.workflow.command import ROOT, start_flexlink
+from tests.workflow.command import ROOT, finish, start_flexlink, wait_until
 from tests.workflow.study_examples import assert_same_study, write_study
 from workflow.study.run import run_study
 
@@ -65,12 +64,10 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     started.stop()
 
 
-def wait_until(condition, process: subprocess.Popen[bytes], seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "nothing happened"
-        assert process.poll() is None, process.communicate()[1].decode()
-        time.sleep(0.005)
+def far_study(folder: Path, address: str) -> tuple[Path, tuple[object, ...]]:
+    """A study as a file, and the arguments that run it on the scheduler at this address."""
+    study = write_study(folder)
+    return study, ("study", "--config", study, "--out", folder / "out", "--scheduler", address)
 
 
 def finished_points(out: Path) -> int:
@@ -81,26 +78,21 @@ def finished_points(out: Path) -> int:
 def test_worker_killed_midway_changes_no_number(cluster, tmp_path):
     cluster.add_worker()
     cluster.add_worker()
-    study = write_study(tmp_path)
-    process = start_flexlink(
-        "study", "--config", study, "--out", tmp_path / "far", "--scheduler", cluster.address
-    )
-    wait_until(lambda: finished_points(tmp_path / "far") >= 1, process)
+    study, call = far_study(tmp_path, cluster.address)
+    process = start_flexlink(*call)
+    wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
     os.kill(cluster.workers[0].pid, signal.SIGKILL)
-    _, complaint = process.communicate(timeout=120)
-    assert process.returncode == 0, complaint.decode()
+    finish(process)
     assert cluster.workers[1].poll() is None
     run_study(study, tmp_path / "near", jobs=2)
-    assert_same_study(tmp_path / "near", tmp_path / "far")
+    assert_same_study(tmp_path / "near", tmp_path / "out")
 
 
 @pytest.mark.slow
 def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp_path):
     cluster.add_worker()
-    study = write_study(tmp_path)
-    process = start_flexlink(
-        "study", "--config", study, "--out", tmp_path / "out", "--scheduler", cluster.address
-    )
+    study, call = far_study(tmp_path, cluster.address)
+    process = start_flexlink(*call)
     wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
     cluster.scheduler.kill()
     out, complaint = process.communicate(timeout=60)
@@ -117,9 +109,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
 
 def test_scheduler_without_workers(cluster, refused, tmp_path, monkeypatch):
     monkeypatch.setattr("workflow.engine.cluster.WITHOUT_WORKERS_S", 0.5)
-    line = refused(
-        "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", cluster.address
-    )
+    line = refused(*far_study(tmp_path, cluster.address)[1])
     assert "no worker within" in line
     assert f"dask worker {cluster.address}" in line
     assert not (tmp_path / "out").exists()
@@ -131,9 +121,7 @@ def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
     monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was made"))
     monkeypatch.setattr("workflow.engine.cluster.CONNECT_S", 1.0)
     address = f"tcp://127.0.0.1:{free_port()}"
-    line = refused(
-        "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", address
-    )
+    line = refused(*far_study(tmp_path, address)[1])
     assert line == f"flexlink: --scheduler {address}: no Dask scheduler answers there\n"
     assert not (tmp_path / "out").exists()
 
@@ -142,17 +130,13 @@ def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
 def test_an_address_that_is_none(refused, tmp_path, address, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
     monkeypatch.setattr("workflow.engine.cluster.CONNECT_S", 1.0)
-    line = refused(
-        "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", address
-    )
+    line = refused(*far_study(tmp_path, address)[1])
     assert "--scheduler" in line
     assert not (tmp_path / "out").exists()
 
 
 def test_without_the_extra(refused, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    line = refused(
-        "study", "--config", write_study(tmp_path), "--out", tmp_path / "out", "--scheduler", "tcp://h:1"
-    )
+    line = refused(*far_study(tmp_path, "tcp://h:1")[1])
     assert "needs the extra 'distributed': pip install 'flexlink[distributed]'" in line
     assert not (tmp_path / "out").exists()
