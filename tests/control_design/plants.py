@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import control
 import numpy as np
 
+from control_design import Controller, UncertainPlant
+from ident import Poles
+from ident.uncertainty import ResponsePosterior
 from validation.example_plants import ResponseRecord
 
 
@@ -39,3 +44,19 @@ def random_stable(rng: np.random.Generator, n: int, dt_s: float) -> control.Stat
     a = rng.standard_normal((n, n))
     a *= rng.uniform(0.3, 0.97) / np.max(np.abs(np.linalg.eigvals(a)))
     return control.ss(a, rng.standard_normal((n, 1)), rng.standard_normal((1, n)), 0, dt_s)
+
+
+def uncertain_hub(relative_std: float, **more: Any) -> UncertainPlant:
+    """`hub_arm` in discs."""
+    return UncertainPlant("hub", hub_arm(), RelativeDisc(hub_arm(), relative_std, 60.0), **more)
+
+
+def uncertain_lag(std: float, level: float = 0.95) -> UncertainPlant:
+    """G = (1 + std x) 0.02/(z - 0.98), x ~ N(0, 1); its ellipses hold |x| below the radius of the level."""
+    poles, scale = Poles(np.array([0.98]), np.zeros(0, complex)), 0.02 / np.sqrt(1 - 0.98**2)
+    posterior = ResponsePosterior(poles, np.array([scale]), np.array([[scale * std]]), 0.005)
+    return UncertainPlant("lag", control.ss([[0.98]], [[1.0]], [[0.02]], 0, 0.005), posterior, level=level)
+
+
+def gain(value: float, delay: int = 1) -> Controller:
+    return Controller.proportional(value, 0.005, computational_delay_samples=delay)

@@ -8,7 +8,6 @@ import pytest
 
 from control_design import (
     Channel,
-    Controller,
     LoopFunction,
     Specification,
     UncertainPlant,
@@ -16,22 +15,14 @@ from control_design import (
 )
 from validation.example_plants import ResponseRecord
 
-from .plants import RelativeDisc, hub_arm, tip_acceleration
+from .plants import RelativeDisc, gain, hub_arm, tip_acceleration, uncertain_hub
 
 _DT = 0.005
 
 
-def _gain(value: float, delay: int = 1) -> Controller:
-    return Controller.proportional(value, _DT, computational_delay_samples=delay)
-
-
-def _arm(relative_std: float = 0.02) -> UncertainPlant:
-    return UncertainPlant("arm", hub_arm(), RelativeDisc(hub_arm(), relative_std, 60.0))
-
-
 def test_a_gentle_gain_on_the_hub_is_certified_and_says_what_it_checked():
     spec = Specification(modulus_margin=0.5, bandwidth_rad_s=0.5, low_frequency_rejection=0.01)
-    certificate = certify(_gain(0.3), [_arm()], spec)
+    certificate = certify(gain(0.3), [uncertain_hub(0.02)], spec)
     assert certificate.certified, [item.sentence() for item in certificate.items]
     (verdict,) = certificate.plants
     assert verdict.stable
@@ -56,7 +47,9 @@ def test_an_unstable_loop_is_never_certified():
     for _ in range(25):
         value = float(10 ** rng.uniform(-1, 3) * rng.choice([-1, 1]))
         closed = control.feedback(control.series(hub_arm(), control.ss(0, 1, value, 0, _DT)), 1)
-        certificate = certify(_gain(value), [_arm(0.001)], Specification(modulus_margin=0.01), n_dense=1500)
+        certificate = certify(
+            gain(value), [uncertain_hub(0.001)], Specification(modulus_margin=0.01), n_dense=1500
+        )
         if np.max(np.abs(closed.poles())) >= 1:
             unstable += 1
             assert not certificate.certified
@@ -67,8 +60,8 @@ def test_an_unstable_loop_is_never_certified():
 
 def test_worst_sensitivity_bounds_every_sampled_plant_and_is_reached():
     """Members drawn on the ellipses' boundary: max|S| never above, and within 0.1 % of, the certificate."""
-    plant, k = _arm(0.05), 0.3
-    certificate = certify(_gain(k), [plant], Specification())
+    plant, k = uncertain_hub(0.05), 0.3
+    certificate = certify(gain(k), [plant], Specification())
     verdict = certificate.plants[0]
     omega = np.unique(
         np.append(np.geomspace(1e-2, plant.nyquist_rad_s, 4000), verdict.worst_margin_omega_rad_s)
@@ -97,7 +90,7 @@ def test_every_requirement_is_listed_with_its_number():
         mode_peak_ratio=0.2,
         delay_margin_s=0.01,
     )
-    certificate = certify(_gain(0.3), [plant], spec)
+    certificate = certify(gain(0.3), [plant], spec)
     met = {item.requirement.split(",")[0]: item.met for item in certificate.items}
     assert met == {
         "modulus margin": True,
@@ -112,8 +105,8 @@ def test_every_requirement_is_listed_with_its_number():
 
 
 def test_damping_number_is_the_sampled_worst_case_of_the_measured_output():
-    plant, spec = _arm(0.05), Specification(mode_peak_ratio=0.5)
-    certificate = certify(_gain(0.3), [plant], spec)
+    plant, spec = uncertain_hub(0.05), Specification(mode_peak_ratio=0.5)
+    certificate = certify(gain(0.3), [plant], spec)
     (item,) = [i for i in certificate.items if i.requirement.startswith("damping")]
     (asked,) = [each for each in spec.weighted(plant) if each.function is LoopFunction.DISTURBANCE]
     low, high = asked.band
@@ -132,26 +125,26 @@ def test_damping_number_is_the_sampled_worst_case_of_the_measured_output():
 def test_uncertainty_on_its_own_grid_is_named():
     own = np.geomspace(0.5, 200.0, 800)
     record: ResponseRecord = RelativeDisc(hub_arm(), 0.02, 60.0).at(own, 0.95)
-    certificate = certify(_gain(0.3), [UncertainPlant("frf", hub_arm(), record)], Specification())
+    certificate = certify(gain(0.3), [UncertainPlant("frf", hub_arm(), record)], Specification())
     assert certificate.plants[0].own_grid_rad_s == (0.5, 200.0)
     assert certificate.certified
 
 
 def test_no_uncertainty_is_said_and_mismatches_are_refused():
     bare = UncertainPlant("bare", hub_arm())
-    certificate = certify(_gain(0.3), [bare], Specification())
+    certificate = certify(gain(0.3), [bare], Specification())
     assert not certificate.plants[0].stated
     with pytest.raises(ValueError, match="0 samples of computational delay"):
-        certify(_gain(0.3, delay=0), [bare], Specification())
+        certify(gain(0.3, delay=0), [bare], Specification())
     with pytest.raises(ValueError, match="at least one plant"):
-        certify(_gain(0.3), [], Specification())
+        certify(gain(0.3), [], Specification())
     slow = UncertainPlant("slow", hub_arm(0.01))
     with pytest.raises(ValueError, match="differ in dt_s"):
-        certify(_gain(0.3), [slow], Specification())
+        certify(gain(0.3), [slow], Specification())
 
 
 def test_mode_damping_is_that_of_python_controls_closed_loop():
-    plant, controller = _arm(), _gain(1.0)
+    plant, controller = uncertain_hub(0.02), gain(1.0)
     loop = control.feedback(plant.nominal * controller.to_control(include_delay=True), 1)
     omega, zeta, _ = control.damp(loop, doprint=False)
     band = (5.0, 60.0)

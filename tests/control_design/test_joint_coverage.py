@@ -12,34 +12,20 @@ from control_design.analysis.joint_coverage import gamma_of_draws, joint_coverag
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
-from ident import Poles
-from ident.uncertainty import ResponsePosterior
 from validation.example_plants import ResponseRecord, flexible_link, flexible_link_specification
 
-from .plants import RelativeDisc, hub_arm, tip_acceleration
+from .plants import RelativeDisc, gain, hub_arm, tip_acceleration, uncertain_lag
 
 _DT = 0.005
-
-
-def _gain(value: float, delay: int = 1) -> Controller:
-    return Controller.proportional(value, _DT, computational_delay_samples=delay)
-
-
-def _lag_with_uncertain_gain(std: float) -> UncertainPlant:
-    """G = (1 + std x) 0.02/(z - 0.98), x ~ N(0, 1)."""
-    poles = Poles(np.array([0.98]), np.zeros(0, complex))
-    scale = 0.02 / np.sqrt(1 - 0.98**2)
-    posterior = ResponsePosterior(poles, np.array([scale]), np.array([[scale * std]]), _DT)
-    return UncertainPlant("lag", control.ss([[0.98]], [[1]], [[0.02]], 0, _DT), posterior)
 
 
 @pytest.mark.parametrize("coverage", [0.8, 0.95])
 def test_one_uncertain_gain_gives_the_one_sided_normal_quantile(coverage):
     """|S| peaks higher the larger the gain, so P(gamma <= worst case of |x| <= r) = P(x <= r), exactly."""
-    plant = _lag_with_uncertain_gain(0.1)
+    plant = uncertain_lag(0.1)
     draws = 8000
     found = joint_coverage(
-        _gain(6.0), [plant], Specification(), rng=np.random.default_rng(1), coverage=coverage, draws=draws
+        gain(6.0), [plant], Specification(), rng=np.random.default_rng(1), coverage=coverage, draws=draws
     )
     radius = norm.ppf(coverage)
     # standard error of a quantile: sqrt(c (1 - c)/n)/density; four of them
@@ -54,7 +40,7 @@ def test_one_uncertain_gain_gives_the_one_sided_normal_quantile(coverage):
 
 
 def test_unstable_draws_are_those_whose_poles_say_so():
-    plant, controller = _lag_with_uncertain_gain(0.3), _gain(40.0)
+    plant, controller = uncertain_lag(0.3), gain(40.0)
     omega = np.array([1.0])
     rng = np.random.default_rng(2)
     found = gamma_of_draws(controller, plant, Specification(), rng, 400)
@@ -83,18 +69,18 @@ def test_link_holds_in_95_percent_of_fresh_draws(scenario):
 
 
 def test_certificate_uses_the_calibrated_level_and_says_so():
-    plant = _lag_with_uncertain_gain(0.05)
+    plant = uncertain_lag(0.05)
     spec = Specification(modulus_margin=0.3)
-    plain = certify(_gain(6.0), [plant], spec)
+    plain = certify(gain(6.0), [plant], spec)
     assert plain.joint is None
-    high = certify(_gain(6.0), [plant], spec, joint_coverage=0.999, rng=np.random.default_rng(0))
+    high = certify(gain(6.0), [plant], spec, joint_coverage=0.999, rng=np.random.default_rng(0))
     assert high.joint is not None
     assert high.joint.level > 0.95
     assert high.gamma == pytest.approx(high.joint.gamma, rel=1e-3)
     assert high.gamma > plain.gamma
     assert high.gamma <= high.gamma_bound
     # A level under the given one changes gamma's statement, not the ellipses that are checked.
-    low = certify(_gain(6.0), [plant], spec, joint_coverage=0.6, rng=np.random.default_rng(0))
+    low = certify(gain(6.0), [plant], spec, joint_coverage=0.6, rng=np.random.default_rng(0))
     assert low.gamma == plain.gamma > low.joint.gamma
 
 
@@ -103,7 +89,7 @@ def test_performance_channel_and_several_plants_are_drawn_together():
     measured, performed = (GaussianGain(g, n, 0.05) for g, n in ((system, 1), (tip, 0)))
     arm = UncertainPlant("arm", system, measured, performance=Channel(tip, performed))
     spec = Specification(modulus_margin=0.3, mode_peak_ratio=0.9)
-    controller = _gain(0.3)
+    controller = gain(0.3)
     one = joint_coverage(controller, [arm], spec, rng=np.random.default_rng(3), draws=3000)
     fresh = gamma_of_draws(controller, arm, spec, np.random.default_rng(4), 3000)
     # binomial, both sides: 0.56 %; four of it
@@ -146,14 +132,14 @@ def test_what_cannot_be_drawn_from_is_refused():
     rng = np.random.default_rng(0)
     measured = RelativeDisc(hub_arm(), 0.02, 60.0).at(np.geomspace(0.5, 200.0, 200), 0.95)
     plant = UncertainPlant("frf", hub_arm(), measured)
-    lag = _lag_with_uncertain_gain(0.1)
+    lag = uncertain_lag(0.1)
     with pytest.raises(ValueError, match="draws of whole responses"):
-        joint_coverage(_gain(0.3), [plant], Specification(), rng=rng)
+        joint_coverage(gain(0.3), [plant], Specification(), rng=rng)
     with pytest.raises(ValueError, match=r"must lie in \(0, 1\)"):
-        joint_coverage(_gain(0.3), [lag], Specification(), rng=rng, coverage=95.0)
+        joint_coverage(gain(0.3), [lag], Specification(), rng=rng, coverage=95.0)
     with pytest.raises(ValueError, match="at least 100 draws"):
-        joint_coverage(_gain(0.3), [lag], Specification(), rng=rng, draws=10)
+        joint_coverage(gain(0.3), [lag], Specification(), rng=rng, draws=10)
     with pytest.raises(ValueError, match="at least one plant"):
-        joint_coverage(_gain(0.3), [], Specification(), rng=rng)
+        joint_coverage(gain(0.3), [], Specification(), rng=rng)
     with pytest.raises(ValueError, match="needs rng"):
-        certify(_gain(0.3), [lag], Specification(), joint_coverage=0.95)
+        certify(gain(0.3), [lag], Specification(), joint_coverage=0.95)

@@ -19,11 +19,9 @@ from control_design.analysis.joint_coverage import gamma_of_draws, unstable_draw
 from control_design.analysis.stability import winds
 from control_design.plants.guards import different_responses, guard_grid
 from control_design.plants.plant_set import frequency_response
-from ident import Poles
-from ident.uncertainty import ResponsePosterior
 from validation.example_plants import flexible_link, flexible_link_specification
 
-from .plants import random_stable
+from .plants import random_stable, uncertain_lag
 
 _DT = 0.005
 _QUICK = SynthesisOptions(
@@ -33,14 +31,6 @@ _QUICK = SynthesisOptions(
 
 def _lag(gain: float = 1.0) -> control.StateSpace:
     return control.ss([[0.98]], [[1.0]], [[0.02 * gain]], 0, _DT)
-
-
-def _uncertain_lag(std: float, level: float) -> UncertainPlant:
-    """G = (1 + std x) 0.02/(z - 0.98), x ~ N(0, 1); its ellipses hold |x| below the radius of the level."""
-    poles = Poles(np.array([0.98]), np.zeros(0, complex))
-    scale = 0.02 / np.sqrt(1 - 0.98**2)
-    posterior = ResponsePosterior(poles, np.array([scale]), np.array([[scale * std]]), _DT)
-    return UncertainPlant("lag", _lag(), posterior, level=level)
 
 
 def _radius(controller, gain: float) -> float:
@@ -84,7 +74,7 @@ def test_a_guard_is_kept_stable_and_costs_no_weight():
 
 @pytest.mark.slow
 def test_joint_design_is_stable_for_the_share_asked():
-    plant = _uncertain_lag(0.5, 0.2)
+    plant = uncertain_lag(0.5, 0.2)
     rng = np.random.default_rng(3)
     free = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
     count, guards = unstable_draws(free.controller, [plant], _FAST, rng=rng, draws=1000, most=3)
@@ -104,7 +94,7 @@ def test_joint_design_is_stable_for_the_share_asked():
 
 
 def test_certificate_asks_for_the_stable_share():
-    plant = _uncertain_lag(0.5, 0.2)
+    plant = uncertain_lag(0.5, 0.2)
     free = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
     found = certify(free.controller, [plant], _FAST, joint_coverage=0.5, rng=np.random.default_rng(1))
     item = next(item for item in found.items if "sampled responses" in item.requirement)
@@ -122,7 +112,7 @@ def test_different_responses_come_first_from_far_apart():
 
 
 def test_bad_input_is_refused():
-    plant = _uncertain_lag(0.1, 0.95)
+    plant = uncertain_lag(0.1, 0.95)
     with pytest.raises(ValueError, match="at least 1000 are needed"):
         synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), draws=500)
     with pytest.raises(ValueError, match="stable_share must lie in"):

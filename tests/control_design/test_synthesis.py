@@ -20,13 +20,9 @@ from control_design import (
 from validation.example_plants import flexible_link, flexible_link_specification
 from workflow.engine import codec
 
-from .plants import RelativeDisc, hub_arm, tip_acceleration
+from .plants import RelativeDisc, hub_arm, tip_acceleration, uncertain_hub
 
 _QUICK = SynthesisOptions(starts=3, exchange_rounds=2, sufficient_gamma=0.97)
-
-
-def _hub(name: str = "hub", relative_std: float = 0.03, **fields) -> UncertainPlant:
-    return UncertainPlant(name, hub_arm(), RelativeDisc(hub_arm(), relative_std, 60.0), **fields)
 
 
 def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
@@ -66,7 +62,10 @@ def test_link_scenarios_at_order_5_with_the_default_search(scenario, limit):
 
 def test_same_seed_same_controller():
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
-    results = [synthesise([_hub()], specification, _QUICK, rng=np.random.default_rng(5)) for _ in range(2)]
+    results = [
+        synthesise([uncertain_hub(0.03)], specification, _QUICK, rng=np.random.default_rng(5))
+        for _ in range(2)
+    ]
     for name in ("A", "B", "C", "D"):
         np.testing.assert_array_equal(
             getattr(results[0].controller, name), getattr(results[1].controller, name)
@@ -98,7 +97,7 @@ def test_integrating_arms_with_integral_action_are_certified(integrators):
 def test_active_damping_through_the_tip_without_tracking():
     """The closed-loop mode is damped at least about as much as the peak is pressed down: 0.015/0.4."""
     performance = Channel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.05, 60.0))
-    plant = _hub(performance=performance)
+    plant = uncertain_hub(0.03, performance=performance)
     specification = Specification(
         mode_peak_ratio=0.4, effort_limit=60.0, effort_rolloff_rad_s=100.0, controller_order=4
     )
@@ -114,7 +113,7 @@ def test_active_damping_through_the_tip_without_tracking():
 
 def test_two_plants_are_met_by_one_controller():
     heavy = hub_arm() * 0.6
-    plants = [_hub(), UncertainPlant("heavy", heavy, RelativeDisc(heavy, 0.03, 60.0))]
+    plants = [uncertain_hub(0.03), UncertainPlant("heavy", heavy, RelativeDisc(heavy, 0.03, 60.0))]
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
     result = synthesise(plants, specification, _QUICK, rng=np.random.default_rng(4))
     certificate = certify(result.controller_or_raise(), plants, specification)
@@ -204,11 +203,11 @@ def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():
     damping = {}
     for asked in (None, 0.7):
         specification = Specification(**fields, controller_damping=asked)
-        result = synthesise([_hub()], specification, _QUICK, rng=np.random.default_rng(3))
+        result = synthesise([uncertain_hub(0.03)], specification, _QUICK, rng=np.random.default_rng(3))
         poles = np.linalg.eigvals(result.controller.A)
         w = (poles - 1) / (poles + 1)  # Tustin's plane up to a factor: angles are what counts
         damping[asked] = min(np.cos(np.pi - np.abs(np.angle(w))))
-        certificate = certify(result.controller, [_hub()], specification)
+        certificate = certify(result.controller, [uncertain_hub(0.03)], specification)
         said = [item for item in certificate.items if "own poles" in item.requirement]
         assert len(said) == (asked is not None)
         if said:

@@ -15,7 +15,7 @@ import pytest
 from control_design import Specification, SynthesisOptions, UncertainPlant, synthesise
 from workflow.engine import codec
 
-from .plants import RelativeDisc, hub_arm
+from .plants import RelativeDisc, hub_arm, uncertain_hub
 
 _SPECIFICATION = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
 
@@ -39,15 +39,11 @@ if __name__ == "__main__":
 """
 
 
-def _plant() -> UncertainPlant:
-    return UncertainPlant("hub", hub_arm(), RelativeDisc(hub_arm(), 0.03, 60.0))
-
-
 @pytest.mark.slow
 def test_the_number_of_processes_does_not_change_the_result():
     results = [
         synthesise(
-            [_plant()],
+            [uncertain_hub(0.03)],
             _SPECIFICATION,
             SynthesisOptions(starts=2, exchange_rounds=1, jobs=jobs),
             rng=np.random.default_rng(3),

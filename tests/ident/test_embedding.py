@@ -60,7 +60,7 @@ def test_noise_model_of_a_record_inside_a_band():
     inside = []
     for seed in range(4):
         arm = random_arm(np.random.default_rng([41, seed]), n_samples=4000, noise_pole=0.9)
-        model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:]), np.zeros(8), DT)
+        model = arm.model()
         options = EmbeddingOptions(coloured_noise=True, fir_length=60, prior_missed_mode=0.0)
         plain = tangent([arm.record], model, options).at(OMEGA[band])
         filtered = band_limited(arm.record, 1.0, 100.0, skip_s=5.0)
@@ -75,13 +75,13 @@ def test_noise_model_of_a_record_inside_a_band():
 
 def test_exact_poles_and_no_remainder_leave_half_the_prior_odds_to_evidence():
     arm = random_arm(np.random.default_rng(3))
-    model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:]), np.zeros(8), DT)
+    model = arm.model()
     report = tangent([arm.record], model).report
     assert report.probability_no_remainder > 0.5
     noise = np.sqrt(np.mean(arm.record.output**2)) * 10 ** (-35 / 20)
     # 35 dB of the noise-free output; the noisy one is 0.02 % larger, the estimate has 2000 samples.
     assert report.noise_std == pytest.approx(noise, rel=0.07)
-    missing = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:4]), np.zeros(6), DT)
+    missing = arm.model(2)
     alone = EmbeddingOptions(prior_missed_mode=0.0)
     assert tangent([arm.record], missing, alone).report.probability_no_remainder < 1e-6
     # Looked for, the mode is found and added, and nothing remains.
@@ -168,7 +168,7 @@ def test_initial_state_and_offset_do_not_disturb_the_estimate():
     arm = random_arm(np.random.default_rng(6), n_samples=3000)
     tail = arm.record.slice(700, 3000)
     lifted = Record("tail", tail.input, tail.output + 5.0, DT, ("u",), ("y",))
-    model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:]), np.zeros(8), DT)
+    model = arm.model()
     with_nuisance = tangent([lifted], model).at(OMEGA)
     without = tangent([lifted], model, EmbeddingOptions(estimate_initial_state=False, estimate_offset=False))
     assert with_nuisance.contains(arm.truth).mean() > 0.8
@@ -178,7 +178,7 @@ def test_initial_state_and_offset_do_not_disturb_the_estimate():
 def test_several_records_shrink_the_ellipses():
     rng = np.random.default_rng(7)
     arm = random_arm(rng, n_samples=4000)
-    model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:]), np.zeros(8), DT)
+    model = arm.model()
     halves = [arm.record.slice(0, 2000), arm.record.slice(2000, 4000)]
     one = tangent(halves[:1], model).at(OMEGA).enclosing_radius()
     both = tangent(halves, model).at(OMEGA).enclosing_radius()
@@ -188,7 +188,7 @@ def test_several_records_shrink_the_ellipses():
 
 def test_bad_input_is_refused():
     arm = random_arm(np.random.default_rng(8), n_samples=300)
-    model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:]), np.zeros(8), DT)
+    model = arm.model()
     with pytest.raises(ValueError, match="at least one record"):
         tangent([], model)
     with pytest.raises(ValueError, match="dt_s"):

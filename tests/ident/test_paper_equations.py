@@ -29,7 +29,6 @@ from ident.basis.model import GobfModel
 from ident.basis.options import Algorithm, IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
-from ident.data.record import Record
 from ident.fit.least_squares import fit
 from ident.fit.problem import CandidateCost
 from ident.fit.regression import prepare
@@ -38,6 +37,7 @@ from ident.search.direct import minimise
 from ident.search.error_surface import error_surface
 from ident.search.pole_search import PoleSearch
 from tests.ident import test_basis, test_error_surface, test_least_squares, test_model, test_pole_search
+from tests.ident.benchmark_plants import as_record
 from tests.ident.paper_oracles import (
     combination,
     complex_realisation,
@@ -152,10 +152,6 @@ def test_every_equation_has_a_function_with_a_contract_and_a_test():
         assert elsewhere or tested.issuperset(numbers), says
 
 
-def record(u: np.ndarray, y: np.ndarray) -> Record:
-    return Record("record", u[:, None], y[:, None], DT_S, ("u",), ("y",))
-
-
 def noise(seed: int, n: int = 400) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(n)
 
@@ -175,10 +171,10 @@ def test_2_zero_poles_are_the_fir_model():
     # The same numbers from the regression on delayed inputs, and cut off they miss what lies behind the cut.
     u = noise(1)
     y = model.simulate(u)
-    np.testing.assert_allclose(arx(record(u, y), 0, 5).b, taps, atol=1e-12)
+    np.testing.assert_allclose(arx(as_record(u, y), 0, 5).b, taps, atol=1e-12)
     slow = GobfModel(Poles([0.9]), np.ones(1), DT_S)
     y = slow.simulate(u)
-    errors = [np.linalg.norm(arx(record(u, y), 0, n).simulate(u) - y) for n in (10, 20, 40)]
+    errors = [np.linalg.norm(arx(as_record(u, y), 0, n).simulate(u) - y) for n in (10, 20, 40)]
     # What is cut off of a decay 0.9^k shrinks by 0.9^10 and 0.9^20; the fit of the rest can only help.
     assert errors[1] < 0.5 * errors[0]
     assert errors[2] < 0.2 * errors[1]
@@ -343,14 +339,14 @@ def test_18_19_solution_with_m2_zero(pole):
 def test_20_cost_is_the_mean_square_residual():
     poles = Poles([0.6], [0.9 * np.exp(0.3j)])
     u, y = noise(5), noise(6)
-    found = fit(prepare([record(u, y)], Structure()), poles)
+    found = fit(prepare([as_record(u, y)], Structure()), poles)
     model = GobfModel(poles, found.coefficients[0], DT_S)
     mean_square = np.mean((y - model.simulate(u)) ** 2)
     assert found.rss / y.size == pytest.approx(mean_square, rel=1e-12)
     gamma = abs(poles.pairs[0]) ** 2
     beta = 2 * poles.pairs[0].real / (1 + gamma)
     surface = error_surface(
-        [record(u, y)],
+        [as_record(u, y)],
         model,
         Structure(),
         coordinates="raw",
@@ -426,7 +422,7 @@ def test_25_26_transformation_keeps_the_space():
 def test_27_least_squares_solves_the_normal_equations():
     poles = Poles([0.6], [0.7 * np.exp(0.8j)])
     u, y = noise(11), noise(12)
-    found = fit(prepare([record(u, y)], Structure()), poles)
+    found = fit(prepare([as_record(u, y)], Structure()), poles)
     phi = regressor(poles, u)
     by_sums = np.linalg.inv(sum(np.outer(row, row) for row in phi)) @ sum(
         row * value for row, value in zip(phi, y, strict=True)
@@ -460,7 +456,7 @@ def test_28_29_filter_parameters_and_poles_correspond():
 
 def test_30_cost_of_eta_is_that_of_the_fitted_coefficients():
     u, y = noise(14), noise(15)
-    data = prepare([record(u, y)], Structure())
+    data = prepare([as_record(u, y)], Structure())
     space = search_space(1, 1, 400, DT_S, IdentOptions(coordinates="raw"))
     none = Poles()
     cost = data.candidate_cost(space, none, none)
@@ -493,15 +489,19 @@ def test_31_all_variants_of_nlopt_are_there():
     assert {"SCIPY_DIRECT", "SCIPY_DIRECT_L"} <= set(DIRECT)
 
 
+def damped_pair(noise_share):
+    """A well-damped pair, the box of the paper's (beta, gamma) and the cost over it."""
+    pole, u = 0.8 * np.exp(0.9j), noise(17)
+    clean = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
+    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
+    data = prepare([as_record(u, clean + noise_share * np.std(clean) * noise(18))], Structure())
+    return pole, space, data.candidate_cost(space, Poles(), Poles())
+
+
 @pytest.mark.parametrize("algorithm", DIRECT)
 def test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum(algorithm):
     """(30) by (31): a well-damped pair at 20 dB, in the paper's (beta, gamma); smooth near its optimum."""
-    pole = 0.8 * np.exp(0.9j)
-    u = noise(17)
-    clean = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
-    y = clean + 0.1 * np.std(clean) * noise(18)
-    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
-    cost = prepare([record(u, y)], Structure()).candidate_cost(space, Poles(), Poles())
+    pole, space, cost = damped_pair(noise_share=0.1)
     points, values = minimise(cost.log, 2, algorithm, 1500)
     assert np.all((points >= 0) & (points <= 1))
     # The optimum by another method, from the true pair; gamma may not leave the box for the simplex either.
@@ -521,11 +521,7 @@ def test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum(algorithm)
 
 def test_31_a_search_that_nlopt_breaks_off_keeps_what_it_found():
     """Noise-free, every box near the pole is worth dividing: the original DIRECT fills its tables."""
-    pole = 0.8 * np.exp(0.9j)
-    u = noise(17)
-    y = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
-    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
-    cost = prepare([record(u, y)], Structure()).candidate_cost(space, Poles(), Poles())
+    pole, space, cost = damped_pair(noise_share=0.0)
     points, values = minimise(cost.log, 2, "GN_ORIG_DIRECT", 1500)
     beta, gamma = space.coordinates(points[np.argmin(values)][None, :])[0]
     assert beta == pytest.approx(2 * pole.real / (1 + abs(pole) ** 2), abs=0.02)

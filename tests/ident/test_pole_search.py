@@ -74,6 +74,11 @@ def test_every_variant_of_direct_finds_the_lowest_of_many_minima(algorithm):
     np.testing.assert_allclose(best, [0.3, 0.8], atol=0.05)
 
 
+def searching(record, **options):
+    options = IdentOptions(**options)
+    return PoleSearch(prepare([record], options.structure()), options)
+
+
 def test_best_points_are_apart():
     points = np.array([[0.5, 0.5], [0.52, 0.5], [0.9, 0.9], [0.1, 0.1]])
     chosen = best_apart(points, np.array([1.0, 1.1, 2.0, 3.0]), 3)
@@ -82,30 +87,25 @@ def test_best_points_are_apart():
 
 @pytest.mark.parametrize("algorithm", ["GN_DIRECT_L", "SCIPY_DIRECT_L"])
 def test_joint_search_finds_the_mode_and_traces_it(algorithm):
-    truth = p1(0)
-    options = IdentOptions(algorithm=algorithm)
-    search = PoleSearch(prepare([truth.record], options.structure()), options)
+    search = searching(p1(0).record, algorithm=algorithm)
     end = search.rescan(search.joint(2, 1))
     assert end.poles.omega_rad_s(0.005)[0] == pytest.approx(15.0, rel=0.02)
     stage = search.stages[0]
     assert stage.points.shape == (stage.log_cost.size, 4)
-    assert stage.log_cost.size >= 0.9 * options.evaluations  # scipy ends between iterations
+    assert stage.log_cost.size >= 0.9 * IdentOptions().evaluations  # scipy ends between iterations
     assert search.evaluations >= stage.log_cost.size
     assert min(minimum.rss for minimum in search.minima) == end.rss
 
 
 def test_paper_coordinates_can_be_chosen():
-    truth = p1(1)
-    options = IdentOptions(coordinates="raw")
-    search = PoleSearch(prepare([truth.record], options.structure()), options)
+    search = searching(p1(1).record, coordinates="raw")
     search.joint(2, 1)
     assert search.stages[0].coordinate_names == ("x 1", "x 2", "beta 1", "gamma 1")
 
 
 def test_rescan_leaves_a_wrong_minimum():
     """A descent from far above the mode ends in a local minimum; the rescan of the pair finds the mode."""
-    options = IdentOptions()
-    search = PoleSearch(prepare([p1(2).record], options.structure()), options)
+    search = searching(p1(2).record)
     start = Poles.from_continuous(decay_per_s=[0.1, 25], omega_rad_s=[104.0], zeta=[0.1], dt_s=0.005)
     wrong = search.descend(start, "start")
     right = search.rescan(wrong)
@@ -115,9 +115,7 @@ def test_rescan_leaves_a_wrong_minimum():
 
 
 def test_a_further_mode_is_found_on_the_residual():
-    truth = p2(0)
-    options = IdentOptions()
-    search = PoleSearch(prepare([truth.record], options.structure()), options)
+    search = searching(p2(0).record)
     first = search.rescan(search.joint(2, 1))
     second = search.add_pair(first.poles)
     found = np.sort(second.poles.omega_rad_s(0.005)) / 2 / np.pi
@@ -125,11 +123,9 @@ def test_a_further_mode_is_found_on_the_residual():
 
 
 def test_no_poles_to_search_means_the_fixed_ones():
-    options = IdentOptions(fixed_poles=((0.9, 0.0), (0.8, 0.1)))
     rng = np.random.default_rng(0)
-    search = PoleSearch(
-        prepare([as_record(rng.normal(size=100), rng.normal(size=100))], options.structure()), options
-    )
+    record = as_record(rng.normal(size=100), rng.normal(size=100))
+    search = searching(record, fixed_poles=((0.9, 0.0), (0.8, 0.1)))
     end = search.joint(0, 0)
     np.testing.assert_array_equal(end.poles.values, [0.9, 0.8 + 0.1j, 0.8 - 0.1j])
 

@@ -83,15 +83,48 @@ def test_dt_must_be_positive(good, dt_s):
     assert f"{good}: dt_s must be a positive number of seconds" in complaint(good, time=None, dt_s=dt_s)
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [("nan", "'nan'"), ("inf", "'inf'"), ("-Infinity", "'-Infinity'"), ("", "empty"), ("o.k.", "'o.k.'")],
-)
-def test_bad_numbers_are_named_with_line_and_column(tmp_path, text, shown):
-    body = rows()
-    body[3] = f"0.03,{text},1.5"
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *body])
-    assert complaint(path) == f"{path}, line 5: column 'u_V' is {shown}; expected a finite number"
+HEAD = f"{T},{U},{Y}"
+# What is wrong with the lines of a log, and what the one line of the complaint must say.
+FAULTS = {
+    **{
+        f"{text or 'empty'} for a number": (
+            [HEAD, *rows(3), f"0.03,{text},1.5", *rows(2, start=4)],
+            [f"log.csv, line 5: column 'u_V' is {shown}; expected a finite number"],
+        )
+        for text, shown in (
+            *(("nan", "'nan'"), ("inf", "'inf'"), ("-Infinity", "'-Infinity'")),
+            *(("", "empty"), ("o.k.", "'o.k.'")),
+        )
+    },
+    "blank line": ([HEAD, *rows(3), "", *rows(3, start=3)], ["log.csv, line 5: column 't_s' is empty"]),
+    "short row": ([HEAD, *rows(3), "0.03,1", *rows(2, start=4)], ["line 5: column 'y_rad' is empty"]),
+    "long row": ([HEAD, *rows(3), "0.03,1,2,3", *rows(2, start=4)], ["line 5: 4 cells where line 1 has 3"]),
+    "semicolons": (["t_s;u_V;y_rad", "0;1;2"], ["no column", "semicolons"]),
+    "tabs": (["t_s\tu_V\ty_rad", "0\t1\t2"], ["no column", "tabs"]),
+    "no header": (["0,1,2", "1,2,3"], ["no column", "column names in line 1"]),
+    "decimal commas": ([HEAD, "0,00,1,00,2,00"], ["line 2: 6 cells where line 1 has 3", "decimal point"]),
+    "time stands still": (
+        [HEAD, *rows(4), "0.030000,1,2", *rows(1, start=5)],
+        ["log.csv, line 6: time 't_s' goes from 0.03 to 0.03 s", "expected increasing time"],
+    ),
+    "lost sample": (
+        [HEAD, *rows(10), *rows(5, start=11)],
+        ["log.csv, line 12: time 't_s' steps by 0.02 s where most steps are 0.01 s", "within 1%"],
+    ),
+    "repeated name": ([f"{T},{U},{U},{Y}", "0,1,2,3", "1,2,3,4"], ["column names repeat"]),
+    "nothing": ([""], []),
+    "blank lines only": (["", ""], []),
+    "header only": ([HEAD], []),
+    "binary": ([bytes(range(256)).decode("latin-1") * 4], []),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_log_is_one_line_with_file_and_place(tmp_path, fault):
+    lines, words = FAULTS[fault]
+    message = complaint(write(tmp_path / "log.csv", lines))
+    for word in (str(tmp_path / "log.csv"), *words):
+        assert word in message
 
 
 def test_bad_numbers_in_columns_nobody_asked_for_do_no_harm(tmp_path):
@@ -104,60 +137,11 @@ def test_missing_column_lists_those_there(good):
         Record.from_file(good, ["w"], [Y], time=T)
 
 
-def test_a_blank_line_in_the_middle_is_named(tmp_path):
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "", *rows(3, start=3)])
-    assert f"{path}, line 5: column 't_s' is empty" in complaint(path)
-
-
-def test_rows_of_uneven_length_are_named(tmp_path):
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "0.03,1", *rows(2, start=4)])
-    assert f"{path}, line 5: column 'y_rad' is empty" in complaint(path)
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(3), "0.03,1,2,3", *rows(2, start=4)])
-    message = complaint(path)
-    assert f"{path}, line 5: 4 cells where line 1 has 3" in message
-
-
-@pytest.mark.parametrize(
-    ("lines", "hint"),
-    [
-        (["t_s;u_V;y_rad", "0;1;2"], "semicolons"),
-        (["t_s\tu_V\ty_rad", "0\t1\t2"], "tabs"),
-        (["0,1,2", "1,2,3"], "column names in line 1"),
-    ],
-)
-def test_a_header_of_another_kind_is_recognised(tmp_path, lines, hint):
-    message = complaint(write(tmp_path / "log.csv", lines))
-    assert "no column" in message
-    assert hint in message
-
-
-def test_decimal_commas_are_named_by_line(tmp_path):
-    message = complaint(write(tmp_path / "log.csv", [f"{T},{U},{Y}", "0,00,1,00,2,00"]))
-    assert "line 2: 6 cells where line 1 has 3" in message
-    assert "decimal point" in message
-
-
 def test_one_column_is_not_two_things(good):
     with pytest.raises(ValueError, match="as input and output"):
         Record.from_file(good, [U], [U], time=T)
     with pytest.raises(ValueError, match="as time and as a signal"):
         Record.from_file(good, [T], [Y], time=T)
-
-
-def test_time_running_backwards_or_standing_still(tmp_path):
-    body = rows()
-    body[4] = "0.030000,1,2"
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *body])
-    message = complaint(path)
-    assert f"{path}, line 6: time 't_s' goes from 0.03 to 0.03 s" in message
-    assert "expected increasing time" in message
-
-
-def test_a_lost_sample_is_named(tmp_path):
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y}", *rows(10), *rows(5, start=11)])
-    message = complaint(path)
-    assert f"{path}, line 12: time 't_s' steps by 0.02 s where most steps are 0.01 s" in message
-    assert "within 1%" in message
 
 
 def test_what_to_do_about_time_stamps_is_said(tmp_path):
@@ -172,24 +156,6 @@ def test_what_to_do_about_time_stamps_is_said(tmp_path):
     assert "1 of 197 are not: samples are missing: split the file there" in lost
     jitter = said_of(even + 0.001 * np.random.default_rng(0).normal(size=200))
     assert "resample it to a uniform step" in jitter
-
-
-@pytest.mark.parametrize("content", ["", "\n\n", f"{T},{U},{Y}\n"])
-def test_files_without_rows(tmp_path, content):
-    path = tmp_path / "log.csv"
-    path.write_text(content)
-    assert str(path) in complaint(path)
-
-
-def test_repeated_column_names_are_refused(tmp_path):
-    path = write(tmp_path / "log.csv", [f"{T},{U},{U},{Y}", "0,1,2,3", "1,2,3,4"])
-    assert "column names repeat" in complaint(path)
-
-
-def test_a_binary_file_is_no_csv(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_bytes(bytes(range(256)) * 4)
-    assert str(path) in complaint(path)
 
 
 def test_paths_that_are_not_there(tmp_path):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.record import Record
@@ -174,7 +173,7 @@ def test_noise_model_is_not_biased_by_the_fit():
     found = []
     for seed in range(10):
         arm = random_arm(np.random.default_rng([40, seed]), n_samples=1000, noise_pole=0.9)
-        model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:]), np.zeros(8), DT)
+        model = arm.model()
         found.append(
             tangent([arm.record], model, EmbeddingOptions(coloured_noise=True)).report.ar_coefficients[0]
         )

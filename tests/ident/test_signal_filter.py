@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal
 
 from ident.basis.options import IdentOptions
-from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
 from ident.identify import identify
 from tests.ident.benchmark_plants import as_record
@@ -55,16 +56,7 @@ def test_bad_bands_are_refused(band, message):
 def test_increments_are_differences_of_every_signal():
     y = np.arange(6.0)[:, None] ** 2
     u = np.array([0, 1, 0, 1, 1, 0.0])[:, None]
-    record = Record(
-        name="a",
-        input=u,
-        output=y,
-        dt_s=0.1,
-        input_names=("u",),
-        output_names=("y",),
-        reference=2 * u,
-        reference_names=("r",),
-    )
+    record = replace(as_record(u[:, 0], y[:, 0], dt_s=0.1), reference=2 * u, reference_names=("r",))
     found = increments(record)
     np.testing.assert_array_equal(found.output[:, 0], [1, 3, 5, 7, 9])
     np.testing.assert_array_equal(found.input[:, 0], [1, -1, 1, 0, -1])

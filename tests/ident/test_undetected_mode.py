@@ -8,7 +8,6 @@ from scipy import signal
 from scipy.stats import multivariate_normal
 
 from ident.basis.functions import basis_response
-from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.record import Record
@@ -28,6 +27,7 @@ from ident.uncertainty.undetected_mode import (
 )
 
 from .benchmark_plants import DT_S as DT
+from .test_residual_noise import covariance
 from .three_mode_arm import OMEGA, random_arm
 
 REAL = (0.8, 0.3)
@@ -85,14 +85,6 @@ def setup(whitening):
     return records, rows
 
 
-def white_matrix(whitening, n):
-    """Inverse Cholesky factor of the noise covariance, from a long impulse response."""
-    h = signal.lfilter([1.0], whitening, np.eye(1, 3000)[0])
-    gamma = np.array([h[k:] @ h[: h.size - k] for k in range(n)])
-    index = np.arange(n)
-    return np.linalg.inv(np.linalg.cholesky(gamma[np.abs(index[:, None] - index)]))
-
-
 @pytest.mark.parametrize("whitening", [np.ones(1), np.array([1.0, -0.7, 0.2])])
 def test_evidence_and_amplitudes_equal_the_dense_ones(whitening):
     records, rows = setup(whitening)
@@ -104,7 +96,7 @@ def test_evidence_and_amplitudes_equal_the_dense_ones(whitening):
     flat, columns, output = [], [], []
     for index, record in enumerate(records):
         u, n = record.input[:, 0], record.n_samples
-        white = white_matrix(whitening, n)
+        white = np.linalg.inv(np.linalg.cholesky(covariance(whitening, n)))
         offset = np.zeros((n, 2))
         offset[:, index] = 1.0
         x = driven(everything, u)
@@ -219,7 +211,7 @@ def test_grid_covers_the_box_and_never_leaves_the_circle():
 
 def test_a_third_mode_left_out_is_found_at_its_place_and_covered():
     arm = random_arm(np.random.default_rng(12))
-    model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:4]), np.zeros(6), DT)
+    model = arm.model(2)
     posterior = tangent([arm.record], model)
     assert posterior.report.n_added_modes == 1
     added = posterior.poles.pairs[4]
@@ -237,7 +229,7 @@ def test_a_mode_near_the_noise_widens_the_ellipses_at_its_place_and_nowhere_else
     wider = []
     for seed in range(4):
         arm = random_arm(np.random.default_rng([30, seed]), n_samples=1000, snr_db=27.0)
-        model = GobfModel(Poles(arm.poles[:2].real, arm.poles[2:4]), np.zeros(6), DT)
+        model = arm.model(2)
         averaged = tangent([arm.record], model)
         if averaged.report.n_added_modes:
             continue

@@ -11,6 +11,7 @@ from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data, invalidate, repeat_scatter
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+from tests.ident.benchmark_plants import as_record
 
 DT = 0.01
 OMEGA = np.linspace(1.0, 100.0, 60)
@@ -20,16 +21,12 @@ def model(integrators=0):
     return GobfModel(Poles([0.9], [0.95 * np.exp(0.3j)]), [1.0, -0.4, 0.7], DT, integrators=integrators)
 
 
-def record(u, y, dt=DT):
-    return Record("fresh", u[:, None], y[:, None], dt, ("u",), ("y",))
-
-
 @pytest.mark.parametrize("integrators", [0, 1, 2])
 def test_true_model_fits_fully_whatever_the_initial_state(integrators):
     m = model(integrators)
     u = np.random.default_rng(0).standard_normal(900)
     y = m.simulate(u) + 3.0
-    middle = record(u[400:], y[400:])
+    middle = as_record(u[400:], y[400:], dt_s=DT)
     fit = fit_on_fresh_data(m, middle)
     assert fit.fit_percent > 99.9999
     from_rest = fit_on_fresh_data(m, middle, estimate_initial_state=False)
@@ -45,16 +42,16 @@ def test_fit_percent_of_pure_noise_on_top():
     u = rng.standard_normal(20_000)
     clean = m.simulate(u)
     noise = 0.1 * np.std(clean) * rng.standard_normal(u.size)
-    fit = fit_on_fresh_data(m, record(u, clean + noise))
+    fit = fit_on_fresh_data(m, as_record(u, clean + noise, dt_s=DT))
     assert fit.fit_percent == pytest.approx(100 * (1 - 0.1 / np.sqrt(1.01)), abs=0.2)
 
 
 def test_fresh_fit_refuses_what_it_cannot_judge():
     u = np.random.default_rng(2).standard_normal(100)
     with pytest.raises(ValueError, match="dt_s"):
-        fit_on_fresh_data(model(), record(u, u, 2 * DT))
+        fit_on_fresh_data(model(), as_record(u, u, dt_s=2 * DT))
     with pytest.raises(ValueError, match="constant"):
-        fit_on_fresh_data(model(), record(u, np.ones(100)))
+        fit_on_fresh_data(model(), as_record(u, np.ones(100), dt_s=DT))
     two = Record("w", np.zeros((9, 2)), np.zeros((9, 1)), DT, ("a", "b"), ("y",))
     with pytest.raises(ValueError, match="one input"):
         fit_on_fresh_data(model(), two)

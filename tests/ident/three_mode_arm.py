@@ -8,7 +8,10 @@ import numpy as np
 
 from benchmarks.coverage_p2 import BANDS, OMEGA
 from benchmarks.p2_plants import Setting, draw
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
 from ident.data.record import Record
+from tests.ident.benchmark_plants import DT_S
 
 
 @dataclass(frozen=True)
@@ -16,6 +19,11 @@ class Arm:
     record: Record
     truth: np.ndarray  # (F,) response on OMEGA
     poles: np.ndarray  # the two real ones, then the three of the upper half plane, in z
+
+    def model(self, n_modes=3):
+        """Its poles without the last modes, coefficients zero."""
+        poles = Poles(self.poles[:2].real, self.poles[2 : 2 + n_modes])
+        return GobfModel(poles, np.zeros(poles.order), DT_S)
 
 
 def random_arm(rng, n_samples=2000, snr_db=35.0, noise_pole=0.0):

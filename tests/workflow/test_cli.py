@@ -379,7 +379,7 @@ def test_main_without_arguments_shows_help(capsys):
     ("command", "words"),
     [
         ("run", ["[default: runs/<name>-<date>-<time>]"]),
-        ("identify", ["Zeit [ms]", "Sampling period [s]", "[samples]"]),
+        ("identify", ["Zeit [ms]", "Sampling period [s]", "[samples]", "one-page report"]),
         ("design", ["[specification]"]),
         ("simulate", ["[source]"]),
     ],

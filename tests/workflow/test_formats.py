@@ -79,6 +79,8 @@ def test_numbers_with_units_and_ranges():
     assert extent([2.0, 1.0, 3.0]) == "1 to 3"
     assert extent([1.00001, 1.0]) == "1"
     assert interval((7.6123, 7.6191)) == "7.6123 to 7.6191"
+    assert interval((0.0801, 0.1072)) == "0.080 to 0.107"
+    assert interval((10.0, 90.0)) == "10 to 90"
     assert interval((0.0, float("inf"))) == "not known"
     assert interval((1.0, 1.0)) == "1 to 1"
     assert interval((1.23456, 2.0), 3) == "1.23 to 2"

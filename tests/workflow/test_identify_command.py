@@ -13,7 +13,6 @@ import scipy.signal
 from ident.basis.model_files import ModelFile
 from tests.ident.benchmark_plants import P2_HZ, p2
 from tests.workflow.test_report import ATTACK, Page, is_one_file
-from workflow.cli import main
 from workflow.commands.identify import identify_logs
 from workflow.engine.errors import InputError
 from workflow.tasks.model_files import read_model
@@ -328,17 +327,3 @@ def test_damaged_model_files_are_one_line(identified, tmp_path):
         assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="cannot read"):
         read_model(tmp_path / "gone.json")
-
-
-def test_intervals_keep_two_digits_of_what_lies_between():
-    assert interval((2.4976, 2.5017)) == "2.4976 to 2.5017"
-    assert interval((0.0801, 0.1072)) == "0.080 to 0.107"
-    assert interval((10.0, 90.0)) == "10 to 90"
-    assert interval((0.0, float("inf"))) == "not known"
-
-
-def test_help_says_what_can_be_written(capsys):
-    assert main(["identify", "--help"]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    for words in ("--report", "--export", "--reference", "one-page report"):
-        assert words in text
