@@ -17,7 +17,7 @@ import numpy as np
 
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.first_order import FirstOrder, Intervals
-from control_design.plants.plant_set import UncertainPlant, frequency_response
+from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
@@ -209,11 +209,3 @@ def flexible_link_specification(order: int) -> Specification:
         controller_order=order,
         computational_delay_samples=0,
     )
-
-
-def nominal_matches_centre(scenario: Scenario, omega_rad_s: Real) -> float:
-    """Largest relative difference of the nominal state space from the ellipse centres (a check of this
-    module)."""
-    plant = flexible_link(scenario)
-    centre = LinkUncertainty(scenario).at(omega_rad_s, 0.95).centre
-    return float(np.max(np.abs(frequency_response(plant.nominal, omega_rad_s) - centre) / np.abs(centre)))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +59,7 @@ class KnownAnswer(Engine):
     """Says what it was told, with the residuals that follow.
 
     verdict, detail, unlisted: as in a Diagnosis. fails: cases it raises an error for; dies: cases that kill
-    their process. waits_s: seconds it takes before it answers. seen: file it appends the case's name to.
+    their process. seen: file it appends the case's name to.
     """
 
     effects: tuple[dict[str, float | str], ...] = ()
@@ -70,8 +69,7 @@ class KnownAnswer(Engine):
     unlisted: tuple[Effect, ...] = ()
     fails: tuple[str, ...] = ()
     dies: tuple[str, ...] = ()
-    waits_s: float = 0.0
-    seen: Path | None = field(default=None)
+    seen: Path | None = None
 
     def __call__(self, case: Case, *, progress=None) -> Diagnosis:
         if self.seen is not None:
@@ -83,7 +81,6 @@ class KnownAnswer(Engine):
             raise ZeroDivisionError("no such luck")
         if case.name in self.dies:
             os.kill(os.getpid(), signal.SIGKILL)
-        time.sleep(self.waits_s)
         return self._answer(case)
 
     def _answer(self, case: Case) -> Diagnosis:

@@ -84,12 +84,10 @@ def posterior(of: GobfModel, relative: float = 0.01) -> ResponsePosterior:
     )
 
 
-def record(
-    models: list[GobfModel], name: str, seed: int, *, samples: int = 900, units: bool = True
-) -> Record:
+def record(models: list[GobfModel], name: str, seed: int) -> Record:
     """Square-wave excitation, outputs of the models with a little white noise."""
     rng = np.random.default_rng(seed)
-    u = np.repeat(rng.choice([-1.0, 1.0], samples // 12 + 1), 12)[:samples] * 2.0
+    u = np.repeat(rng.choice([-1.0, 1.0], 76), 12)[:900] * 2.0
     y = np.column_stack([m.simulate(u) for m in models])
     y = y + 0.02 * y.std(axis=0) * rng.standard_normal(y.shape)
     return Record(
@@ -99,8 +97,8 @@ def record(
         dt_s=DT_S,
         input_names=(models[0].input_name,),
         output_names=tuple(m.output_name for m in models),
-        input_units=("V",) if units else (),
-        output_units=tuple("rad" if "rad" in m.output_name else "m" for m in models) if units else (),
+        input_units=("V",),
+        output_units=tuple("rad" if "rad" in m.output_name else "m" for m in models),
     )
 
 
@@ -190,7 +188,6 @@ def config(
     labels: tuple[str, ...] = ("hub", "tip"),
     records: tuple[str, ...] = ("prbs 1", "prbs 2", "fresh"),
     input_name: str = INPUT,
-    modulus_margin: float = 0.5,
     notes: tuple[str, ...] = ("link of 1 m",),
     machine: str = "simulated",
 ) -> RunConfig:
@@ -213,7 +210,7 @@ def config(
             ],
             "specification": {
                 "bandwidth_rad_s": 0.1,
-                "modulus_margin": modulus_margin,
+                "modulus_margin": 0.5,
                 "input_limit": 24.0,
                 "controller_order": 1,
             },
@@ -245,7 +242,7 @@ def build_run(
     names = settings.record_names
     roles = [entry.role for entry in settings.source.records]
     records = tuple(
-        RunRecord(record(models, name, seed, samples=900), role, "same", "a remark", kind="prbs")
+        RunRecord(record(models, name, seed), role, "same", "a remark", kind="prbs")
         for seed, (name, role) in enumerate(zip(names, roles, strict=True), 1)
     )
     run.save_stage("records", RecordsResult(records), "00")
@@ -339,13 +336,13 @@ def achievable(reached: float = 0.8) -> AchievablePerformance:
     )
 
 
-def sampled_responses(gamma: float, *, level: float = 0.9, calibrated: bool = False) -> SampledResponses:
+def sampled_responses(gamma: float) -> SampledResponses:
     """Sampled responses, made up: the worst case holds for 990 of 1000."""
     joint = JointCoverage(
         coverage=0.95,
         draws=1000,
         gamma=0.99 * gamma,
-        level=level,
+        level=0.9,
         given_level=0.95,
         gamma_given=gamma,
         coverage_given=0.99,
@@ -353,7 +350,7 @@ def sampled_responses(gamma: float, *, level: float = 0.9, calibrated: bool = Fa
         simultaneous_level=0.998,
         stable_share=1.0,
     )
-    return SampledResponses(joint, calibrated)
+    return SampledResponses(joint)
 
 
 def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
@@ -399,9 +396,7 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
     )
 
 
-def beyond_the_trial(
-    reference, output, *, small_off_percent: float = -12.0
-) -> tuple[SensitivityCheck, tuple[ConditionRun, ...]]:
+def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[ConditionRun, ...]]:
     """Two measurements of S and two conditions, as the closed-loop stage leaves them."""
     omega = np.linspace(1.0, 60.0, 40)
     loop = controller().response(omega) * plant().channel.nominal_response(omega)
@@ -423,7 +418,7 @@ def beyond_the_trial(
             magnitude=size * (1 + off / 100),
             std=np.full(omega.size, 0.002),
         )
-        for number, (name, off) in enumerate(zip(names, (0.4, small_off_percent), strict=True))
+        for number, (name, off) in enumerate(zip(names, (0.4, -12.0), strict=True))
     ]
     conditions = []
     for name, factor in (("payload 200 %", 0.9), ("push at the tip", 1.1)):

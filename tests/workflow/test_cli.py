@@ -324,48 +324,32 @@ def test_version_and_module_entry():
     assert out.decode().startswith("flexlink ")
 
 
-def test_internal_errors_are_one_line_and_one(flexlink, monkeypatch, tmp_path):
-    import workflow.commands.run
-
-    def broken(*arguments, **options):
-        raise ZeroDivisionError("division\nby zero")
-
-    monkeypatch.setattr(workflow.commands.run, "run_from_files", broken)
-    answer = flexlink("run", "--out", tmp_path / "run")
-    assert answer.code == 1
-    assert (
-        answer.err == "flexlink: internal error: ZeroDivisionError: division by zero (--debug shows where)\n"
-    )
-    assert "Traceback" in flexlink("--debug", "run", "--out", tmp_path / "run").err
+def divided():
+    raise ZeroDivisionError("division\nby zero")
 
 
-def test_lack_of_memory_is_no_internal_error(flexlink, monkeypatch, tmp_path):
-    import workflow.commands.run
+def stopped():
+    raise KeyboardInterrupt
 
-    def too_much(*arguments, **options):
-        return np.zeros(2**45)  # more than any address space
 
-    monkeypatch.setattr(workflow.commands.run, "run_from_files", too_much)
-    answer = flexlink("run", "--out", tmp_path / "run")
-    assert answer.code == 1
-    assert answer.err.startswith("flexlink: out of memory (Unable to allocate")
+@pytest.mark.parametrize(
+    ("fails", "code", "line"),
+    [
+        (divided, 1, "internal error: ZeroDivisionError: division by zero (--debug shows where)\n"),
+        (lambda: np.zeros(2**45), 1, "out of memory (Unable to allocate"),  # more than any address space
+        (stopped, 130, "interrupted\n"),  # nothing is there to be continued
+    ],
+    ids=["error", "memory", "interrupt"],
+)
+@pytest.mark.parametrize("command", ["run.run_from_files", "simulate.simulate_to_csv"])
+def test_what_nobody_expected_is_one_line(flexlink, monkeypatch, tmp_path, command, fails, code, line):
+    monkeypatch.setattr(f"workflow.commands.{command}", lambda *arguments, **options: fails())
+    call = command.partition(".")[0], "--out", tmp_path / "run"
+    answer = flexlink(*call)
+    assert answer.code == code
+    assert answer.err.startswith(f"flexlink: {line}")
     assert answer.err.count("\n") == 1
-
-
-def test_interrupt_is_one_line(flexlink, monkeypatch, tmp_path):
-    import workflow.commands.run
-    import workflow.commands.simulate
-
-    def stop(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(workflow.commands.run, "run_from_files", stop)
-    answer = flexlink("run", "--out", tmp_path / "run")
-    assert answer.code == 130
-    assert answer.err == "flexlink: interrupted\n"  # nothing is there yet to be continued
-    monkeypatch.setattr(workflow.commands.simulate, "simulate_to_csv", stop)
-    answer = flexlink("simulate", "--out", tmp_path / "run")
-    assert (answer.code, answer.err) == (130, "flexlink: interrupted\n")
+    assert ("Traceback" in flexlink("--debug", *call).err) == ("internal error" in line)
 
 
 def test_main_without_arguments_shows_help(capsys):

@@ -15,6 +15,7 @@ from workflow.engine import codec, storage
 from workflow.engine.codec import CodecError
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import IdentifiedPlant, RunResults
+from workflow.tasks.stages import STAGES
 
 
 class Colour(Enum):
@@ -86,9 +87,7 @@ def test_a_value_of_every_kind_comes_back():
     assert back.signal.flags.c_contiguous
 
 
-@pytest.mark.parametrize(
-    "stage", [name for name, kind in vars(RunResults).items() if isinstance(kind, property)]
-)
+@pytest.mark.parametrize("stage", [stage.name for stage in STAGES])
 def test_every_result_of_a_run_comes_back(fast_run, stage):
     result = getattr(RunResults(RunDirectory.open(fast_run[0])), stage)
     back = codec.from_arrays(type(result), codec.to_arrays(result))

@@ -263,11 +263,9 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
     ("wishes", "words"),
     [
         ("sensitivity_weight = { numerator = [1.0], denominator = [1.0, -2.0] }", "weight is unstable"),
-        ("effort_weight = { numerator = [1.0, 0.0], denominator = [1.0] }", "weight is improper"),
         ("structure = 'pi_d_notch'\nintegrator = true\ncontroller_order = 1", "controller_order of at least"),
         ("bandwith_rad_s = 1.0", "did you mean bandwidth_rad_s"),
         ("[uncertainty]\nmultiplicative = { numerator = [1.0], denominator = [1.0, -2.0] }", "unstable"),
-        ("[uncertainty]\nmultiplicative = { numerator = [1.0, 1.0], denominator = [1.0] }", "improper"),
         ("[uncertainty]\nmultiplicative = { numerator = [1.0], denominator = [1.0, 0.0] }", "imaginary axis"),
         ("[uncertainty]\nmultiplicative = -0.1", "must be positive"),
         ("[uncertainty]\nmultiplicative = 0.1\nadditive = 0.1", "either multiplicative or additive"),
@@ -279,13 +277,10 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
             "wish.toml: reference_filter.corner_rad_s: 100 lies beyond the Nyquist",
         ),
         ("[reference_filter]\nmodel = { numerator = [1.0, 1.0], denominator = [1.0] }", "improper"),
-        ("[reference_filter]\nmodel = { numerator = [1.0], denominator = [1.0, -1.0] }", "unstable"),
         ("[certificate]\njoint_draws = 5", "joint_draws must be 0 or at least 100"),
         ("[certificate]\njoint_coverage = 1.0", "joint_coverage"),
         ("[certificate]\njoint_draws = 0\ncalibrate = true", "calibrate needs joint_draws"),
         ("[achievable_performance]\ncompute = true\nreal_pole = 3", "did you mean real_poles"),
-        ("bandwidth_rad_s = nan", "bandwidth_rad_s: input should be a finite number"),
-        ("controller_order = 0", "controller_order"),
         ("[specification]\nbandwidth_rad_s = 1.0\n[uncertanty]\nmultiplicative = 0.1", "uncertanty"),
     ],
 )
@@ -329,18 +324,12 @@ def test_measured_response_is_refused(refused, wish, tmp_path):
     write_response(path)
     assert "write dt_s in [plant]" in refused("design", path, "--spec", wish())
     spec = wish(f"[plant]\ndt_s = {DT_S}\n")
-    write_response(path, order=[3, 1, 2])
-    assert "strictly increasing" in refused("design", path, "--spec", spec)
-    write_response(path, order=[])
-    assert "no rows under the header" in refused("design", path, "--spec", spec)
     write_response(path, order=[1])
     assert "one frequency is no response" in refused("design", path, "--spec", spec)
     header = "omega_rad_s,real,imag,variance_real,variance_imag,covariance_real_imag\n"
     path.write_text(header + "0.1,1,0,1e-4,1e-4,0\n0.2,1,0,1e-4,1e-4,5e-4\n0.3,1,0,1e-4,1e-4,0\n")
     line = refused("design", path, "--spec", spec)
     assert "not positive semidefinite (first at omega = 0.2 rad/s)" in line
-    path.write_text(header + "0.1,1,0,1e-4,1e-4,0\n0.2,1,0,-1e-4,1e-4,0\n")
-    assert "line 3: a variance is negative" in refused("design", path, "--spec", spec)
     path.write_text(header.replace("_real_imag", "") + "0.1,1,0,1e-4,1e-4,0\n0.2,1,0,1e-4,1e-4,0\n")
     assert "line 1: unknown column 'covariance'" in refused("design", path, "--spec", spec)
     path.write_text("omega_rad_s,real,imag\n0.1,1,0\n0.1,1,0.1\n0.2,1,0\n")

@@ -268,6 +268,8 @@ def test_a_real_arm_is_not_said_to_have_run(undrawn, tmp_path):
     assert "Nothing was run on the real machine here." in page.text
     assert "The controller has not run on the real machine." in page.text
     assert "on the simulated arm came to rest" not in page.text
+    assert "Sensitivity on the arm" not in page.text
+    assert "The loop under other conditions" not in page.text
 
 
 def test_hostile_names_are_escaped(tmp_path):
@@ -322,12 +324,6 @@ def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn
     assert "The loop on the arm is not the predicted one" in text
     assert "dry friction takes" not in text
     assert "The loop does not come to rest with: payload 200 % and push at the tip." in text
-
-
-def test_identified_machine_has_neither_sensitivity_nor_conditions(tmp_path, undrawn):
-    page = page_for(tmp_path, example.config(machine="identified"))
-    assert "Sensitivity on the arm" not in page.text
-    assert "The loop under other conditions" not in page.text
 
 
 def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, undrawn):
