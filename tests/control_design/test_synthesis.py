@@ -66,10 +66,6 @@ def test_same_seed_same_controller():
         synthesise([uncertain_hub(0.03)], specification, _QUICK, rng=np.random.default_rng(5))
         for _ in range(2)
     ]
-    for name in ("A", "B", "C", "D"):
-        np.testing.assert_array_equal(
-            getattr(results[0].controller, name), getattr(results[1].controller, name)
-        )
     assert codec.plain(results[0]) == codec.plain(results[1])
 
 

@@ -72,15 +72,9 @@ def test_simulation_from_rest_has_the_impulse_response_of_the_centre(integrators
         integrators=integrators,
         input_delay_samples=delay,
     )
-    taps = (
-        signal.lfilter([1.0], [1.0, -1.0], np.concatenate([np.zeros(delay), u])[:200])
-        if integrators
-        else None
-    )
     filtered = np.concatenate([np.zeros(delay), u])[:200]
     for _ in range(integrators):
         filtered = signal.lfilter([1.0], [1.0, -1.0], filtered)
-    assert taps is None or integrators > 1 or np.allclose(taps, filtered)
     expected = model.simulate(u) + signal.lfilter(np.concatenate([[0.0], p.mean[-4:]]), [1.0], filtered)
     np.testing.assert_allclose(p.simulate(u), expected, atol=1e-9 * np.abs(expected).max())
     with pytest.raises(ValueError, match="coefficients"):

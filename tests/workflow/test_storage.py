@@ -118,12 +118,6 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_temporary(tmp_path, monke
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_unwritable_place_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write"):
-        storage.write_text(tmp_path / "file" / "a.txt", "x")
-
-
 def test_a_reader_never_sees_half_a_file_while_the_writer_is_killed(tmp_path):
     """Kill -9 a process that rewrites one file without pause; whatever is there must be whole."""
     path = tmp_path / "a.npz"

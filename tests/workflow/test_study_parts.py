@@ -255,11 +255,6 @@ def test_a_task_that_kills_its_process_fails_alone():
         assert "code of the worker" in found[index].reason
 
 
-def test_jobs_must_be_positive():
-    with pytest.raises(ValueError, match="at least 1"):
-        LocalProcesses(0)
-
-
 SEARCH = f"""
 [study]
 base = "{FAST_ARM}"
