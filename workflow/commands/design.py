@@ -7,8 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from control_design.analysis.certificate import Certificate
-from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -31,7 +29,6 @@ from workflow.tasks.results import (
     CertifyResult,
     DesignResult,
     ReferenceFilterResult,
-    SampledResponses,
 )
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import rows_of, said
@@ -82,18 +79,9 @@ class _Designed:
     """Results of a design, of the same types as a run's stages."""
 
     design: DesignResult
+    certify: CertifyResult
     achievable: AchievablePerformance = field(default_factory=AchievablePerformance)
-    certify: CertifyResult | None = None
     reference_filter: ReferenceFilterResult = field(default_factory=ReferenceFilterResult)
-
-    @property
-    def certificate(self) -> Certificate | None:
-        return None if self.certify is None else self.certify.certificate
-
-    @property
-    def controller(self) -> Controller | None:
-        """The controller, where there is one that means something."""
-        return self.design.synthesis.controller if self.design.synthesis and self.certify else None
 
 
 def _design(
@@ -103,11 +91,12 @@ def _design(
         design = find_design(
             plants, asked.specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
         )
+        nothing = CertifyResult(None, certified=False, reason=design.reason)
         if design.synthesis is None:
-            return _Designed(replace(design, reason=f"specification not met: {design.reason}"))
+            return _Designed(replace(design, reason=f"specification not met: {design.reason}"), nothing)
         achievable = find_bracket(plants, asked.specification, asked.achievable_performance)
         if not design.has_controller:
-            return _Designed(design, achievable)
+            return _Designed(design, nothing, achievable)
         controller = design.synthesis.controller
         certified = certify_asked(
             controller,
@@ -118,7 +107,7 @@ def _design(
             between_own_points=between_own_points,
         )
         return _Designed(
-            design, achievable, certified, find_filter(controller, plants, asked.reference_filter)
+            design, certified, achievable, find_filter(controller, plants, asked.reference_filter)
         )
 
 
@@ -148,25 +137,24 @@ def design_controller(
     plants = [source.plant for source in sources_found]
     check_filter(asked.reference_filter, plants[0].dt_s, str(file.path or paths[0]))
     done = _design(plants, asked, file.plant.between_points, seed)
-    certificate, order = done.certificate, asked.specification.controller_order
-    certified = certificate is not None and certificate.certified
+    certificate, certified = done.certify.certificate, done.certify.certified
+    synthesis, order = done.design.synthesis, asked.specification.controller_order
     files: list[Path] = []
-    if out is not None and done.controller is not None:
+    if out is not None and synthesis is not None and certificate is not None:
         found = done.reference_filter.filter
-        files = write_controller(out, done.controller, found, certified=certified)
+        files = write_controller(out, synthesis.controller, found, certified=certified)
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None
     reason = _reason(done, advice)
-    sampled = SampledResponses() if done.certify is None else done.certify.sampled
-    shares = joint_numbers(sampled)
+    shares = joint_numbers(done.certify.sampled)
     rows = rows_of(
         "summary/design.j2",
         sources=sources_found,
         done=done,
         order=order,
         advice=advice,
-        verdict=CertifyResult(certificate, certified, reason, sampled),
+        verdict=replace(done.certify, reason=reason),
         shares=shares,
         files=files,
     )
@@ -207,7 +195,7 @@ def _check_out(out: Path, sources: Sequence[Path]) -> None:
 
 def _reason(done: _Designed, advice: str | None) -> str:
     """How the design stands, in one line."""
-    certificate, reason = done.certificate, done.design.reason
+    certificate, reason = done.certify.certificate, done.design.reason
     if certificate is None:
         return reason if done.design.synthesis is None else f"{reason}; {_NO_CONTROLLER}"
     if certificate.certified:
