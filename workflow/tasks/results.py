@@ -184,14 +184,6 @@ class IdentifiedChannel:
         return tuple(sorted(self.model.poles.real.tolist(), reverse=True))
 
     @property
-    def warnings(self) -> tuple[Finding, ...]:
-        return self.identification.warnings
-
-    @property
-    def verdicts(self) -> tuple[Finding, ...]:
-        return self.identification.verdicts
-
-    @property
     def order_table(self) -> tuple[OrderStep, ...]:
         return self.identification.order_table
 

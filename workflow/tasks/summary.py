@@ -113,8 +113,8 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
     )
     return {
         **{name: codec.plain(getattr(found, name)) for name in names},
-        "warnings": [words(item) for item in found.warnings],
-        "verdicts": [words(item) for item in found.verdicts],
+        "warnings": [words(item) for item in found.identification.warnings],
+        "verdicts": [words(item) for item in found.identification.verdicts],
         "two_stage": None if found.two_stage is None else words(found.two_stage),
         "modes": [
             {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode), "is_mode": found.is_mode(mode)}
