@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,25 +76,20 @@ def draw_waterfall(found: Diagnosis) -> Figure:
 
 
 @drawing("gap_overview")
-def draw_case_gaps(
-    names: Sequence[str],
-    answers: Sequence[str],
-    before: Sequence[float],
-    after: Sequence[float],
-    floors: Sequence[float],
-) -> Figure:
-    """One line per case: RMS over noise (C,) with the nominal parameters, and with the effects added."""
-    at, floor = np.arange(len(names)), float(np.median(floors))
-    figure = style.new_figure(1.5 + 0.32 * len(names))
+def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
+    """One line per case, from its JSON answer with `name` and `answer` in words: RMS over noise with the
+    nominal parameters, and with the effects added."""
+    before, after = ([case[key] for case in cases] for key in ("gap_before", "gap_after"))
+    at, floor = np.arange(len(cases)), float(np.median([case["noise_floor"] for case in cases]))
+    figure = style.new_figure(1.5 + 0.32 * len(cases))
     axes = figure.subplots()
     axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
     for model, values in (("stated", before), ("repaired", after)):
         axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
     axes.axvline(floor, **gap_style.FLOOR, zorder=0)
     axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
-    labels = [f"{style.plain(n, 34)}: {style.plain(a, 44)}" for n, a in zip(names, answers, strict=True)]
-    axes.set_yticks(at, labels)
-    axes.set(ylim=(len(names) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
+    axes.set_yticks(at, [f"{style.plain(c['name'], 34)}: {style.plain(c['answer'], 44)}" for c in cases])
+    axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
     axes.set_title("How far each gap shrinks")
     style.finish(figure, axes)
     return figure
