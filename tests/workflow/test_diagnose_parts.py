@@ -11,7 +11,7 @@ from plant.effects import in_words
 from tests.workflow.diagnosis_examples import small_rig
 from workflow.diagnose.controller_check import check_controller
 from workflow.diagnose.linear_machine import sampled_linear_machine
-from workflow.diagnose.words import FILTERS, parameter_words, probability_words, unit_of
+from workflow.diagnose.words import FILTERS, key_words, parameter_words, probability_words, unit_of
 from workflow.text import formats
 
 LINEAR = {
@@ -92,6 +92,8 @@ def test_every_effect_has_words_and_every_parameter_its_unit():
     assert unit_of("hub.inertia_kg_m2") == "kg m²"
     assert parameter_words("delay_s", 0.012, (0.011, 0.013)) == "delay 0.012 s (95 %: 0.011 to 0.013)"
     assert parameter_words("ratio", 1.25, None) == "ratio 1.25"
+    assert key_words("link.youngs_modulus_Pa") == "Young's modulus (link)"
+    assert key_words("hub.inertia_kg_m2") == "inertia (hub)"
 
 
 def test_no_probability_is_called_certain():

@@ -96,3 +96,8 @@ def test_row_measures_in_percent_of_the_move(bench):
     away = late.achieved - late.predicted
     assert late.largest_difference_percent == pytest.approx(100 * np.max(np.abs(away)) / 0.2)
     assert late.words == "5 ms more delay"
+
+
+def test_coarse_converters_are_told_with_their_units(bench):
+    """24 V in 128 steps either side of zero; without an encoder 0.4 % of the move of 0.2 rad."""
+    assert bench.coarse().words == "command in steps of 0.188 V, measurement of 0.0008 rad"

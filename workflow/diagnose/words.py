@@ -26,22 +26,21 @@ def unit_of(parameter: str) -> str:
     return f"{over} {under}" if (over, under) == ("kg", "m²") else f"{over}/{under}" if under else over
 
 
-def _ending(parameter: str) -> str:
-    found = _UNIT.search(parameter)
-    return "" if found is None else found.group()
+def name_words(parameter: str) -> str:
+    """Name without its unit: "torque_Nm" as "torque"."""
+    return _UNIT.sub("", parameter).replace("_", " ").replace("youngs", "Young's")
 
 
 def parameter_words(parameter: str, value: float, bounds: Sequence[float] | None = None) -> str:
     """Name, value, unit and 95 % interval."""
-    name = parameter.removesuffix(_ending(parameter)).replace("_", " ")
-    text = f"{name} {si(value, unit_of(parameter), 4)}"
+    text = f"{name_words(parameter)} {si(value, unit_of(parameter), 4)}"
     return text if bounds is None else f"{text} (95 %: {interval(bounds, 4)})"
 
 
 def key_words(key: str) -> str:
     """A dotted key of the rig file: "hub.inertia_kg_m2" as "inertia (hub)"."""
     section, _, name = key.partition(".")
-    what = name.removesuffix(_ending(name)).replace("_", " ")
+    what = name_words(name)
     return what if re.search(rf"\b{section}\b", what) else f"{what} ({section})"
 
 
@@ -77,6 +76,7 @@ FILTERS: Mapping[str, Callable[..., str]] = {
     "effect": in_words,
     "parameter_unit": unit_of,
     "parameter": parameter_words,
+    "parameter_name": name_words,
     "rig_key": key_words,
     "setting_of": setting_words,
     "probability": probability_words,

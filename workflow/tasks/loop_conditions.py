@@ -25,7 +25,7 @@ from plant.machine import Machine
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
-from workflow.tasks.simulated_rig import EncodedArm
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, EncodedArm
 
 Real = npt.NDArray[np.float64]
 
@@ -231,7 +231,8 @@ class ConditionBench:
         measurement = (
             4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
         )
-        words = f"command in steps of {command:.3g}, measurement of {measurement:.3g}"
+        unit = UNITS[OUTPUT_NAMES[self.measured]]
+        words = f"command in steps of {command:.3g} V, measurement of {measurement:.3g} {unit}"
         return self._run("coarse", words, steps=(measurement, command))
 
     def overdriven(self) -> list[ConditionRun]:
