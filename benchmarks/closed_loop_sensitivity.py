@@ -33,7 +33,7 @@ from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.synthesis.synthesis import synthesise
 from workflow.config.run_config import RunConfig, SimulatedSource, built_in_config
-from workflow.engine.progress import Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
@@ -71,7 +71,7 @@ def identified(config: RunConfig, folder: Path) -> UncertainPlant:
     )
     results = RunResults(run)
     for stage in STAGES[:3]:
-        run.save_stage(stage.name, stage.run(StageInput(config, results, Silence())), "benchmark")
+        run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), "benchmark")
     return results.uncertainty.plant(config)
 
 

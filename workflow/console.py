@@ -12,11 +12,12 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
+from workflow.engine import progress
 from workflow.engine.errors import printable
 from workflow.tasks.summary import RunSummary
 
 
-class TerminalProgress:
+class TerminalProgress(progress.Progress):
     """Progress with remaining time on standard error; silent when that is no terminal. Use as a context
     manager."""
 

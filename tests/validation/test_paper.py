@@ -22,7 +22,7 @@ from validation.paper.methods import METHODS
 from validation.paper.quotes import OPEN_CHOICES, REPORTED
 from validation.paper.settings import PaperSettings
 from validation.paper.table import csv_text, rows_of
-from workflow.engine.progress import Silence
+from workflow.engine.progress import Progress
 from workflow.figures import style
 
 # Everything once, and the searches long enough to find something.
@@ -31,7 +31,7 @@ SMALL = PaperSettings(seed=7, repeats=2, searches=1, evaluations=200, surface_po
 
 @pytest.fixture(scope="module")
 def results():
-    return run_experiments(SMALL, Silence())
+    return run_experiments(SMALL, Progress())
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_csv_holds_the_rows(results):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(results):
-    again = run_experiments(SMALL, Silence())
+    again = run_experiments(SMALL, Progress())
     assert csv_text(rows_of(again)) == csv_text(rows_of(results))
 
 

@@ -17,7 +17,7 @@ from workflow.commands.run import run_from_files
 from workflow.config.run_config import load_config
 from workflow.engine import storage
 from workflow.engine.errors import InputError
-from workflow.engine.progress import Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.report import run_report
 from workflow.report.stage import REPORT
@@ -106,7 +106,7 @@ def test_resume_from_every_stage_boundary(fast_run, tmp_path, plain_page):
         assert_same_run(fast_run[0], out)
 
 
-class Watch(Silence):
+class Watch(Progress):
     """Remembers which stages were taken up."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ from workflow.config.design_options import ReferenceFilterSettings
 from workflow.config.run_config import Channel, FileRecord, FileSource, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
-from workflow.engine.progress import Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
@@ -115,7 +115,7 @@ def test_reference_filter_takes_the_reference_step_to_the_loop(run, tmp_path):
     corner = 0.3 * config_of(run.run).specification.bandwidth_rad_s
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": corner, "dense_points": 1000})
     config = config_of(run.run).model_copy(update={"reference_filter": settings})
-    stage = StageInput(config, copy, Silence())
+    stage = StageInput(config, copy, Progress())
     result = design_filter(stage)
     found = result.filter
     assert found is not None

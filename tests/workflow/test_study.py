@@ -19,7 +19,7 @@ from tests.workflow.study_examples import SMALL_STUDY, assert_same_study, point_
 from workflow.config.run_config import load_config
 from workflow.engine import codec
 from workflow.engine.errors import InputError
-from workflow.engine.progress import Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.directory import StudyDirectory
 from workflow.study.run import run_study
@@ -250,7 +250,7 @@ def test_a_base_that_cannot_be_identified_is_refused(refused, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-class Watch(Silence):
+class Watch(Progress):
     """Remembers what was said."""
 
     def __init__(self) -> None:

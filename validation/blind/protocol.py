@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -35,7 +34,7 @@ from validation.blind.worker import BlindCase, diagnose_folder, failed
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.executor import Failure, LocalProcesses
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.engine.storage import (
     read_json,
     sha256_of_file,
@@ -78,7 +77,7 @@ def run_blind(
     only: cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
     diagnose: case folder -> document; runs in processes that are kept out of the run's directory.
     """
-    progress = progress or Silence()
+    progress = progress or Progress()
     chosen = next((name for name in SIMULATORS if name == simulator), None)
     if chosen is None:
         raise InputError(f"--simulator must be one of {', '.join(SIMULATORS)}; got {simulator!r}")
@@ -142,10 +141,10 @@ def _sealed_cases(
     progress: Progress,
 ) -> None:
     """Cases and closed seal; an interrupted generation goes on where it stopped."""
-    progress.start("cases")
-    started = time.monotonic()
     taken_up = (out / COMMITMENT).is_file()
-    if not taken_up:
+    with progress.stage("cases", taken_up=taken_up) as update:
+        if taken_up:
+            return
         parts = private_directory(private_directory(out / SEAL_DIRECTORY) / "parts")
         finished: dict[str, Answer] = {path.stem: read_json(path) for path in sorted(parts.glob("*.json"))}
         count = len(finished)
@@ -154,7 +153,7 @@ def _sealed_cases(
             nonlocal count
             write_private(parts / f"{answer['case']}.json", json.dumps(answer) + "\n")
             count += 1
-            progress.update("cases", count / n_cases, f"{count} of {n_cases}")
+            update(count / n_cases, f"{count} of {n_cases}")
 
         answers = generate(
             n_cases,
@@ -168,23 +167,20 @@ def _sealed_cases(
         )
         close_seal(out, answers)
         shutil.rmtree(parts)
-    progress.finish("cases", time.monotonic() - started, taken_up=taken_up)
 
 
 def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, progress: Progress) -> None:
-    progress.start("diagnosis")
-    started = time.monotonic()
     folder = out / "predictions"
     todo = [name for name in names if not (folder / f"{name}.json").is_file()]
     done = len(names) - len(todo)
     work = [BlindCase(out / "cases" / name, out.resolve(), diagnose) for name in todo]
-    with closing(LocalProcesses(jobs, preload=["validation.blind.worker"])) as processes:
+    processes = LocalProcesses(jobs, preload=["validation.blind.worker"])
+    with closing(processes), progress.stage("diagnosis", taken_up=not todo) as update:
         for index, found in processes.run(work):
             document = failed(todo[index], found.reason) if isinstance(found, Failure) else found
             write_json(folder / f"{todo[index]}.json", document)
             done += 1
-            progress.update("diagnosis", done / len(names), f"{done} of {len(names)}")
-    progress.finish("diagnosis", time.monotonic() - started, taken_up=not todo)
+            update(done / len(names), f"{done} of {len(names)}")
 
 
 def _check_cases(out: Path, labels: Sequence[Answer]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import groupby
@@ -30,7 +29,7 @@ from validation.paper.settings import PaperSettings
 from workflow.engine import storage
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import package_versions
 from workflow.engine.store import Store
 from workflow.figures.style import Picture, render
@@ -78,43 +77,41 @@ def redraw_paper(
     no page ever stands over other figures. With `replace` the files of an earlier call are exchanged, and
     nothing else is touched. Raises InputError when `out` cannot be written or holds something.
     """
-    settings, progress, store = settings or PaperSettings(), progress or Silence(), PaperDirectory(Path(out))
+    settings, progress, store = settings or PaperSettings(), progress or Progress(), PaperDirectory(Path(out))
     if store.refuse_unless_free(replace=True) and not replace:
         raise InputError(f"{out}: not empty, a redrawn paper is there; choose another --out or --replace it")
     progress.plan(STAGES)
     results = run_experiments(settings, progress)
-    progress.start("page")
-    started = time.monotonic()
-    pictures = {}
-    for number, draw in DRAWERS.items():
-        progress.update("page", (number - 1) / len(DRAWERS), f"figure {number}")
-        pictures[number] = render(draw(results))
-    findings, rows = findings_of(results), table.rows_of(results)
-    headlines = headlines_of(results, findings)
-    document = {
-        "seed": settings.seed,
-        "repeats": settings.repeats,
-        "searches": settings.searches,
-        "versions": package_versions(),
-        "figures": [
-            {
-                "figure": item.number,
-                "title": item.title,
-                "agrees": findings.agrees[item.number],
-                "found": headline,
-            }
-            for item, headline in zip(REPORTED, headlines, strict=True)
-        ],
-        "rows": [asdict(row) for row in rows],
-    }
-    page = page_html(results, pictures, findings, rows)
-    store.prepare(replace=True)
-    for number, picture in pictures.items():
-        storage.write_bytes(store.path / f"figure-{number}.{picture.kind}", picture.content)
-    storage.write_text(store.path / TABLE_CSV, table.csv_text(rows))
-    storage.write_text(store.path / TABLE_JSON, plain_text(document))
-    storage.write_text(store.manifest_path, page)
-    progress.finish("page", time.monotonic() - started, taken_up=False)
+    with progress.stage("page") as update:
+        pictures = {}
+        for number, draw in DRAWERS.items():
+            update((number - 1) / len(DRAWERS), f"figure {number}")
+            pictures[number] = render(draw(results))
+        findings, rows = findings_of(results), table.rows_of(results)
+        headlines = headlines_of(results, findings)
+        document = {
+            "seed": settings.seed,
+            "repeats": settings.repeats,
+            "searches": settings.searches,
+            "versions": package_versions(),
+            "figures": [
+                {
+                    "figure": item.number,
+                    "title": item.title,
+                    "agrees": findings.agrees[item.number],
+                    "found": headline,
+                }
+                for item, headline in zip(REPORTED, headlines, strict=True)
+            ],
+            "rows": [asdict(row) for row in rows],
+        }
+        page = page_html(results, pictures, findings, rows)
+        store.prepare(replace=True)
+        for number, picture in pictures.items():
+            storage.write_bytes(store.path / f"figure-{number}.{picture.kind}", picture.content)
+        storage.write_text(store.path / TABLE_CSV, table.csv_text(rows))
+        storage.write_text(store.path / TABLE_JSON, plain_text(document))
+        storage.write_text(store.manifest_path, page)
     return _summary(store.path, document)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -34,9 +32,6 @@ STAGES = (("surface", 10.0), ("simulation", 6.0), ("experiment", 6.0), ("bounds"
 _N_FREQUENCIES = 400
 # The paper does not print how long it searched; ten times our budget, and a hundred times changes nothing.
 RECIPE_BUDGET = 10
-
-Report = Callable[[float, str], None]
-R = TypeVar("R")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +74,15 @@ def frequencies() -> RealArray:
 
 def run_experiments(settings: PaperSettings, progress: Progress) -> PaperResults:
     """All of it; deterministic for given settings."""
-    surface = _timed("surface", progress, lambda report: study_surface(settings, report))
-    simulation = _timed("simulation", progress, lambda report: compare(SimulationExample(), settings, report))
+    with progress.stage("surface") as report:
+        surface = study_surface(settings, report)
+    with progress.stage("simulation") as report:
+        simulation = compare(SimulationExample(), settings, report)
     recipe = paper_recipe(simulation.trial.fitted, RECIPE_BUDGET * settings.evaluations)
-    experiment = _timed("experiment", progress, lambda report: compare(LinkExperiment(), settings, report))
-    bounds = _timed(
-        "bounds",
-        progress,
-        lambda report: study_bounds(experiment.trial.fitted, experiment.omega_rad_s, settings, report),
-    )
+    with progress.stage("experiment") as report:
+        experiment = compare(LinkExperiment(), settings, report)
+    with progress.stage("bounds") as report:
+        bounds = study_bounds(experiment.trial.fitted, experiment.omega_rad_s, settings, report)
     return PaperResults(
         settings=settings,
         surface=surface,
@@ -129,11 +124,3 @@ def compare(
         median_ceiling_percent=float(np.median(ceilings)),
         medians=median_scores(collected),
     )
-
-
-def _timed(name: str, progress: Progress, work: Callable[[Report], R]) -> R:
-    progress.start(name)
-    started = time.monotonic()
-    result = work(lambda fraction, message: progress.update(name, fraction, message))
-    progress.finish(name, time.monotonic() - started, taken_up=False)
-    return result

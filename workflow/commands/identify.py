@@ -12,7 +12,7 @@ from ident.basis.options import IdentOptions
 from ident.data.record import Record
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.tasks import truth
 from workflow.tasks.log_identification import LogIdentification, identify_records
 from workflow.tasks.model_files import MODEL_SUFFIXES, write_model
@@ -56,7 +56,7 @@ def identify_logs(
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
         raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
     _refuse_files_in_the_way([*logs, *validation], {"--out": out, "--report": report, "--export": export})
-    progress = progress or Silence()
+    progress = progress or Progress()
     progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
     references = [] if reference is None else [reference]
 
@@ -92,11 +92,9 @@ def identify_logs(
     if report is not None:
         from workflow.report.identify_page import identify_page  # loads matplotlib: a second
 
-        progress.start("report")
-        inputs = {str(path): storage.sha256_of_file(Path(path)) for path in (*logs, *validation)}
-        content = identify_page(result, inputs, lambda f, m: progress.update("report", f, m))
-        storage.write_text(report, content)
-        progress.finish("report", 0.0, taken_up=False)
+        with progress.stage("report") as update:
+            inputs = {str(path): storage.sha256_of_file(Path(path)) for path in (*logs, *validation)}
+            storage.write_text(report, identify_page(result, inputs, update))
     if out is not None:
         plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, level)
         storage.write_npz(out, codec.to_arrays(plant))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from workflow.engine.errors import (
     one_line,
 )
 from workflow.engine.executor import Failure, LocalProcesses
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.tasks.summary import RunSummary
 from workflow.text.formats import listing
 from workflow.text.templates import Row, Section
@@ -91,7 +90,7 @@ def diagnose_cases(
     InputError or StageError. Raises InputError (one line, nothing written) if no case can be read, two have
     one name, or `out` cannot be used.
     """
-    progress = progress or Silence()
+    progress = progress or Progress()
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     if resume and replace:
@@ -118,10 +117,9 @@ def diagnose_cases(
         page = out / f"{loaded[0].case.name}.html"
         if len(places) > 1:
             page = out / "index.html"
-            progress.start("overview")
             reasons = {case: failure.reason for case, failure in failures}
-            directory.write("index.html", overview_page(documents, reasons).encode())
-            progress.finish("overview", 0.0, taken_up=False)
+            with progress.stage("overview"):
+                directory.write("index.html", overview_page(documents, reasons).encode())
     return DiagnosisRun(tuple(documents), tuple(failures), _summary(documents, failures, page))
 
 
@@ -154,8 +152,6 @@ def _compute(
     progress.plan(
         [("cases", _CASE_S * len(todo) / width), *((("overview", _OVERVIEW_S),) if several else ())]
     )
-    progress.start("cases")
-    started = time.monotonic()
     shares = [0.0] * len(todo)
     timings = directory.timings()
     failures: dict[str, Failure] = {}
@@ -167,18 +163,18 @@ def _compute(
         progress.update("cases", sum(shares) / len(todo), words)
 
     processes = LocalProcesses(width, preload=["workflow.diagnose.outputs"])
-    for index, found in processes.run(list(todo.values()), watch):
-        name = names[index]
-        if isinstance(found, Failure):
-            failures[name] = found
-        else:
-            files, cpu_s = found
-            directory.save(name, files)
-            answers[name] = json.loads(files[f"{name}.json"])
-            timings[name] = {"cpu_s": round(cpu_s, 3)}
-            directory.write("timings.json", codec.plain_text(timings).encode())
-        watch(index, 1.0, "done")
-    progress.finish("cases", time.monotonic() - started, taken_up=not todo)
+    with progress.stage("cases", taken_up=not todo):
+        for index, found in processes.run(list(todo.values()), watch):
+            name = names[index]
+            if isinstance(found, Failure):
+                failures[name] = found
+            else:
+                files, cpu_s = found
+                directory.save(name, files)
+                answers[name] = json.loads(files[f"{name}.json"])
+                timings[name] = {"cpu_s": round(cpu_s, 3)}
+                directory.write("timings.json", codec.plain_text(timings).encode())
+            watch(index, 1.0, "done")
     return (
         [answers[name] for name in order if name in answers],
         [(name, failures[name]) for name in order if name in failures],

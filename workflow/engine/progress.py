@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 
 
-class Progress(Protocol):
-    """Called by the pipeline; every method returns at once and must not raise."""
+class Progress:
+    """Called by whatever takes long; every method returns at once and must not raise. Here nobody watches."""
 
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
         """Names of the stages to come with the seconds each is expected to take."""
@@ -21,18 +23,10 @@ class Progress(Protocol):
     def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
         """A stage is done; `taken_up` means its result was there from an earlier run."""
 
-
-class Silence:
-    """Nobody watches."""
-
-    def plan(self, stages: Sequence[tuple[str, float]]) -> None:
-        pass
-
-    def start(self, stage: str) -> None:
-        pass
-
-    def update(self, stage: str, fraction: float, message: str = "") -> None:
-        pass
-
-    def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
-        pass
+    @contextmanager
+    def stage(self, name: str, *, taken_up: bool = False) -> Iterator[Callable[..., None]]:
+        """A stage from start to finish, which is not told where it fails; gives its `update`."""
+        started = time.monotonic()
+        self.start(name)
+        yield partial(self.update, name)
+        self.finish(name, time.monotonic() - started, taken_up=taken_up)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -14,7 +13,7 @@ from workflow.engine.cluster import DaskCluster
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import Executor, Failure, LocalProcesses
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.columns import COLUMNS
 from workflow.study.directory import StudyDirectory
@@ -61,7 +60,7 @@ def run_study(
     Raises InputError (one line) for anything wrong with what the user gave, StageError when points failed
     (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
     """
-    progress = progress or Silence()
+    progress = progress or Progress()
     if resume and replace:
         raise InputError("--resume and --replace contradict each other")
     if jobs is not None and jobs < 1:
@@ -91,10 +90,8 @@ def run_study(
             except InputError:
                 directory.discard_if_empty()
                 raise
-            progress.start("page")
-            started = time.monotonic()
-            summary = _write_up(directory, study, text, base, rows)
-            progress.finish("page", time.monotonic() - started, taken_up=False)
+            with progress.stage("page"):
+                summary = _write_up(directory, study, text, base, rows)
     broken = [row for row in rows if row.state == "failed"]
     if broken:
         raise StageError(
@@ -125,29 +122,24 @@ class _Work:
         self._count = strategy.count
         share = _POINT_S * self._count / self._executor.width
         self._progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
-        started = time.monotonic()
-        self._progress.start("plant")
-        taken_up = self._make_base_plant(base_point)
-        self._progress.finish("plant", time.monotonic() - started, taken_up=taken_up)
-        started = time.monotonic()
-        self._progress.start("points")
+        there = self._directory.has_plant(base_point)
+        with self._progress.stage("plant", taken_up=there):
+            if not there:
+                self._make_base_plant(base_point)
         rows: list[PointRow] = []
-        for points in strategy.batches():
-            found = self._batch(points, base_point)
-            strategy.learn(found)
-            rows += found
-        self._progress.finish("points", time.monotonic() - started, taken_up=False)
+        with self._progress.stage("points"):
+            for points in strategy.batches():
+                found = self._batch(points, base_point)
+                strategy.learn(found)
+                rows += found
         return rows
 
-    def _make_base_plant(self, base_point: Point) -> bool:
-        if self._directory.has_plant(base_point):
-            return True
+    def _make_base_plant(self, base_point: Point) -> None:
         given = {} if self._base.run is None else self._base.run.stage_files(base_point.given)
         self._plants([(base_point, given)])
         reason = self._broken_plants.get(base_point.plant_key)
         if reason is not None:
             raise InputError(f"the base cannot be identified: {reason}")
-        return False
 
     def _batch(self, points: Sequence[Point | Contradiction], base_point: Point) -> list[PointRow]:
         """The points of a batch: what is finished is taken up, what shares a controller goes together."""

@@ -20,7 +20,7 @@ from workflow.engine import storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import StageError
 from workflow.engine.executor import Failure, Report, attempt
-from workflow.engine.progress import Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.pipeline import stage_input_hash
 from workflow.tasks.results import RunResults
@@ -85,7 +85,7 @@ class Task:
             started = time.monotonic()
             wanted = stage_input_hash(stage, config, run, job.inputs)
             if not _take_over(run, stage.name, wanted, earlier):
-                run.save_stage(stage.name, stage.run(StageInput(config, results, Silence())), wanted)
+                run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), wanted)
             seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
         return Done(run.stage_files(self.stages), seconds, hashes)
 

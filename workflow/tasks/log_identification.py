@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from ident.identification import Identification
 from ident.uncertainty import ResponsePosterior
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from workflow.engine.errors import naming
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.tasks.identification import identified_channel
 from workflow.tasks.results import IdentifiedChannel, Tests, UncertainChannel
 from workflow.tasks.truth import TrueMode
@@ -64,9 +63,8 @@ def identify_records(
     The noise is modelled where the residuals are not white. Records with a reference are taken as made in
     closed loop. Raises InputError.
     """
-    options, progress = options or IdentOptions(), progress or Silence()
-    progress.start("identify")
-    with naming("identify"):
+    options, progress = options or IdentOptions(), progress or Progress()
+    with naming("identify"), progress.stage("identify") as update:
         used, opened = list(measured), None
         if band_rad_s is not None:
             # A pair far outside the band could only describe the filter's skirts.
@@ -101,13 +99,12 @@ def identify_records(
             used,
             [(record, "validation") for record in fresh_records],
             options,
-            partial(progress.update, "identify"),
+            update,
             with_plot=with_plot,
             two_stage=None if opened is None else opened.finding,
         )
         about, found = replace(about, band_rad_s=band_rad_s), about.identification
-        progress.finish("identify", 0.0, taken_up=False)
-        progress.start("uncertainty")
+    with naming("identify"), progress.stage("uncertainty"):
         posterior, tests = _posterior(used, found, noise_order)
         omega = display_grid(found.model, used)
         if band_rad_s is not None:
@@ -117,7 +114,6 @@ def identify_records(
                     f"the band {band_rad_s[0]:g} to {band_rad_s[1]:g} rad/s is too narrow to show"
                 )
         spread = uncertain_channel("tangent", level, posterior, about, omega, omega, tests=tests)
-    progress.finish("uncertainty", 0.0, taken_up=False)
     return LogIdentification(
         measured=tuple(measured),
         fresh_records=tuple(fresh_records),

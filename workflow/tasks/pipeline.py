@@ -10,7 +10,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import CommandInterruptedError, InputError, one_line
-from workflow.engine.progress import Progress, Silence
+from workflow.engine.progress import Progress
 from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.controller_files import write_controller
 from workflow.tasks.results import RecordsResult, RunResults
@@ -38,7 +38,7 @@ def run_pipeline(
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
     """
-    progress = progress or Silence()
+    progress = progress or Progress()
     out = Path(out)
     RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
@@ -85,7 +85,7 @@ def rebuild_page(run: RunDirectory, page: Stage) -> RunSummary:
     config = config_of(run)
     results = RunResults(run)
     with run.locked():
-        _perform(page, config, results, Silence(), {}, None, always=True)
+        _perform(page, config, results, Progress(), {}, None, always=True)
     return summarise(results, config)
 
 
