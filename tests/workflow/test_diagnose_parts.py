@@ -67,7 +67,7 @@ def test_a_machine_that_is_its_model_meets_the_prediction():
         # frequency apart.
         np.testing.assert_allclose(achieved.tip_m, predicted.tip_m, atol=1e-8)
         assert achieved.cost_s == pytest.approx(predicted.cost_s, rel=1e-6)
-        assert achieved.margin == pytest.approx(predicted.margin, rel=0.02)
+        assert achieved.modulus_margin == pytest.approx(predicted.modulus_margin, rel=0.02)
     # Same rig, same specification, same seed.
     assert third.cost_s == first.cost_s
 
@@ -77,9 +77,9 @@ def test_a_delay_costs_margin_that_only_the_repaired_design_predicts():
     late = parse_effects([{"name": "input_delay", "delay_s": 0.03}])
     check = check_controller(case, case.rig, late)
     promised, kept, _, _ = check.runs
-    assert kept.margin < promised.margin - 0.02
+    assert kept.modulus_margin < promised.modulus_margin - 0.02
     third, fourth = check.runs[2:]
-    assert fourth.margin == pytest.approx(third.margin, rel=0.02)
+    assert fourth.modulus_margin == pytest.approx(third.modulus_margin, rel=0.02)
     assert fourth.cost_s == pytest.approx(third.cost_s, rel=1e-6)
 
 

@@ -16,10 +16,10 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.certificate import Certificate, certify
+from control_design.analysis.certificate import certify
 from control_design.analysis.closed_loop import (
-    ClosedLoopTrajectory,
     LinearMachine,
+    SampledMachine,
     measure_sensitivity,
     simulate,
 )
@@ -34,6 +34,7 @@ from diagnosis.machine.case import Case
 from ident.data.record import Record
 from plant import Effect, Rig, SampledArm
 from workflow.diagnose.linear_machine import sampled_linear_machine
+from workflow.engine import codec
 from workflow.tasks.loop_sensitivity import plan_sensitivity
 
 Real = npt.NDArray[np.float64]
@@ -51,53 +52,31 @@ _SEED = 2006
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One closed loop: hub angle and tip position over the trial, cost [s], smallest distance from -1.
+    """One closed loop: cost [s], smallest distance from -1, tip position and command (T,) over the trial.
 
-    margin: nominal margin of the design on its own model, one over the largest measured |S| on the machine.
-    settles: at the end of the trial it moves by less than a tenth of the step.
+    modulus_margin: nominal margin of the design on its own model, one over the largest measured |S| on the
+    machine. settles: at the end of the trial it moves by less than a tenth of the step.
     """
 
     design: str
     machine: str
-    hub_angle_rad: Real
+    cost_s: float
+    modulus_margin: float
+    peak_command_V: float
+    settles: bool
     tip_m: Real
     command_V: Real
-    cost_s: float
-    margin: float
-    settles: bool
-
-    @property
-    def peak_command_V(self) -> float:
-        return float(np.max(np.abs(self.command_V)))
-
-    def row(self) -> dict[str, Any]:
-        return {
-            "design": self.design,
-            "machine": self.machine,
-            "cost_s": self.cost_s,
-            "modulus_margin": self.margin,
-            "peak_command_V": self.peak_command_V,
-            "settles": self.settles,
-        }
 
 
 @dataclass(frozen=True, eq=False)
 class ControllerCheck:
     """Four runs on one trial: design on the stated rig predicted and achieved, design on the repaired one
-    likewise. reference (T,) [rad]; disturbance_V acts half-way for a twentieth of the trial."""
+    likewise."""
 
-    time_s: Real
-    reference_rad: Real
-    disturbance_V: float
-    arm_m: float
+    trial: Trial
     specification: Specification
     certified: tuple[bool, bool]
     runs: tuple[Run, Run, Run, Run]
-
-    @property
-    def reference_m(self) -> Real:
-        """Tip position (T,) asked for."""
-        return np.asarray(self.arm_m * self.reference_rad)
 
     def document(self) -> dict[str, Any]:
         return {
@@ -107,13 +86,13 @@ class ControllerCheck:
                 "effort_limit_V_rad": self.specification.effort_limit,
                 "controller_order": self.specification.controller_order,
             },
-            "step_rad": float(self.reference_rad[-1]),
-            "disturbance_V": self.disturbance_V,
+            "step_rad": self.trial.step_rad,
+            "disturbance_V": float(np.max(self.trial.disturbance_V)),
             "certified_on_own_model": {
                 "nominal parameters": self.certified[0],
                 "repaired": self.certified[1],
             },
-            "runs": [run.row() for run in self.runs],
+            "runs": [codec.plain(run, arrays=False) for run in self.runs],
         }
 
 
@@ -130,16 +109,16 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
     specification = _specification(case, plants[0])
     designs = [_designed(plant, specification) for plant in plants]
     certificates = [certify(k, [p.uncertain], specification) for k, p in zip(designs, plants, strict=True)]
-    trial = _Trial.of(case, designs[0], plants[0])
+    trial = Trial.of(case, designs[0], plants[0])
+    arm = _WatchedArm(rig, effects)
     runs = []
     for controller, plant, certificate in zip(designs, plants, certificates, strict=True):
-        runs.append(_predicted(trial, controller, plant, certificate))
-        runs.append(_achieved(trial, controller, plant, case, rig, effects))
+        name, margin = plant.uncertain.name, certificate.plants[0].nominal_margins.modulus
+        runs.append(trial.run(controller, LinearMachine(plant.both), name, "its own model", margin))
+        margin = _measured_margin(controller, plant, arm, case, trial)
+        runs.append(trial.run(controller, arm, name, "repaired machine", margin))
     return ControllerCheck(
-        time_s=trial.time_s,
-        reference_rad=trial.reference,
-        disturbance_V=float(np.max(trial.disturbance)),
-        arm_m=trial.arm_m,
+        trial=trial,
         specification=specification,
         certified=(certificates[0].certified, certificates[1].certified),
         runs=(runs[0], runs[1], runs[2], runs[3]),
@@ -199,16 +178,16 @@ def _designed(plant: _Plant, specification: Specification) -> Controller:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
+class Trial:
     """A step after a lead-in, half-way a short push by the voltage as well; arrays (T,)."""
 
     time_s: Real
-    reference: Real
-    disturbance: Real
+    reference_rad: Real
+    disturbance_V: Real
     arm_m: float
 
     @classmethod
-    def of(cls, case: Case, controller: Controller, plant: _Plant) -> _Trial:
+    def of(cls, case: Case, controller: Controller, plant: _Plant) -> Trial:
         dt = case.rig.sampling.dt_s
         radius = float(np.max(np.abs(closed_loop_poles(controller, plant.uncertain))))
         # e^-7 is a thousandth: the slowest pole has died out by the end of either half.
@@ -218,76 +197,62 @@ class _Trial:
         voltage = float(np.sqrt(np.mean([np.mean(e.voltage_V**2) for e in case.estimation])))
         return cls(
             time_s=np.asarray(k * dt, dtype=np.float64),
-            reference=np.where(k >= round(_LEAD_IN * k.size), _step(case), 0.0),
-            disturbance=np.where((k >= half) & (k < half + k.size // 20), 0.2 * voltage, 0.0),
+            reference_rad=np.where(k >= round(_LEAD_IN * k.size), _step(case), 0.0),
+            disturbance_V=np.where((k >= half) & (k < half + k.size // 20), 0.2 * voltage, 0.0),
             arm_m=case.rig.hub.radius_m + case.rig.link.length_m,
         )
 
+    @property
+    def reference_m(self) -> Real:
+        """Tip position (T,) asked for."""
+        return np.asarray(self.arm_m * self.reference_rad)
+
+    @property
+    def step_rad(self) -> float:
+        return float(self.reference_rad[-1])
+
     def run(
-        self, controller: Controller, machine: LinearMachine | _Watched, design: str, on: str, margin: float
+        self, controller: Controller, machine: SampledMachine, design: str, on: str, margin: float
     ) -> Run:
-        found = simulate(controller, machine, self.reference, input_disturbance=self.disturbance)
-        place = np.array(machine.tips) if isinstance(machine, _Watched) else found.output[:, 1]
-        error = (self.arm_m * self.reference - place) / (self.arm_m * float(self.reference[-1]))
+        """machine: its last output is the tip position."""
+        found = simulate(controller, machine, self.reference_rad, input_disturbance=self.disturbance_V)
+        tip, n = found.output[:, -1], self.time_s.size
+        error = (self.reference_m - tip) / (self.arm_m * self.step_rad)
+        ends = [found.measured[stop - n // 20 : stop] for stop in (n // 2, n)]
         return Run(
             design=design,
             machine=on,
-            hub_angle_rad=found.output[:, 0],
-            tip_m=place,
-            command_V=found.command,
             cost_s=float(np.sum(error**2)) * controller.dt_s,
-            margin=margin,
-            settles=self._settles(found),
+            modulus_margin=margin,
+            peak_command_V=float(np.max(np.abs(found.command))),
+            settles=bool(all(np.ptp(end) <= _SETTLED * self.step_rad for end in ends)),
+            tip_m=tip,
+            command_V=found.command,
         )
 
-    def _settles(self, found: ClosedLoopTrajectory) -> bool:
-        step, n = float(self.reference[-1]), found.time_s.size
-        ends = [found.measured[stop - n // 20 : stop] for stop in (n // 2, n)]
-        return bool(all(np.ptp(end) <= _SETTLED * step for end in ends))
 
-
-class _Watched:
-    """The arm, with the true tip position kept aside at every sample of the last run."""
-
-    def __init__(self, arm: SampledArm) -> None:
-        self._arm = arm
-        self.tips: list[float] = []
-
-    @property
-    def dt_s(self) -> float:
-        return self._arm.dt_s
-
-    def reset(self) -> None:
-        self._arm.reset()
-        self.tips = []
+class _WatchedArm(SampledArm):
+    """The arm, with the true tip position as a third output."""
 
     def measure(self) -> Real:
-        self.tips.append(float(self._arm.true_output[1]))
-        return self._arm.measure()
-
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        self._arm.advance(u, hub_torque_Nm)
+        return np.append(super().measure(), self.true_output[1])
 
 
-def _predicted(trial: _Trial, controller: Controller, plant: _Plant, certificate: Certificate) -> Run:
-    margin = certificate.plants[0].nominal_margins.modulus
-    name = plant.uncertain.name
-    return trial.run(controller, LinearMachine(plant.both), name, "its own model", margin)
-
-
-def _achieved(
-    trial: _Trial, controller: Controller, plant: _Plant, case: Case, rig: Rig, effects: tuple[Effect, ...]
-) -> Run:
-    arm = SampledArm(rig, effects)
-    records = [
+def _measured_margin(
+    controller: Controller, plant: _Plant, arm: SampledArm, case: Case, trial: Trial
+) -> float:
+    """One over the largest |S| measured on the arm."""
+    hub = [
         Record(
-            e.name, e.voltage_V[:, None], e.output, case.rig.sampling.dt_s, ("voltage_V",), arm.output_names
+            e.name,
+            e.voltage_V[:, None],
+            e.output[:, :1],
+            case.rig.sampling.dt_s,
+            ("voltage_V",),
+            arm.output_names[:1],
         )
         for e in case.estimation
     ]
-    hub = [record.siso("voltage_V", "hub_angle_rad") for record in records]
     plan = plan_sensitivity(controller, plant.uncertain, hub, trial.time_s.size // 2)
-    rng = np.random.default_rng(_SEED)
-    seen = measure_sensitivity(controller, _Watched(arm), rng, **plan.excitation())
-    peak, _, _ = seen.peak
-    return trial.run(controller, _Watched(arm), plant.uncertain.name, "repaired machine", 1.0 / peak)
+    seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
+    return 1.0 / seen.peak[0]
