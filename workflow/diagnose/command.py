@@ -13,8 +13,7 @@ from workflow.config.settings import repeated
 from workflow.diagnose.case_files import CASE_FILE, LoadedCase, load_case
 from workflow.diagnose.directory import DiagnosisDirectory
 from workflow.diagnose.outputs import Engine, Work
-from workflow.diagnose.overview import closure_words, overview_page, short_answer
-from workflow.diagnose.words import parameter_words, probability_words, times_noise
+from workflow.diagnose.words import FILTERS, closure_words, short_answer
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import (
@@ -28,9 +27,9 @@ from workflow.engine.errors import (
 )
 from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress
+from workflow.report.rendering import render_page
 from workflow.tasks.summary import RunSummary
-from workflow.text.formats import listing
-from workflow.text.templates import Row, Section
+from workflow.text.templates import rows_of
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
@@ -117,9 +116,8 @@ def diagnose_cases(
         page = out / f"{loaded[0].case.name}.html"
         if len(places) > 1:
             page = out / "index.html"
-            reasons = {case: failure.reason for case, failure in failures}
             with progress.stage("overview"):
-                directory.write("index.html", overview_page(documents, reasons).encode())
+                directory.write("index.html", _overview(documents, failures).encode())
     return DiagnosisRun(tuple(documents), tuple(failures), _summary(documents, failures, page))
 
 
@@ -181,39 +179,24 @@ def _compute(
     )
 
 
+def _overview(documents: Sequence[Mapping[str, Any]], failures: Sequence[_Failed]) -> str:
+    """The page of several cases: a picture, a table with links, and what failed."""
+    failed = {case: failure.reason for case, failure in failures}
+    cases = [
+        {**answer, "name": answer["case"], "answer": short_answer(answer), "closed": closure_words(answer)}
+        for answer in documents
+    ]
+    page = "diagnosis/overview.html.j2"
+    return render_page(page, filters=FILTERS.items(), title="Gap diagnosis", cases=cases, failed=failed).html
+
+
 def _summary(documents: Sequence[Mapping[str, Any]], failures: Sequence[_Failed], page: Path) -> RunSummary:
-    sections = [Section(str(document["case"]), tuple(_rows(document))) for document in documents]
-    sections += [Section(case, (Row("failed", one_line(failure.reason)),)) for case, failure in failures]
-    answers = len(documents)
+    count, table = len(documents), "diagnosis/summary.j2"
     return RunSummary(
         title="Gap diagnosis",
-        sections=tuple(sections),
+        sections=rows_of(table, FILTERS.items(), documents=documents, failures=failures),
         verdict=short_answer(documents[0])
-        if answers == 1 and not failures
-        else f"{answers} of {answers + len(failures)} cases answered",
+        if count == 1 and not failures
+        else f"{count} of {count + len(failures)} cases answered",
         report_path=str(page) if documents or failures else None,
     )
-
-
-def _rows(document: Mapping[str, Any]) -> list[Row]:
-    sure = probability_words(document["probability"])
-    rows = [Row("answer", f"{short_answer(document)}, {sure}")]
-    for effect in document["effects"]:
-        if effect["name"] in document["combination"]:
-            parts = [
-                parameter_words(key, value, effect["intervals"].get(key))
-                for key, value in effect["parameters"].items()
-            ]
-            rows.append(Row(effect["name"], "; ".join(parts)))
-    if document["ambiguous_with"]:
-        rows.append(Row("could also be", listing(document["ambiguous_with"])))
-    gaps = [times_noise(document[key]) for key in ("gap_before", "gap_refit", "gap_after", "noise_floor")]
-    rows.append(
-        Row(
-            "residual / noise",
-            f"{gaps[0]} nominal, {gaps[1]} re-estimated, {gaps[2]} with effects, floor {gaps[3]}",
-        )
-    )
-    if document["combination"]:
-        rows.append(Row("gap closed", closure_words(document)))
-    return rows

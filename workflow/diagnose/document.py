@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from diagnosis.diagnosis import Diagnosis
-from diagnosis.where.findings import Where
 from workflow.diagnose.case_files import LoadedCase
-from workflow.diagnose.controller_check import ControllerCheck
-from workflow.diagnose.following import Following
 from workflow.engine import codec
 
 FORMAT = "flexlink-diagnosis-1"
@@ -16,20 +14,13 @@ LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
 
 
 def document_of(
-    loaded: LoadedCase,
-    found: Diagnosis,
-    *,
-    where: Where | None = None,
-    remains: Where | None = None,
-    coming: Following | None = None,
-    check: ControllerCheck | None = None,
-    no_check: str = "",
+    loaded: LoadedCase, found: Diagnosis, beside: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """The answer as plain values.
 
     `effects` are all possible answers, best first, "none" and "unknown" among them: `probability` of being
     the main cause (they sum to one), `presence` of being there at all. gap_* are the pooled root mean square
-    of (measured - model)/noise over the held-out experiments.
+    of (measured - model)/noise over the held-out experiments. beside: what else was looked at.
     """
     document = {
         "format": FORMAT,
@@ -55,7 +46,7 @@ def document_of(
         "gap_closed": found.gap_closed,
         "gap_closed_interval": found.gap_closed_interval,
         "gap_by_experiment": found.gap_by_experiment,
-        **_beside(where, remains, coming, check, no_check),
+        **(beside or {}),
         "deviations": found.deviations,
         "repair": {
             "values": {
@@ -70,20 +61,3 @@ def document_of(
     }
     plain: dict[str, Any] = codec.plain(document)
     return plain
-
-
-def _beside(
-    where: Where | None,
-    remains: Where | None,
-    coming: Following | None,
-    check: ControllerCheck | None,
-    no_check: str,
-) -> dict[str, Any]:
-    """What was looked at besides the cause."""
-    places = {"where": where, "remains": remains}
-    document: dict[str, Any] = {key: place for key, place in places.items() if place is not None}
-    if coming is not None:
-        document["next_experiment"] = {"advice": coming.advice, **codec.plain(coming.proposal or {})}
-    if check is not None or no_check:
-        document["controller"] = {"skipped": no_check} if check is None else check.document()
-    return document

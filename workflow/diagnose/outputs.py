@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from typing import Any
+
+import tomlkit
 
 from diagnosis.diagnosis import Diagnosis, diagnose
 from diagnosis.machine.case import Case
+from diagnosis.where.findings import Where
 from diagnosis.where.where import where
+from plant.effects import LOOK_ALIKES, Effect
+from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.document import document_of
-from workflow.diagnose.following import following
-from workflow.diagnose.page import CasePage, case_page
-from workflow.diagnose.repaired_rig import effects_text, rig_text
+from workflow.diagnose.following import Following, following
+from workflow.diagnose.words import FILTERS
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
 from workflow.engine.executor import Report
+from workflow.report.rendering import render_page
 
 # Shares of a case's time, for the progress bar only.
 _ENGINE, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
@@ -76,9 +84,13 @@ class Work:
             files[effects_name] = effects.encode()
         if coming.proposal is not None and coming.proposal.separates:
             files[f"{case.name}.next.csv"] = coming.csv_text().encode()
-        document = document_of(
-            loaded, found, where=place, remains=remains, coming=coming, check=check, no_check=no_check
-        )
+        beside = {
+            "where": place,
+            "remains": remains,
+            "next_experiment": {"advice": coming.advice, **codec.plain(coming.proposal or {})},
+            "controller": {"skipped": no_check} if check is None else check.document(),
+        }
+        document = document_of(loaded, found, beside)
         document["made_from"] = self.made_from
         document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
         files[f"{case.name}.json"] = codec.plain_text(document).encode()
@@ -95,3 +107,61 @@ def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:
         return check_controller(found.case, found.rig, found.repair), ""
     except NoControllerError as error:
         return None, str(error)
+
+
+@dataclass(frozen=True, eq=False)
+class CasePage:
+    """Everything the page is made of.
+
+    where: of the gap that is left when the nominal parameters are re-estimated within their tolerances;
+    remains: of what the effects leave. check is None where there was nothing to compare, no_check says why.
+    """
+
+    loaded: LoadedCase
+    found: Diagnosis
+    where: Where
+    remains: Where
+    next_experiment: Following
+    check: ControllerCheck | None
+    no_check: str
+    rig_text: str
+    effects_text: str
+
+
+def case_page(page: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
+    """One self-contained HTML page; equal content gives equal bytes."""
+    versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba")]
+    return render_page(
+        "diagnosis/case.html.j2",
+        progress,
+        filters=FILTERS.items(),
+        title=page.loaded.case.name,
+        page=page,
+        look_alikes=LOOK_ALIKES,
+        versions=[*versions, ("python", sys.version.split()[0])],
+    ).html
+
+
+def rig_text(
+    case: str, stated: Rig, repaired: Rig, deviations: Mapping[str, float], effects_file: str
+) -> str:
+    """A rig file that `Rig.from_toml` reads back as `repaired`.
+
+    The head names every moved value with how far it moved; effects_file is empty where there are no effects.
+    """
+    head = [f"# {case}: rig as repaired by flexlink diagnose"]
+    for key, d in deviations.items():
+        old, new = stated.value(key), repaired.value(key)
+        if old != new:
+            percent = 100 * (new / old - 1) if old else 0.0
+            head.append(f"#   {key}: {old:.6g} stated, {new:.6g} now ({percent:+.2f} %, {d:+.2f} tolerances)")
+    if effects_file:
+        head.append(f"# The effects to add stand in {effects_file}.")
+    return "\n".join(head) + "\n" + repaired.to_toml()
+
+
+def effects_text(case: str, effects: Sequence[Effect]) -> str:
+    """The effects as [[effects]] tables, in the spelling of [[source.effects]] in a run configuration."""
+    tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in effects]})
+    place = "in a run configuration they go under [[source.effects]]"
+    return f"# {case}: effects found by flexlink diagnose; {place}\n\n{tables}"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from plant.effects import in_words
-from workflow.text.formats import MISSING, fixed, interval, number, si
+from workflow.text.formats import MISSING, fixed, interval, listing, number, si
 
 # A unit at the end of a name, as the rig file spells it: units multiplied, then after "_" those divided by.
 _FACTORS = r"(?:(?:rad|ohm|kg|Pa|Hz|N|m|s|V|A)[23]?)"
@@ -72,6 +73,25 @@ def sureness(p: float) -> str:
     return next(word for limit, word in _SURE.items() if p >= limit)
 
 
+def short_answer(document: Mapping[str, Any]) -> str:
+    """The verdict of a JSON answer in a few words."""
+    if document["detail_verdict"] == "not_converged":
+        return "not converged"
+    if document["verdict"] != "effect":
+        return "no gap" if document["verdict"] == "none" else "outside the list"
+    names = listing([in_words(name) for name in document["combination"]])
+    return f"{names} (ambiguous)" if document["detail_verdict"] == "ambiguous" else names
+
+
+def closure_words(document: Mapping[str, Any]) -> str:
+    """Share of the gap closed with its interval; a dash where nothing was added."""
+    closed = document["gap_closed"]
+    if not document["combination"] or closed is None:
+        return MISSING
+    low, high = (100 * v if v is not None else float("nan") for v in document["gap_closed_interval"])
+    return f"{number(100 * closed, 4)} % ({number(low, 4)} to {number(high, 4)})"
+
+
 FILTERS: Mapping[str, Callable[..., str]] = {
     "effect": in_words,
     "parameter_unit": unit_of,
@@ -82,4 +102,6 @@ FILTERS: Mapping[str, Callable[..., str]] = {
     "probability": probability_words,
     "times_noise": times_noise,
     "sureness": sureness,
+    "short_answer": short_answer,
+    "closure": closure_words,
 }

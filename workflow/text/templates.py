@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -64,11 +64,13 @@ class Section(NamedTuple):
     rows: Sequence[Row]
 
 
-def rows_of(template: str, **values: Any) -> list[Section]:
+def rows_of(
+    template: str, filters: Iterable[tuple[str, Callable[..., Any]]] = (), **values: Any
+) -> list[Section]:
     """A table by template: plain text on one line each.
 
     The template calls part("title") and {% call line("label") %}value{% endcall %}; an empty value is no row,
-    a part without rows no section.
+    a part without rows no section. filters: (name, function) beside those of all.
     """
     parts: list[tuple[str, list[Row]]] = []
 
@@ -82,7 +84,7 @@ def rows_of(template: str, **values: Any) -> list[Section]:
             parts[-1][1].append(Row(_plain(label), value))
         return ""
 
-    environment().get_template(template).render(part=part, line=line, **values)
+    environment(*filters).get_template(template).render(part=part, line=line, **values)
     return [Section(title, rows) for title, rows in parts if rows]
 
 
