@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic
 
 import numpy as np
 
-from diagnosis.machine.machine_protocol import Real, Stated
+from diagnosis.machine.machine_protocol import Machine, Real
 
 # A nominal parameter that would have to be wrong by more tolerances than this is not believed.
 LARGEST_DEVIATION = 8.0
@@ -34,14 +33,14 @@ def prior_curvature(deviations: Real) -> Real:
 
 
 @dataclass(frozen=True, eq=False)
-class NominalParameters(Generic[Stated]):
+class NominalParameters:
     """Deviations d (P,) of nominal parameters in units of their tolerances; `prior_cost` before any record.
 
-    A rig or machine with tolerances t states values that are wrong by draws of that size: stated =
+    A machine with tolerances t states values that are wrong by draws of that size: stated =
     true (1 + t d), so the true value is stated / (1 + t d).
     """
 
-    stated: Stated
+    stated: Machine
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -51,8 +50,8 @@ class NominalParameters(Generic[Stated]):
     def count(self) -> int:
         return len(self.stated.tolerances)
 
-    def at(self, deviations: Real) -> Stated:
-        """The rig or machine whose nominal parameters are off by these deviations (P,)."""
+    def at(self, deviations: Real) -> Machine:
+        """The machine whose nominal parameters are off by these deviations (P,)."""
         if not self.count:
             return self.stated
         return self.stated.scaled(self.factors(deviations))

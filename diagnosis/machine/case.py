@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from diagnosis.machine.flexible_arm import FlexibleArm
-from diagnosis.machine.machine_protocol import Real, Role, check_names_and_roles, check_record, readonly
+from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record, readonly
 from diagnosis.machine.quantisation_grid import grid_step
 from plant.rig import Rig
 
@@ -53,7 +53,7 @@ class Experiment:
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class Case(RecordedCase[Experiment]):
     """A rig as its makers know it, and what it did.
 
     Raises
@@ -68,15 +68,9 @@ class Case:
     experiments: tuple[Experiment, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "experiments", tuple(self.experiments))
-        check_names_and_roles(self.name, self.experiments)
+        super().__post_init__()
         if not np.all(self.noise > 0):
             raise ValueError(f"case {self.name}: sensors need a noise level above zero to judge a gap by")
-
-    @property
-    def noise(self) -> Real:
-        """(2,) noise standard deviations of hub_angle_rad and tip_m."""
-        return self.machine.noise
 
     @cached_property
     def steps(self) -> Real:
@@ -88,11 +82,3 @@ class Case:
     def machine(self) -> FlexibleArm:
         """The rig in the form that fits and evidence ask for (see `diagnosis.machine.machine_protocol`)."""
         return FlexibleArm(self.rig)
-
-    @property
-    def estimation(self) -> tuple[Experiment, ...]:
-        return tuple(e for e in self.experiments if e.role == "estimation")
-
-    @property
-    def held_out(self) -> tuple[Experiment, ...]:
-        return tuple(e for e in self.experiments if e.role == "held_out")

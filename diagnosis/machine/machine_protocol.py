@@ -6,9 +6,10 @@ simulation somebody brings. Fits, evidence and `diagnose` know no other machine.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ from plant.effects.search_space import Candidate
 
 Real = npt.NDArray[np.float64]
 Role = Literal["estimation", "held_out"]
-Stated = TypeVar("Stated", bound="StatedValues")
+Record = TypeVar("Record", bound="RecordOfMachine")
 
 _FEWEST_SAMPLES = 20
 
@@ -50,19 +51,15 @@ class Weighing:
         return float(np.sqrt(self.correlation_samples * (1 + self.model_error**2)))
 
 
-class StatedValues(Protocol):
-    """Something with stated parameters that may be off."""
+class Machine(Protocol):
+    """A machine that can be simulated, as its makers know it; stated parameters may be off."""
 
     @property
     def tolerances(self) -> Mapping[str, float]:
         """Parameter -> relative standard deviation of its nominal parameter."""
 
-    def scaled(self: Stated, factors: Mapping[str, float]) -> Stated:
+    def scaled(self, factors: Mapping[str, float]) -> Machine:
         """The same with these parameters multiplied."""
-
-
-class Machine(StatedValues, Protocol):
-    """A machine that can be simulated, as its makers know it."""
 
     @property
     def noise(self) -> Real:
@@ -100,30 +97,53 @@ class RecordOfMachine(Protocol):
         """(T, Y) as measured."""
 
 
-class CaseOfMachine(Protocol):
-    """A machine and its records."""
+class RecordedCase(ABC, Generic[Record]):
+    """A machine and its records, in the order given.
+
+    Raises
+    ------
+    ValueError
+        If a role has no experiment or a name comes twice.
+    """
+
+    name: str
+    experiments: tuple[Record, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "experiments", tuple(self.experiments))
+        names = [experiment.name for experiment in self.experiments]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"case {self.name}: experiment {name} is given twice")
+        for role in get_args(Role):
+            if role not in [experiment.role for experiment in self.experiments]:
+                raise ValueError(f"case {self.name}: no experiment has the role {role}")
 
     @property
-    def name(self) -> str: ...
+    @abstractmethod
+    def machine(self) -> Machine:
+        """The machine in the form that fits and evidence ask for."""
 
     @property
-    def machine(self) -> Machine: ...
-
-    @property
-    def experiments(self) -> Sequence[RecordOfMachine]: ...
-
-    @property
-    def estimation(self) -> Sequence[RecordOfMachine]: ...
-
-    @property
-    def held_out(self) -> Sequence[RecordOfMachine]: ...
-
-    @property
-    def noise(self) -> Real: ...
-
-    @property
+    @abstractmethod
     def steps(self) -> Real:
         """(Y,) steps of outputs whose values lie on a quantisation grid, 0 for all others."""
+
+    @property
+    def noise(self) -> Real:
+        """(Y,) noise standard deviations of the outputs."""
+        return self.machine.noise
+
+    @property
+    def estimation(self) -> tuple[Record, ...]:
+        return tuple(e for e in self.experiments if e.role == "estimation")
+
+    @property
+    def held_out(self) -> tuple[Record, ...]:
+        return tuple(e for e in self.experiments if e.role == "held_out")
+
+
+CaseOfMachine = RecordedCase[Any]
 
 
 def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> None:
@@ -142,17 +162,6 @@ def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> N
     for column, output in zip(y.T, output_names, strict=False):
         if np.ptp(column) == 0:
             raise ValueError(f"{what}: {output} is {column[0]:.6g} throughout: is the sensor dead?")
-
-
-def check_names_and_roles(case: str, experiments: Sequence[RecordOfMachine]) -> None:
-    """Every name once, both roles there; ValueError otherwise."""
-    names = [experiment.name for experiment in experiments]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"case {case}: experiment {name} is given twice")
-    for role in ("estimation", "held_out"):
-        if not any(experiment.role == role for experiment in experiments):
-            raise ValueError(f"case {case}: no experiment has the role {role}")
 
 
 def readonly(values: Any) -> Real:

@@ -24,10 +24,10 @@ import numpy as np
 
 from diagnosis.machine.machine_protocol import (
     Real,
+    RecordedCase,
     RecordOfMachine,
     Role,
     Weighing,
-    check_names_and_roles,
     check_record,
     readonly,
 )
@@ -261,7 +261,7 @@ class PlantExperiment:
 
 
 @dataclass(frozen=True, eq=False)
-class PlantCase:
+class PlantCase(RecordedCase[PlantExperiment]):
     """A plant as its makers know it, and what it did.
 
     Raises
@@ -276,8 +276,7 @@ class PlantCase:
     experiments: tuple[PlantExperiment, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "experiments", tuple(self.experiments))
-        check_names_and_roles(self.name, self.experiments)
+        super().__post_init__()
         for e in self.experiments:
             check_record(e, self.plant.output_names)
         first = self.experiments[0]
@@ -293,18 +292,6 @@ class PlantCase:
         return self.plant
 
     @property
-    def noise(self) -> Real:
-        return self.plant.noise
-
-    @property
     def steps(self) -> Real:
         """(Y,) zeros: quantisation is an effect of one's own plant like any other."""
         return np.zeros(len(self.plant.output_names))
-
-    @property
-    def estimation(self) -> tuple[PlantExperiment, ...]:
-        return tuple(e for e in self.experiments if e.role == "estimation")
-
-    @property
-    def held_out(self) -> tuple[PlantExperiment, ...]:
-        return tuple(e for e in self.experiments if e.role == "held_out")

@@ -104,10 +104,11 @@ def competing_hypotheses(
 
 def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
     """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
-    nominal = NominalParameters(case.rig)
+    nominal = NominalParameters(case.machine)
 
     def outputs(deviations: Real, effects: Sequence[Effect], voltage: Real) -> Real:
-        return np.asarray((simulate(nominal.at(deviations), voltage, effects).output / case.noise).ravel())
+        rig = nominal.at(deviations).description
+        return np.asarray((simulate(rig, voltage, effects).output / case.noise).ravel())
 
     def directions(voltage: Real) -> Real:
         # Contacts say little about a small change of a nominal parameter and cost most of the time.
@@ -130,7 +131,8 @@ def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingH
         )
         return np.hstack([by_d, by_x])
 
-    return CompetingHypothesis(probability, nominal.at(fit.deviations), fit.effects, directions, fit.hessian)
+    rig = nominal.at(fit.deviations).description
+    return CompetingHypothesis(probability, rig, fit.effects, directions, fit.hessian)
 
 
 def distances(
