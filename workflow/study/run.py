@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workflow.engine import codec, storage
@@ -28,7 +28,7 @@ from workflow.study.points import (
     shared_stages,
 )
 from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_without_run
-from workflow.study.search import Grid, ParzenSearch, Strategy
+from workflow.study.search import ParzenSearch
 from workflow.study.settings import StudyConfig, load_study
 from workflow.study.task import Done, Job, Task
 from workflow.tasks.pipeline import config_of
@@ -70,11 +70,12 @@ def run_study(
     study, text, base_path = load_study(config_path)
     base = load_base(study, config_path, base_path)
     maker = PointMaker(study, config_path, base)
-    strategy: Strategy
-    if study.search.method == "grid":
-        strategy = Grid(maker)
+    count, search = study.search.trials, None
+    if study.search.method == "optuna":
+        search = ParzenSearch(study, maker, base.config.run.seed)
     else:
-        strategy = ParzenSearch(study, maker, base.config.run.seed)
+        points = maker.grid()
+        count = len(points)
     processes = jobs or os.cpu_count() or 1
     # A cluster that does not answer is found out before anything is written.
     with ExitStack() as stack:
@@ -84,9 +85,13 @@ def run_study(
             executor = stack.enter_context(closing(DaskCluster(scheduler)))
         directory = StudyDirectory.begin(out, text=text, base=base, resume=resume, replace=replace)
         with directory.locked():
-            work = _Work(directory, base, executor, here, progress)
+            share = _POINT_S * count / executor.width
+            progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
+            work = _Work(directory, base, maker.base_point(), executor, here, progress, count)
             try:
-                rows = work.compute(strategy, maker.base_point())
+                work.make_base_plant()
+                with progress.stage("points"):
+                    rows = work.compute(points) if search is None else search.run(work.compute)
             except InputError:
                 directory.discard_if_empty()
                 raise
@@ -101,76 +106,60 @@ def run_study(
     return summary
 
 
+@dataclass(eq=False)
 class _Work:
     """The points of one study on one executor, with the plants they share made before them."""
 
-    def __init__(
-        self,
-        directory: StudyDirectory,
-        base: Base,
-        executor: Executor,
-        here: LocalProcesses,
-        progress: Progress,
-    ) -> None:
-        self._directory, self._base, self._executor = directory, base, executor
-        self._here, self._progress = here, progress
-        self._broken_plants: dict[str, str] = {}
-        self._count = self._finished = self._taken_up = self._good = 0
+    directory: StudyDirectory
+    base: Base
+    base_point: Point
+    executor: Executor
+    here: LocalProcesses
+    progress: Progress
+    count: int
+    broken_plants: dict[str, str] = field(default_factory=dict)
+    finished: int = 0
+    taken_up: int = 0
+    good: int = 0
 
-    def compute(self, strategy: Strategy, base_point: Point) -> list[PointRow]:
-        """All rows, in the order of the points."""
-        self._count = strategy.count
-        share = _POINT_S * self._count / self._executor.width
-        self._progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
-        there = self._directory.has_plant(base_point)
-        with self._progress.stage("plant", taken_up=there):
+    def make_base_plant(self) -> None:
+        there = self.directory.has_plant(self.base_point)
+        with self.progress.stage("plant", taken_up=there):
             if not there:
-                self._make_base_plant(base_point)
-        rows: list[PointRow] = []
-        with self._progress.stage("points"):
-            for points in strategy.batches():
-                found = self._batch(points, base_point)
-                strategy.learn(found)
-                rows += found
-        return rows
+                given = {} if self.base.run is None else self.base.run.stage_files(self.base_point.given)
+                self._plants([(self.base_point, given)])
+            reason = self.broken_plants.get(self.base_point.plant_key)
+            if reason is not None:
+                raise InputError(f"the base cannot be identified: {reason}")
 
-    def _make_base_plant(self, base_point: Point) -> None:
-        given = {} if self._base.run is None else self._base.run.stage_files(base_point.given)
-        self._plants([(base_point, given)])
-        reason = self._broken_plants.get(base_point.plant_key)
-        if reason is not None:
-            raise InputError(f"the base cannot be identified: {reason}")
-
-    def _batch(self, points: Sequence[Point | Contradiction], base_point: Point) -> list[PointRow]:
-        """The points of a batch: what is finished is taken up, what shares a controller goes together."""
+    def compute(self, points: Sequence[Point | Contradiction]) -> list[PointRow]:
+        """The rows of a batch: what is finished is taken up, what shares a controller goes together."""
         rows = {
             point.name: row_without_run(point, "impossible", point.refusal)
             for point in points
             if isinstance(point, Contradiction)
         }
         valid = {point.name: point for point in points if isinstance(point, Point)}.values()
-        lacking = {point.plant_key: point for point in valid if not self._directory.has_plant(point)}
-        self._plants([(point, self._given(point, base_point)) for point in lacking.values()])
+        lacking = {point.plant_key: point for point in valid if not self.directory.has_plant(point)}
+        self._plants([(point, self._given(point)) for point in lacking.values()])
         groups: dict[str, list[Point]] = {}
         for point in valid:
-            if point.plant_key in self._broken_plants:
-                rows[point.name] = row_without_run(point, "failed", self._broken_plants[point.plant_key])
-            elif self._directory.has_point(point):
-                rows[point.name] = row_of(point, self._directory.point(point))
-                self._taken_up += 1
+            if point.plant_key in self.broken_plants:
+                rows[point.name] = row_without_run(point, "failed", self.broken_plants[point.plant_key])
+            elif self.directory.has_point(point):
+                rows[point.name] = row_of(point, self.directory.point(point))
+                self.taken_up += 1
             else:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
-        work = [
-            _task(group, self._directory.plant_files(group[0]), POINT_STAGES) for group in groups.values()
-        ]
-        for found in _done(self._executor, list(groups.values()), work):
+        work = [_task(group, self.directory.plant_files(group[0]), POINT_STAGES) for group in groups.values()]
+        for found in _done(self.executor, list(groups.values()), work):
             for point, done in found:
                 if isinstance(done, Failure):
                     rows[point.name] = row_without_run(point, "failed", done.reason)
                 else:
-                    self._directory.save_point(point, done)
-                    rows[point.name] = row_of(point, self._directory.point(point))
+                    self.directory.save_point(point, done)
+                    rows[point.name] = row_of(point, self.directory.point(point))
             self._report([rows[point.name] for point, _ in found])
         # The same point may be asked for twice by a search: each time under its own number.
         return [replace(rows[point.name], number=point.number) for point in points]
@@ -184,29 +173,29 @@ class _Work:
             there = {name.partition(".")[0] for name in given}
             work.append(_task([point], given, [stage for stage in PLANT_STAGES if stage.name not in there]))
         given_of = {point.name: given for point, given in wanted}
-        for ((point, done),) in _done(self._here, [[point] for point, _ in wanted], work):
+        for ((point, done),) in _done(self.here, [[point] for point, _ in wanted], work):
             if isinstance(done, Failure):
-                self._broken_plants[point.plant_key] = done.reason
+                self.broken_plants[point.plant_key] = done.reason
             else:
-                self._directory.save_plant(point, given_of[point.name], done)
+                self.directory.save_plant(point, given_of[point.name], done)
 
-    def _given(self, point: Point, base_point: Point) -> Mapping[str, bytes]:
+    def _given(self, point: Point) -> Mapping[str, bytes]:
         """What a plant begins with: stages of a given run, else those it shares with the base's plant."""
-        if self._base.run is not None:
-            return self._base.run.stage_files(point.given)
-        if point.config.run.seed != base_point.config.run.seed or point.inputs != base_point.inputs:
+        if self.base.run is not None:
+            return self.base.run.stage_files(point.given)
+        if point.config.run.seed != self.base_point.config.run.seed or point.inputs != self.base_point.inputs:
             return {}
-        shared = shared_stages(point.config, base_point.config)
-        return self._directory.plant(base_point).stage_files(shared)
+        shared = shared_stages(point.config, self.base_point.config)
+        return self.directory.plant(self.base_point).stage_files(shared)
 
     def _report(self, rows: Iterable[PointRow]) -> None:
         for row in rows:
-            self._finished += 1
-            self._good += row.good
-        message = f"{self._finished} of {self._count}, {self._good} certified"
+            self.finished += 1
+            self.good += row.good
+        message = f"{self.finished} of {self.count}, {self.good} certified"
         # The time left follows from the points computed now; those taken up took none.
-        share = (self._finished - self._taken_up) / max(self._count - self._taken_up, 1)
-        self._progress.update("points", min(share, 1.0), message)
+        share = (self.finished - self.taken_up) / max(self.count - self.taken_up, 1)
+        self.progress.update("points", min(share, 1.0), message)
 
 
 def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[Stage]) -> Task:

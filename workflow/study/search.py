@@ -1,12 +1,12 @@
-"""Which points are computed, batch by batch: the whole grid, or a search that learns from what it finds."""
+"""Points chosen batch by batch, by a search that learns from what it finds."""
 
 from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
@@ -14,36 +14,8 @@ from workflow.study.points import Contradiction, Point, PointMaker
 from workflow.study.rows import PointRow
 from workflow.study.settings import Axis, StudyConfig, tidy
 
-
-class Strategy(Protocol):
-    """Batches of points; `learn` is told what became of a batch before the next is asked for."""
-
-    @property
-    def count(self) -> int:
-        """Points in all."""
-
-    def batches(self) -> Iterator[list[Point | Contradiction]]:
-        """The points, in an order that does not depend on who computes them."""
-
-    def learn(self, rows: Sequence[PointRow]) -> None:
-        """Results of the last batch, in its order."""
-
-
-class Grid:
-    """All combinations, in one batch."""
-
-    def __init__(self, maker: PointMaker) -> None:
-        self._points = maker.grid()
-
-    @property
-    def count(self) -> int:
-        return len(self._points)
-
-    def batches(self) -> Iterator[list[Point | Contradiction]]:
-        yield self._points
-
-    def learn(self, rows: Sequence[PointRow]) -> None:
-        pass
+# Points of a batch -> their rows, in the same order.
+Compute = Callable[[Sequence[Point | Contradiction]], list[PointRow]]
 
 
 class ParzenSearch:
@@ -82,33 +54,25 @@ class ParzenSearch:
                 ],
                 sampler=sampler,
             )
-        self._asked: list[Any] = []
 
-    @property
-    def count(self) -> int:
-        return self._study.search.trials
-
-    def batches(self) -> Iterator[list[Point | Contradiction]]:
-        left = self.count
-        while left > 0:
-            size = min(left, self._study.search.batch)
+    def run(self, compute: Compute) -> list[PointRow]:
+        """The rows of all points, in the order they were asked for."""
+        options, rows = self._study.search, list[PointRow]()
+        while len(rows) < options.trials:
             with warnings.catch_warnings(action="ignore"):
-                self._asked = [self._search.ask() for _ in range(size)]
-                values = [
-                    {axis.key: _suggest(trial, axis) for axis in self._study.axes} for trial in self._asked
-                ]
-            yield [self._maker.make(one) for one in values]
-            left -= size
-
-    def learn(self, rows: Sequence[PointRow]) -> None:
-        for trial, row in zip(self._asked, rows, strict=True):
-            goals = [row.numbers.get(name) for name in self._study.search.objectives]
-            trial.set_user_attr("violation", 0.0 if row.good else _excess(row.numbers))
-            with warnings.catch_warnings(action="ignore"):
-                if None in goals:
-                    self._search.tell(trial, state=self._optuna.trial.TrialState.FAIL)
-                else:
-                    self._search.tell(trial, goals)
+                asked = [self._search.ask() for _ in range(min(options.trials - len(rows), options.batch))]
+                values = [{axis.key: _suggest(trial, axis) for axis in self._study.axes} for trial in asked]
+            found = compute([self._maker.make(one) for one in values])
+            for trial, row in zip(asked, found, strict=True):
+                goals = [row.numbers.get(name) for name in options.objectives]
+                trial.set_user_attr("violation", 0.0 if row.good else _excess(row.numbers))
+                with warnings.catch_warnings(action="ignore"):
+                    if None in goals:
+                        self._search.tell(trial, state=self._optuna.trial.TrialState.FAIL)
+                    else:
+                        self._search.tell(trial, goals)
+            rows += found
+        return rows
 
 
 def _violation(trial: Any) -> tuple[float]:
