@@ -54,7 +54,7 @@ def fits(out: Print, count: int) -> None:
     for name, seconds in times.items():
         each = 1e3 * np.array(seconds)
         low, high = np.quantile(each, [0.1, 0.9])
-        reach = "3" if "pair" in name else ""
+        reach = "5" if "pair" in name else ""
         out(f"{name:<26}  {np.median(each):>13.2f}  {low:>5.2f}  {high:>6.2f}   {reach:>5}")
     out()
 

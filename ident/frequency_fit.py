@@ -156,6 +156,8 @@ def identify_frf(
     search = PoleSearch(data, options)
     selection = OrderSelection(search)
     best = selection.run()
+    if None not in (options.n_real, options.n_pairs):
+        best = selection.exchanged(best)
     poles = in_order(best.poles, fixed)
     fit = fit_response(data, poles)
     freedom = data.n_rows - data.n_parameters(poles.order, fixed.order)

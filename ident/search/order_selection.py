@@ -11,9 +11,12 @@ from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.fit.least_squares import EXPLAINED
 from ident.fit.refinement import Refined
-from ident.search.pole_search import PoleSearch
+from ident.search.pole_search import GAIN, PoleSearch
 
 Progress = Callable[[float, str], None]
+
+# Exchanges of a pole for another at most.
+_EXCHANGES = 4
 
 
 def silent(fraction: float, message: str) -> None:
@@ -73,6 +76,25 @@ class OrderSelection:
                 break
         return best
 
+    def exchanged(self, best: Refined) -> Refined:
+        """One pole more and the least needed one less, as long as something is gained.
+
+        A search that grows to given numbers can end with a pair where two real poles should be, and no way to
+        move them one by one. For measured responses, whose covariances tell noise from dynamics: in records
+        the pole that is least needed may be the one that matters, and the one gained follow friction.
+        """
+        for _ in range(_EXCHANGES):
+            if not self._visible(best):
+                break
+            larger = [self.search.add_pair(best.poles)]
+            if self._counts(best)[0]:
+                larger.append(self.search.add_real(best.poles))
+            found = min((self._reduced(end, self._counts(best)) for end in larger), key=lambda end: end.rss)
+            if not found.rss < best.rss * (1 - GAIN):
+                break
+            best = self._noted(self.search.rescan(found))
+        return best
+
     def table(self, best: Refined) -> tuple[OrderStep, ...]:
         """Everything that was tried, by order, judged by the residual of the chosen model."""
         criterion = self._criterion(best)
@@ -114,6 +136,14 @@ class OrderSelection:
                 break
             best = self._noted(self.search.descend(chosen.poles, "pruning"))
         return best
+
+    def _reduced(self, end: Refined, counts: tuple[int, int]) -> Refined:
+        """Poles taken out one by one, the one first whose loss costs least, down to the given numbers."""
+        while trials := self._one_less(
+            end.poles, *(here > wanted for here, wanted in zip(self._counts(end), counts, strict=True))
+        ):
+            end = min((self.search.descend(poles, "exchange", 1e-4) for poles in trials), key=lambda e: e.rss)
+        return self.search.descend(end.poles, "exchange")
 
     def _one_less(self, poles: Poles, real: bool, pairs: bool) -> list[Poles]:
         """The poles without one of the searched real ones or pairs."""

@@ -19,8 +19,8 @@ from ident.fit.residual_colour import ResidualColour
 from ident.search.direct import best_apart, minimise
 from ident.search.search_trace import PolishedMinimum, SearchStage
 
-# A rescan has to gain this fraction of J to count.
-_GAIN = 1e-6
+# A rescan or an exchange has to gain this fraction of J to count.
+GAIN = 1e-6
 # Rescans of every block at most.
 _ROUNDS = 6
 # Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
@@ -98,7 +98,7 @@ class PoleSearch:
             return best
         if len(points) > few:
             other = self._best_rough(starts(points[few:]), title)
-            if other.rss < best.rss * (1 - _GAIN):
+            if other.rss < best.rss * (1 - GAIN):
                 best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
         return best
 
@@ -162,7 +162,7 @@ class PoleSearch:
         quiet = 0
         for scan in islice(cycle(scans), _ROUNDS * len(scans)):
             found = scan(best)
-            quiet = 1 if found.rss < best.rss * (1 - _GAIN) else quiet + 1
+            quiet = 1 if found.rss < best.rss * (1 - GAIN) else quiet + 1
             best = found
             if quiet == len(scans):
                 break
@@ -217,7 +217,7 @@ class PoleSearch:
             if known:
                 continue
             trial = self.descend(start, "rescan", ROUGH)
-            if trial.rss < found.rss * (1 - _GAIN):
+            if trial.rss < found.rss * (1 - GAIN):
                 found = self.descend(trial.poles, "rescan")
         return found
 

@@ -281,6 +281,21 @@ def test_order_and_modes_of_a_published_frequency_response(flexlink_data):
     assert four.dispersion > 5
 
 
+def test_numbers_that_are_given_are_fitted_as_well_as_the_same_numbers_chosen(flexlink_data):
+    """Grown to given numbers without a test in between, the search ended at up to four times the chi-square."""
+    plant = kyoto_plant(flexlink_data)
+    wide = plant.only(plant.labels[0]).band(0, 600).mean(0.002, outlier_threshold=6.0)
+    chosen = identify_frf(wide, IdentOptions(integrators=1))
+    n_real, n_pairs = chosen.model.poles.real.size - 1, chosen.model.poles.pairs.size
+    given = identify_frf(wide, IdentOptions(integrators=1, n_real=n_real, n_pairs=n_pairs))
+    assert given.rss <= chosen.rss * (1 + 1e-6)
+    narrow = plant.only(plant.labels[2]).band(0, 200).mean(0.002, outlier_threshold=6.0)
+    less = identify_frf(narrow, IdentOptions(integrators=1, n_real=2, n_pairs=2))
+    more = identify_frf(narrow, IdentOptions(integrators=1))
+    assert more.model.poles.order == less.model.poles.order + 1
+    assert less.rss < 2 * more.rss
+
+
 def kyoto_plant(folder):
     """Motor to angle, from the closed loop with a proportional gain of 1.65, point by point."""
     path = folder / "quanser_rfl_frf" / "frf_repeats.csv"
