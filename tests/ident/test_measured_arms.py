@@ -282,7 +282,7 @@ def test_order_and_modes_of_a_published_frequency_response(flexlink_data):
 
 
 def test_numbers_that_are_given_are_fitted_as_well_as_the_same_numbers_chosen(flexlink_data):
-    """Grown to given numbers without a test in between, the search ended at up to four times the chi-square."""
+    """Grown to given numbers without a test in between, it once ended at four times the chi-square."""
     plant = kyoto_plant(flexlink_data)
     wide = plant.only(plant.labels[0]).band(0, 600).mean(0.002, outlier_threshold=6.0)
     chosen = identify_frf(wide, IdentOptions(integrators=1))
