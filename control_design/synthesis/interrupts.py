@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,17 +19,19 @@ def interrupts_kept() -> Iterator[None]:
 
     CasADi asks Python for signals while it iterates and turns the exception of the handler into an ordinary
     end of the solver ("User_Requested_Stop", or a failed evaluation). The handler is therefore watched, not
-    the status. Python runs handlers in the main thread only: elsewhere there is nothing to do.
+    the status; what CasADi prints about the exception that it swallowed is not for the user. Python runs
+    handlers in the main thread only: elsewhere there is nothing to do.
     """
     before: Any = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield
         return
-    seen = False
+    seen, stderr = False, sys.stderr
 
     def watch(number: int, frame: FrameType | None) -> None:
         nonlocal seen
         seen = True
+        sys.stderr = io.StringIO()
         before(number, frame)
 
     try:
@@ -35,6 +39,7 @@ def interrupts_kept() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+        sys.stderr = stderr
         if seen:
             raise KeyboardInterrupt
 

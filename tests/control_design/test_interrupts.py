@@ -54,7 +54,7 @@ def test_an_interrupt_in_the_interior_point_ends_the_synthesis(tmp_path, solves,
         timeout=120,
         env=os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2]), "OMP_NUM_THREADS": "1"},
     )
-    assert ended.returncode == 130, ended.stderr.decode()
+    assert (ended.returncode, ended.stderr) == (130, b"")
 
 
 def test_a_swallowed_interrupt_is_raised_and_the_handler_restored():
