@@ -282,6 +282,7 @@ values = [0.4, 0.5]
 """
 
 
+@pytest.mark.slow
 def test_search_gives_the_same_points_whatever_runs_them(tmp_path):
     pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
     study = write_study(tmp_path, SEARCH)
