@@ -269,7 +269,7 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
         ("[uncertainty]\nmultiplicative = { numerator = [1.0], denominator = [1.0, 0.0] }", "imaginary axis"),
         ("[uncertainty]\nmultiplicative = -0.1", "must be positive"),
         ("[uncertainty]\nmultiplicative = 0.1\nadditive = 0.1", "either multiplicative or additive"),
-        ("[plant]\nintegrators = 1", "the model has 0 at z = 1"),
+        ("[plant]\nintegrators = 1", "0 of its poles at z = 1"),
         ("[plant]\nfit = { integrators = 1 }", "say integrators in [plant] itself"),
         ("[reference_filter]\norder = 1", "either corner_rad_s or model"),
         (
@@ -303,7 +303,10 @@ def changed(**changes):
         (changed(B=[[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), "B is 3x2, expected 3x1"),
         (changed(A=[[1.0, "x"], [0.0, 1.0]]), "matrix of real numbers"),
         (changed(C=[[1.0, float("nan"), 0.0]]), "not finite"),
-        (document(control.ss([[1.0]], [[0.1]], [[1.0]], [[0.0]], DT_S)), "1 pole at z = 1 (integration)"),
+        (
+            document(control.ss([[1.0]], [[0.1]], [[1.0]], [[0.0]], DT_S)),
+            "1 of its poles at z = 1 (int",
+        ),
         (
             document(control.ss([[0.6, -0.8], [0.8, 0.6]], [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]], DT_S)),
             "on the unit circle away from z = 1",

@@ -5,17 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
-from control_design.synthesis.synthesis_options import SynthesisOptions
-from workflow.config.design_options import (
-    AchievableOptions,
-    CertificateOptions,
-    ReferenceFilterSettings,
-)
-from workflow.config.run_config import RunConfig
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming, need
 from workflow.engine.randomness import stage_rng
@@ -33,46 +25,6 @@ from workflow.tasks.results import (
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import rows_of, said
 
-BetweenPoints = Literal["nothing", "linear"]
-
-
-_NO_CONTROLLER = (
-    "there is no controller and no certificate; lower bandwidth_rad_s, raise controller_order, or improve "
-    "the model where its ellipses are widest"
-)
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What a design is to be: from the design file, else from the first plant's run, else the defaults."""
-
-    specification: Specification
-    synthesis: SynthesisOptions
-    certificate: CertificateOptions
-    achievable_performance: AchievableOptions
-    reference_filter: ReferenceFilterSettings | None
-
-    @classmethod
-    def of(cls, file: DesignFile, run: RunConfig | None, paths: Sequence[Path]) -> _Asked:
-        """Raises InputError where nothing says what to design for."""
-        specification = file.specification
-        if specification is None:
-            if len(paths) > 1:
-                raise InputError(f"{len(paths)} plants, no specification for all of them: give --spec FILE")
-            if run is None:
-                raise InputError(f"{paths[0]} holds no specification: give --spec FILE")
-            specification = run.specification
-        # A design file without [reference_filter] asks for none; it has no other way to.
-        filtered = run if run is not None and file.path is None else file
-        return cls(
-            specification,
-            file.synthesis or (run.synthesis if run else SynthesisOptions()),
-            file.certificate or (run.certificate if run else CertificateOptions.model_validate({})),
-            file.achievable_performance
-            or (run.achievable_performance if run else AchievableOptions.model_validate({})),
-            filtered.reference_filter,
-        )
-
 
 @dataclass(frozen=True)
 class _Designed:
@@ -85,26 +37,26 @@ class _Designed:
 
 
 def _design(
-    plants: Sequence[UncertainPlant], asked: _Asked, between_own_points: BetweenPoints, seed: int
+    plants: Sequence[UncertainPlant], specification: Specification, asked: DesignFile, seed: int
 ) -> _Designed:
     with naming("design"):
         design = find_design(
-            plants, asked.specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
+            plants, specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
         )
         nothing = CertifyResult(None, certified=False, reason=design.reason)
         if design.synthesis is None:
             return _Designed(replace(design, reason=f"specification not met: {design.reason}"), nothing)
-        achievable = find_bracket(plants, asked.specification, asked.achievable_performance)
+        achievable = find_bracket(plants, specification, asked.achievable_performance)
         if not design.has_controller:
             return _Designed(design, nothing, achievable)
         controller = design.synthesis.controller
         certified = certify_asked(
             controller,
             plants,
-            asked.specification,
+            specification,
             asked.certificate,
             stage_rng(seed, "certify"),
-            between_own_points=between_own_points,
+            between_own_points=asked.plant.between_points,
         )
         return _Designed(
             design, certified, achievable, find_filter(controller, plants, asked.reference_filter)
@@ -133,12 +85,15 @@ def design_controller(
     need(*paths)
     file = read_design_file(specification_path) if specification_path is not None else DesignFile()
     sources_found = load_sources(paths, file)
-    asked = _Asked.of(file, sources_found[0].config, paths)
+    asked = file.completed(sources_found[0].config)
+    specification = file.specification if len(paths) > 1 else asked.specification
+    if specification is None:
+        raise InputError(f"{', '.join(map(str, paths))}: no specification for all: give --spec FILE")
     plants = [source.plant for source in sources_found]
-    check_filter(asked.reference_filter, plants[0].dt_s, str(file.path or paths[0]))
-    done = _design(plants, asked, file.plant.between_points, seed)
+    check_filter(asked.reference_filter, plants[0].dt_s, str(specification_path or paths[0]))
+    done = _design(plants, specification, asked, seed)
     certificate, certified = done.certify.certificate, done.certify.certified
-    synthesis, order = done.design.synthesis, asked.specification.controller_order
+    synthesis, order = done.design.synthesis, specification.controller_order
     files: list[Path] = []
     if out is not None and synthesis is not None and certificate is not None:
         found = done.reference_filter.filter
@@ -146,7 +101,7 @@ def design_controller(
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None
-    reason = _reason(done, advice)
+    reason = said("design_verdict", done.design, certificate, advice)
     shares = joint_numbers(done.certify.sampled)
     rows = rows_of(
         "summary/design.j2",
@@ -191,15 +146,3 @@ def _check_out(out: Path, sources: Sequence[Path]) -> None:
         storage.check_writable(path)
         if path.absolute() in [source.absolute() for source in sources]:
             raise InputError(f"--out {out}: {path} is a source; give the controller a name of its own")
-
-
-def _reason(done: _Designed, advice: str | None) -> str:
-    """How the design stands, in one line."""
-    certificate, reason = done.certify.certificate, done.design.reason
-    if certificate is None:
-        return reason if done.design.synthesis is None else f"{reason}; {_NO_CONTROLLER}"
-    if certificate.certified:
-        return reason
-    missed = [said("requirement", item) for item in certificate.items if not item.met]
-    text = "not certified: " + ("; ".join(missed) or "unstable, or an ellipse reaches -1")
-    return f"{text}; {advice}" if advice else text

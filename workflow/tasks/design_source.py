@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import control
 import numpy as np
-from pydantic import BaseModel, Field, field_validator, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from control_design.plants.plant_set import UncertainPlant, count_integrators
 from control_design.plants.stated_uncertainty import StatedDiscs
@@ -121,32 +121,33 @@ class StatedUncertainty(Section):
         return StatedDiscs(nominal, self.additive, "additive")
 
 
-@dataclass(frozen=True)
-class DesignFile:
+class DesignFile(Section):
     """What a design file says; specification None where there is no file."""
 
     specification: Specification | None = None
-    synthesis: SynthesisOptions | None = None
-    plant: PlantSection = field(default_factory=PlantSection)
+    synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
+    plant: PlantSection = Field(default_factory=PlantSection)
     uncertainty: StatedUncertainty | None = None
-    certificate: CertificateOptions | None = None
-    achievable_performance: AchievableOptions | None = None
+    certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
+    achievable_performance: AchievableOptions = Field(
+        default_factory=lambda: AchievableOptions.model_validate({})
+    )
     reference_filter: ReferenceFilterSettings | None = None
-    path: Path | None = None
+    _name: str = PrivateAttr("a design file (--spec FILE)")
 
     @property
     def name(self) -> str:
-        return "a design file (--spec FILE)" if self.path is None else str(self.path)
+        return self._name
 
-
-_TABLES: dict[str, type[BaseModel]] = {
-    "synthesis": SynthesisOptions,
-    "plant": PlantSection,
-    "uncertainty": StatedUncertainty,
-    "certificate": CertificateOptions,
-    "achievable_performance": AchievableOptions,
-    "reference_filter": ReferenceFilterSettings,
-}
+    def completed(self, run: RunConfig | None) -> DesignFile:
+        """What is left out is as in a run; but a file without [reference_filter] asks for none, it has no
+        other way to."""
+        if run is None:
+            return self
+        lacking = {"specification", "synthesis", "certificate", "achievable_performance"}
+        if self.specification is None:
+            lacking.add("reference_filter")
+        return self.model_copy(update={name: getattr(run, name) for name in lacking - self.model_fields_set})
 
 
 def read_design_file(path: Path) -> DesignFile:
@@ -154,21 +155,15 @@ def read_design_file(path: Path) -> DesignFile:
     [uncertainty], [synthesis], [certificate], [achievable_performance] and [reference_filter]; of a run's
     configuration all of these but the first two are taken. Raises InputError."""
     _, document = read_toml(path)
-    known = {"specification", *_TABLES}
+    known = DesignFile.model_fields.keys()
     if "specification" not in document:
-        wanted = {key: value for key, value in document.items() if key not in known}
-    else:
-        wanted = document["specification"]
-        unknown = sorted(set(document) - known)
-        if unknown and "channels" not in document:
-            raise InputError(f"{path}: unknown key {unknown[0]} (known keys: {', '.join(sorted(known))})")
-    base = {"base": path.absolute().parent}
-    tables: dict[str, Any] = {
-        name: check(kind, document[name], source=f"{path} [{name}]", context=base)
-        for name, kind in _TABLES.items()
-        if name in document
-    }
-    return DesignFile(check(Specification, wanted, source=str(path)), path=path, **tables)
+        wishes = {key: document.pop(key) for key in document.keys() - known}
+        document["specification"] = wishes
+    elif "channels" in document:
+        document = {key: value for key, value in document.items() if key in known}
+    found = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})
+    found._name = str(path)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,20 +328,13 @@ def _refuse_untold_integrators(path: Path, nominal: control.StateSpace, design: 
     """A pole on the circle decides how often the Nyquist curve has to turn: it is never guessed."""
     poles = np.asarray(nominal.poles(), dtype=np.complex128)
     found, told = count_integrators(poles), design.plant.integrators
-    if found == told:
-        return
-    nearest = np.sort(np.abs(poles - 1.0))[: max(told, 1)]
-    if found > told:
+    if found != told:
+        away = np.sort(np.abs(poles - 1.0))[found:told]
+        near = f" (another pole is {away[0]:.3g} away)" if away.size else ""
         raise InputError(
-            f"{path}: {found} {'poles' if found > 1 else 'pole'} at z = 1 (integration), "
-            f"[plant] says {told}: write integrators = {found} in [plant] of {design.name} if that is meant"
+            f"{path}: {found} of its poles at z = 1 (integration){near}, [plant] says {told}: write "
+            f"integrators = {found} in [plant] of {design.name} if that is meant"
         )
-    raise InputError(
-        f"{path}: [plant] says {told} integrators, the model has {found} at z = 1 (nearest pole "
-        f"{nearest[-1]:.3g} away)"
-        if nearest.size
-        else f"{path}: [plant] says {told} integrators, found none"
-    )
 
 
 def _measured(path: Path, design: DesignFile) -> DesignSource:
