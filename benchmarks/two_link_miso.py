@@ -32,7 +32,8 @@ from benchmarks.harness import Print, main, timed
 from examples.two_link_arm import AMPLITUDE_V, DT_S, ELBOW_ANGLE_RAD, NOISE_M
 from ident import IdentOptions, Record, identify
 from ident.several_inputs import identify_miso
-from plant import prbs, two_link_operating_point
+from plant import prbs
+from validation.example_arms import two_link_operating_point
 
 N_SAMPLES = 8000
 OPTIONS = IdentOptions(integrators=1)

@@ -22,7 +22,8 @@ from scipy.signal import dlsim
 from ident import IdentOptions, Record
 from ident.several_inputs import identify_miso
 from ident.uncertainty.miso_uncertainty import response_uncertainty
-from plant import prbs, two_link_operating_point
+from plant import prbs
+from validation.example_arms import two_link_operating_point
 
 DT_S, ELBOW_ANGLE_RAD, NOISE_M, AMPLITUDE_V = 0.002, 2 * np.pi / 3, 2e-5, 1.0
 OMEGA = np.geomspace(1.0, 1000.0, 500)

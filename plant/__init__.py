@@ -3,10 +3,9 @@
 from plant.effects import EFFECTS, Effect, parse_effect, parse_effects
 from plant.excitation import bang_bang, crest_factor, doublet, log_chirp, multisine, multisine_lines, prbs
 from plant.modal import linear_arm
-from plant.presets import paper_example, paper_example_rig, paper_link
+from plant.presets import paper_link
 from plant.rig import Rig, parameter_keys
 from plant.simulate import SampledArm, Trajectory, simulate
-from plant.two_link import two_link_operating_point
 
 __all__ = [
     "EFFECTS",
@@ -21,13 +20,10 @@ __all__ = [
     "log_chirp",
     "multisine",
     "multisine_lines",
-    "paper_example",
-    "paper_example_rig",
     "paper_link",
     "parameter_keys",
     "parse_effect",
     "parse_effects",
     "prbs",
     "simulate",
-    "two_link_operating_point",
 ]

@@ -8,8 +8,8 @@ import scipy.signal
 
 from ident.data.record import Record
 from ident.search.error_surface import ErrorSurface
-from plant import paper_example
 from validation.comparators.prediction_error import arx_polynomials
+from validation.example_arms import paper_example
 from validation.paper.bounds import TWO_SIGMA_LEVEL, coverage_of
 from validation.paper.experiments import frequencies
 from validation.paper.machines import NOISE_STD, SNR_DB, LinkExperiment, SimulationExample

@@ -16,7 +16,8 @@ import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
-from plant import Effect, Rig, linear_arm, paper_example, paper_link, parse_effect, prbs, simulate
+from plant import Effect, Rig, linear_arm, paper_link, parse_effect, prbs, simulate
+from validation.example_arms import paper_example
 from validation.paper.settings import DT_S
 
 # p. 104: noise variance 0.004^2 and 30 dB, so the output has a standard deviation of 0.1265.
