@@ -60,15 +60,15 @@ SIMULATED = {"kind": "simulated"}
         ({"source": SIMULATED, "channels": [{}, {}]}, "missing keys channels[0].input, channels[1].input"),
         (
             {"source": {"kind": "simulated", "bandwidth_rad_s": True}},
-            "source.bandwidth_rad_s: input should be a number, got True",
+            "source.bandwidth_rad_s: input should be a valid number, got True",
         ),
         (
             {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": "0.5"}}]},
-            "channels[0].options.level: input should be a number, got '0.5'",
+            "channels[0].options.level: input should be a valid number, got '0.5'",
         ),
         (
             {"source": SIMULATED, "channels": [{"input": "u", "options": {"wide": 1}}]},
-            "channels[0].options.wide: input should be true or false, got 1",
+            "channels[0].options.wide: input should be a valid boolean, got 1",
         ),
         ({"source": {}}, "missing key source.kind"),
         ({"source": {"kind": "wire"}}, "source.kind: expected one of 'files', 'simulated', got 'wire'"),
@@ -82,8 +82,7 @@ SIMULATED = {"kind": "simulated"}
         ),
         (
             {"source": {"kind": "simulated", "bandwidth_rad_s": "fast"}},
-            "source.bandwidth_rad_s: input should be a valid number, unable to parse string as a "
-            "number, got 'fast'",
+            "source.bandwidth_rad_s: input should be a valid number, got 'fast'",
         ),
     ],
 )

@@ -338,7 +338,7 @@ def test_killed_worker_is_replaced(small_study, tmp_path):
         (
             "1.0, 1.5, 1e5",
             "1.0, true",
-            "axes[0].values[1]: specification.bandwidth_rad_s: input should be a number",
+            "axes[0].values[1]: specification.bandwidth_rad_s: input should be a valid number",
         ),
         ("1.0, 1.5, 1e5", "1.0, 1.0", "axes[0]: the value 1.0 is listed twice"),
         ("values = [1.0, 1.5, 1e5]", "from = 1.0", "axes[0]: a range needs from and to"),

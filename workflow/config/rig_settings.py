@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationInfo
 
 from plant import Rig, parse_effect
 from plant.presets import paper_link
@@ -34,5 +34,5 @@ def _check_effect(value: Any) -> dict[str, Any]:
     return parse_effect(value).to_dict()
 
 
-RigChoice = Annotated[str | Path, BeforeValidator(_choose_rig), PlainSerializer(str, return_type=str)]
+RigChoice = Annotated[str | Path, PlainValidator(_choose_rig), PlainSerializer(str, return_type=str)]
 EffectTable = Annotated[dict[str, Any], BeforeValidator(_check_effect)]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, to_json
 
 from workflow.config.renamed_keys import with_current_keys
 from workflow.engine import storage
@@ -50,37 +50,11 @@ def check(
     """`document` as a `model`. Raises InputError: one line with `source`, the dotted key and what was
     expected."""
     try:
-        found = model.model_validate(document, context=dict(context or {}))
+        # As JSON, whose strict reading takes `true` for no 1.0 and "2" for no 2, but a list for a tuple.
+        text = to_json(document, inf_nan_mode="constants")
+        return model.model_validate_json(text, strict=True, context=dict(context or {}))
     except ValidationError as error:
         raise InputError(f"{source}: {_first_complaint(model, error)}") from error
-    converted = _first_converted(document, found)
-    if converted:
-        raise InputError(f"{source}: {converted}")
-    return found
-
-
-def _first_converted(given: Any, found: Any, where: str = "") -> str | None:
-    """Complaint about the first value that pydantic took for a number or a switch although it was written as
-    something else.
-
-    `true` is no 1.0 and `"2"` no 2; pydantic's own strict mode would refuse TOML's lists for tuples as well.
-    """
-    if isinstance(given, Mapping):
-        for key, value in given.items():
-            inner = found.get(key) if isinstance(found, Mapping) else getattr(found, str(key), None)
-            complaint = _first_converted(value, inner, f"{where}.{key}" if where else str(key))
-            if complaint:
-                return complaint
-    elif isinstance(given, (list, tuple)) and isinstance(found, (list, tuple)) and len(given) == len(found):
-        for index, (value, inner) in enumerate(zip(given, found, strict=True)):
-            complaint = _first_converted(value, inner, f"{where}[{index}]")
-            if complaint:
-                return complaint
-    elif isinstance(found, bool) and not isinstance(given, bool):
-        return f"{where}: input should be true or false, got {shortened(given)}"
-    elif isinstance(found, (int, float)) and not isinstance(found, bool) and isinstance(given, (bool, str)):
-        return f"{where}: input should be a number, got {shortened(given)}"
-    return None
 
 
 def _first_complaint(model: type[BaseModel], error: ValidationError) -> str:

@@ -104,8 +104,10 @@ class StatedUncertainty(Section):
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             if not 0 < value < np.inf:
                 raise ValueError(f"a constant radius must be positive and finite; got {value}")
-            return {"numerator": [float(value)], "denominator": [1.0]}
-        return value
+            return RationalWeight(numerator=(float(value),), denominator=(1.0,))
+        # A table seen before it is checked is no JSON any more, whose lists stand for tuples.
+        lists = value.items() if isinstance(value, Mapping) else ()
+        return {key: tuple(v) if isinstance(v, list) else v for key, v in lists} or value
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
