@@ -44,6 +44,7 @@ from validation.example_plants import (
     flexible_link,
     flexible_link_specification,
 )
+from workflow.text.templates import said
 
 BRUTE = 400_000
 MANY = 20_000
@@ -141,7 +142,7 @@ def run(out: Print, *, draws: int = 3000, scenarios: tuple[Scenario, ...] = ("A"
         design = synthesise_jointly([plant], specification, rng=np.random.default_rng(1))
         controllers[scenario] = design.result.controller
         gamma = certify(design.result.controller, [plant], specification).gamma
-        out(f"{scenario}: worst case {gamma:.4f}; {design.sentence()}")
+        out(f"{scenario}: worst case {gamma:.4f}; {said('draws_stable', design)}")
     out()
     out(f"joint coverage asked 95 %, {draws} fresh draws (right: 95 % ellipses as given)")
     out("draws              certified  level %  holds in % stable %  worst case  holds in % in all ell. %")

@@ -63,16 +63,6 @@ class SpecificationItem:
     omega_rad_s: float | None = None
     bound: float | None = None
 
-    def sentence(self) -> str:
-        """One line for a report."""
-        where = "" if self.omega_rad_s is None else f" at {self.omega_rad_s:.4g} rad/s"
-        verdict = "met" if self.met else "NOT met"
-        unit = f" {self.unit}" if self.unit else ""
-        numbers = f"{self.achieved:.4g} against {self.required:.4g}{unit}{where}"
-        known = self.met and self.bound is not None
-        proved = f" ({self.bound:.4g} proved for all frequencies)" if known else ""
-        return f"{self.plant}: {self.requirement}: {numbers}{proved}: {verdict}"
-
 
 @dataclass(frozen=True)
 class Findings:

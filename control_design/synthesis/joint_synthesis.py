@@ -40,16 +40,6 @@ class JointDesign:
     unstable: tuple[int, ...]
     reached: bool
 
-    def sentence(self) -> str:
-        """One line for a report."""
-        if not self.unstable:
-            return "no stable design: nothing was drawn"
-        added = f"; {len(self.guards)} of the unstable ones before it guarded" if self.guards else ""
-        return (
-            f"{self.unstable[-1]} of {self.draws} sampled responses unstable "
-            f"({'enough' if self.reached else 'NOT enough'} are stable){added}"
-        )
-
 
 def synthesise_jointly(
     plants: Sequence[UncertainPlant],
@@ -111,5 +101,5 @@ def synthesise_jointly(
             break
         guards += found
     assert best is not None
-    tell(1.0, best.result.explain())
+    tell(1.0, f"gamma {best.result.gamma:.4g}")
     return best

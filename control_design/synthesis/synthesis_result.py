@@ -76,19 +76,6 @@ class SynthesisResult:
     gamma_history: tuple[float, ...]
     grid_points: int
 
-    def explain(self) -> str:
-        """One line: met, or how far and which frequency and requirement block it."""
-        said, where = str(self.outcome.value), ""
-        if self.blocking:
-            first = self.blocking[0]
-            where = f"{first.weight} of {first.plant!r} at {first.omega_rad_s:.4g} rad/s blocks"
-        if self.outcome is Outcome.NOT_CONVERGED:
-            return said + (f"; where it came nearest, {where}" if where else "")
-        met = self.outcome is Outcome.MET_ON_GRID
-        share = "" if met else f", {100 * (self.gamma - 1):.3g} % too much"
-        blocks = f"; {where}{' more' if met else ''}" if where else ""
-        return f"{said} (gamma {self.gamma:.4g}{share}{blocks})"
-
     def controller_or_raise(self) -> Controller:
         """The controller if the specification is met on the grid.
 
@@ -98,5 +85,8 @@ class SynthesisResult:
             Otherwise, with this result attached.
         """
         if self.outcome is not Outcome.MET_ON_GRID:
-            raise SynthesisError(self.explain(), self)
+            blocks = (
+                f"; {b.weight} of {b.plant!r} at {b.omega_rad_s:.4g} rad/s blocks" for b in self.blocking
+            )
+            raise SynthesisError(f"{self.outcome.value} (gamma {self.gamma:.4g}){next(blocks, '')}", self)
         return self.controller

@@ -86,7 +86,6 @@ def test_joint_design_is_stable_for_the_share_asked():
     assert design.reached
     assert design.guards
     assert design.unstable[-1] < design.unstable[0]
-    assert "enough" in design.sentence()
     gains = 1 + 0.5 * np.random.default_rng(9).standard_normal(1000)
     unstable = sum(_radius(design.result.controller, gain) >= 1 for gain in gains)
     # 3 % asked, met by two standard deviations of its own count; three more of the fresh one

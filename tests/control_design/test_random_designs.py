@@ -65,6 +65,6 @@ def test_a_case_without_a_design_is_not_handed_out_as_one():
     result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(149))
     if result.outcome is Outcome.NOT_CONVERGED:
         assert result.blocking[0].plant == plant.name
-        assert "rad/s blocks" in result.explain()
+        assert result.blocking[0].omega_rad_s > 0
     else:
         assert certify(result.controller, [plant], specification).plants[0].all_frequencies.proved

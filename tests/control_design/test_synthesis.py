@@ -85,7 +85,7 @@ def test_integrating_arms_with_integral_action_are_certified(integrators):
     options = SynthesisOptions(starts=12, exchange_rounds=2, sufficient_gamma=0.97)
     result = synthesise([plant], specification, options, rng=np.random.default_rng(2))
     certificate = certify(result.controller_or_raise(), [plant], specification)
-    assert certificate.certified, [item.sentence() for item in certificate.items]
+    assert certificate.certified, certificate.items
     assert certificate.plants[0].nyquist.required == (integrators + 1) / 2
     assert result.controller.input_limit == 10.0
 
@@ -156,7 +156,6 @@ def test_without_a_stable_design_the_unstable_pole_is_named():
     first = result.blocking[0]
     assert (first.plant, first.weight) == ("unruly", "stability of the nominal loop")
     assert 0 < first.omega_rad_s <= np.pi / 0.01
-    assert "stability of the nominal loop of 'unruly' at" in result.explain()
     with pytest.raises(SynthesisError, match="no start led to a stable loop"):
         result.controller_or_raise()
 

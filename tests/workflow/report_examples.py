@@ -51,6 +51,7 @@ from workflow.tasks.results import (
     SensitivityCheck,
     UncertaintyResult,
 )
+from workflow.text.templates import said
 
 DT_S = 0.01
 INPUT = "voltage_V"
@@ -318,10 +319,10 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         gamma_history=(certificate.gamma,),
         grid_points=200,
     )
-    run.save_stage("design", DesignResult(result, met, result.explain()), "00")
+    run.save_stage("design", DesignResult(result, met, said("outcome", result)), "00")
     run.save_stage("achievable_performance", achievable(), "00")
     run.save_stage("reference_filter", ReferenceFilterResult(), "00")
-    reason = "; ".join(item.sentence() for item in certificate.items if not item.met) or "met"
+    reason = "; ".join(said("requirement", item) for item in certificate.items if not item.met) or "met"
     sampled = sampled_responses(certificate.gamma)
     run.save_stage("certify", CertifyResult(certificate, certificate.certified, reason, sampled), "00")
     run.save_stage("closed_loop", ClosedLoopResult(check=loop_check(settings, settled)), "00")

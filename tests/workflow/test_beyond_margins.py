@@ -20,7 +20,9 @@ from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification
 from control_design.specification.requirement import LoopFunction
+from control_design.synthesis.joint_synthesis import JointDesign
 from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_result import Outcome
 from tests.workflow.report_examples import (
     DT_S,
     achievable,
@@ -160,7 +162,7 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
 
 def test_calibration_is_designed_for(monkeypatch):
     asked = []
-    result = SimpleNamespace(gamma=0.9, explain=lambda: "met")
+    result = SimpleNamespace(gamma=0.9, outcome=Outcome.MET_ON_GRID, blocking=())
 
     def plain(plants, specification, options, *, rng, progress):
         asked.append("plain")
@@ -168,14 +170,15 @@ def test_calibration_is_designed_for(monkeypatch):
 
     def jointly(plants, specification, options, *, rng, progress):
         asked.append("jointly")
-        return SimpleNamespace(result=result, sentence=lambda: "2 of 10000 unstable")
+        return JointDesign(result, (), 10_000, (7, 2), True)
 
     monkeypatch.setattr("workflow.tasks.design.synthesise", plain)
     monkeypatch.setattr("workflow.tasks.design.synthesise_jointly", jointly)
     exact = UncertainPlant("exact", model().to_control())
     options = CertificateOptions.model_validate({"calibrate": True})
     rng, how = np.random.default_rng(1), SynthesisOptions()
-    assert find_design([plant()], spec(), how, options, rng).jointly == "2 of 10000 unstable"
+    jointly_said = find_design([plant()], spec(), how, options, rng).jointly
+    assert jointly_said == "2 of 10000 sampled responses unstable (enough are stable)"
     assert find_design([exact], spec(), how, options, rng).jointly is None
     kept = CertificateOptions.model_validate({})
     assert find_design([plant()], spec(), how, kept, rng).jointly is None

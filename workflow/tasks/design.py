@@ -20,6 +20,7 @@ from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import CertificateOptions
 from workflow.engine import codec
 from workflow.tasks.results import CertifyResult, DesignResult, SampledResponses
+from workflow.text.templates import said
 
 
 def find_design(
@@ -39,13 +40,13 @@ def find_design(
     try:
         if options.calibrate and undrawable(plants) is None:
             found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
-            result, jointly = found.result, found.sentence()
+            result, jointly = found.result, said("draws_stable", found)
         else:
             result = synthesise(plants, specification, synthesis, rng=rng, progress=progress)
             jointly = None
     except SpecificationError as impossible:
         return DesignResult(None, met=False, reason=str(impossible))
-    return DesignResult(result, result.gamma <= 1.0, result.explain(), jointly)
+    return DesignResult(result, result.gamma <= 1.0, said("outcome", result), jointly)
 
 
 def certify_asked(
@@ -85,7 +86,7 @@ def certify_asked(
             draws=options.joint_draws,
         )
     unstable = [verdict.plant for verdict in certificate.plants if not verdict.stable]
-    missed = [item.sentence() for item in certificate.items if not item.met]
+    missed = [said("requirement", item) for item in certificate.items if not item.met]
     doubts = "; ".join([*(f"{name}: nominal closed loop unstable" for name in unstable), *missed])
     return CertifyResult(
         certificate,
