@@ -110,37 +110,12 @@ class ConditionBench:
             law or self.controller,
             self.posterior,
             self.posterior.mean,
-            self._given(reference),
+            self._filtered(reference),
             output_disturbance=output_disturbance,
             clip=clip,
         )
 
-    def achieve(
-        self,
-        reference: Real,
-        *,
-        effects: Mapping[str, Mapping[str, Any]] | None = None,
-        law: Controller | None = None,
-        rig: Rig | None = None,
-        steps: tuple[float, float] | None = None,
-        tip_force_N: Real | None = None,
-        clip: float | None = None,
-    ) -> ClosedLoopTrajectory:
-        """The loop on the arm, with effects exchanged by name; steps: of measurement and command."""
-        extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
-        rng = self.rng.spawn(1)[0]
-        arm = EncodedArm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)
-        measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
-        return simulate(
-            law or self.controller,
-            ClippedMachine(arm, FINITE if clip is None else clip),
-            self._given(reference),
-            measured_index=self.measured,
-            measurement_step=measurement,
-            command_step=command,
-        )
-
-    def _given(self, reference: Real) -> Real:
+    def _filtered(self, reference: Real) -> Real:
         """What the loop is given for a reference."""
         return reference if self.reference_filter is None else self.reference_filter.filtered(reference)
 
@@ -268,11 +243,26 @@ class ConditionBench:
         law: Controller | None = None,
         clip: float | None = None,
         output_disturbance: Real | None = None,
-        **changes: Any,
+        effects: Mapping[str, Mapping[str, Any]] | None = None,
+        rig: Rig | None = None,
+        steps: tuple[float, float] | None = None,
+        tip_force_N: Real | None = None,
     ) -> ConditionRun:
-        """The reference (the step, unless another is given) predicted, and achieved with the changes."""
+        """The reference (the step, unless another is given) predicted, and achieved on the arm with effects
+        exchanged by name; steps: of measurement and command."""
         reference = self.reference if reference is None else reference
         predicted = self.predict(reference, law=law, output_disturbance=output_disturbance, clip=clip)
-        achieved = self.achieve(reference, law=law, clip=clip, **changes)
+        extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
+        rng = self.rng.spawn(1)[0]
+        arm = EncodedArm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)
+        measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
+        achieved = simulate(
+            law or self.controller,
+            ClippedMachine(arm, FINITE if clip is None else clip),
+            self._filtered(reference),
+            measured_index=self.measured,
+            measurement_step=measurement,
+            command_step=command,
+        )
         size = float(reference[-1]) or float(np.max(np.abs(predicted.measured)))
         return condition_run(name, words, reference, predicted, achieved, size)
