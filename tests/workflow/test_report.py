@@ -139,7 +139,7 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
     for channel in results.identify.channels:
         for mode in channel.modes:
             assert f"{mode.frequency_Hz:.4g} {mode.omega_rad_s:.4g} {mode.damping:.3g}" in text
-        for name, fit in channel.fit_validation_percent.items():
+        for name, fit in channel.fit_percent["validation"].items():
             assert f"{fit:.3g} % ({name})" in text
     for spread in results.uncertainty.channels:
         for band in spread.bands:

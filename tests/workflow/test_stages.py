@@ -84,9 +84,8 @@ def test_empirical_response_is_there(run):
 
 def test_identification_comes_back_whole(run):
     found = run.identify.channels[0]
-    assert found.identification.model.order == found.order
-    assert found.fit_estimation_percent == {"prbs": pytest.approx(found.identification.fit_percent[0])}
-    assert set(found.fit_validation_percent) == {"fresh <b>prbs</b>"}
+    assert found.fit_percent["estimation"] == {"prbs": pytest.approx(found.identification.fit_percent[0])}
+    assert set(found.fit_percent["validation"]) == {"fresh <b>prbs</b>"}
     assert [fit.name for fit in found.fresh] == ["fresh <b>prbs</b>"]
 
 

@@ -28,7 +28,7 @@ def draw_order(channel: ChannelView) -> Figure | None:
     The response straight from the records stands faintly behind the right panel: modes belong on its peaks.
     Nothing where no other structure was tried.
     """
-    plot, steps = channel.found.stabilisation, channel.found.order_table
+    plot, steps = channel.found.stabilisation, channel.found.identification.order_table
     if plot is None or not steps:
         return None
     figure = style.new_figure(4.6)

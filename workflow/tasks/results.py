@@ -28,7 +28,6 @@ from ident.checks.validation import FreshFit, ScatterRow
 from ident.data.record import Record
 from ident.finding import Finding
 from ident.identification import Identification
-from ident.search.order_selection import OrderStep
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow.config.run_config import Channel, Role, RunConfig
@@ -137,22 +136,6 @@ class IdentifiedChannel:
         return self.model.output_name
 
     @property
-    def order(self) -> int:
-        return self.model.order
-
-    @property
-    def integrators(self) -> int:
-        return self.model.integrators
-
-    @property
-    def input_delay_samples(self) -> int:
-        return self.model.input_delay_samples
-
-    @property
-    def feedthrough(self) -> bool:
-        return self.identification.structure.feedthrough
-
-    @property
     def data_band_rad_s(self) -> Interval | None:
         """Band of the data behind the ellipses; None where they were not confined to one."""
         return self.bounds_band_rad_s or self.band_rad_s
@@ -184,25 +167,14 @@ class IdentifiedChannel:
         return tuple(sorted(self.model.poles.real.tolist(), reverse=True))
 
     @property
-    def order_table(self) -> tuple[OrderStep, ...]:
-        return self.identification.order_table
-
-    @property
-    def fit_estimation_percent(self) -> dict[str, float]:
+    def fit_percent(self) -> dict[Role, dict[str, float]]:
+        """By role and record: of the fit itself on the estimation records, of free runs on the others."""
         found = self.identification
-        return dict(zip(found.record_names, found.fit_percent.tolist(), strict=True))
-
-    @property
-    def fit_validation_percent(self) -> dict[str, float]:
-        return self._fresh_percent("validation")
-
-    @property
-    def fit_repeat_percent(self) -> dict[str, float]:
-        return self._fresh_percent("repeat")
-
-    def _fresh_percent(self, role: Role) -> dict[str, float]:
-        pairs = zip(self.fresh, self.fresh_roles, strict=True)
-        return {fit.name: fit.fit_percent for fit, of in pairs if of == role}
+        fits: dict[Role, dict[str, float]] = {"estimation": {}, "validation": {}, "repeat": {}}
+        fits["estimation"] = dict(zip(found.record_names, found.fit_percent.tolist(), strict=True))
+        for fit, role in zip(self.fresh, self.fresh_roles, strict=True):
+            fits[role][fit.name] = fit.fit_percent
+        return fits
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,34 +95,30 @@ def verdict_of(
 
 def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
     """What was found in one channel, for programs."""
-    names = (
-        "name",
-        "input",
-        "output",
-        "order",
-        "integrators",
-        "input_delay_samples",
-        "feedthrough",
-        "real_poles_per_s",
-        "real_poles_z",
-        "order_table",
-        "band_rad_s",
-        "fit_estimation_percent",
-        "fit_validation_percent",
-        "fit_repeat_percent",
-    )
+    model, identification = found.model, found.identification
     return {
-        **{name: codec.plain(getattr(found, name)) for name in names},
-        "warnings": [words(item) for item in found.identification.warnings],
-        "verdicts": [words(item) for item in found.identification.verdicts],
+        "name": found.name,
+        "input": found.input,
+        "output": found.output,
+        "order": model.order,
+        "integrators": model.integrators,
+        "input_delay_samples": model.input_delay_samples,
+        "feedthrough": identification.structure.feedthrough,
+        "real_poles_per_s": codec.plain(found.real_poles_per_s),
+        "real_poles_z": codec.plain(found.real_poles_z),
+        "order_table": codec.plain(identification.order_table),
+        "band_rad_s": codec.plain(found.band_rad_s),
+        **{f"fit_{role}_percent": fits for role, fits in found.fit_percent.items()},
+        "warnings": [words(item) for item in identification.warnings],
+        "verdicts": [words(item) for item in identification.verdicts],
         "two_stage": None if found.two_stage is None else words(found.two_stage),
         "modes": [
             {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode), "is_mode": found.is_mode(mode)}
             for mode in found.modes
         ],
-        "noise_std": found.identification.noise_std,
-        "tangent_optimality": found.identification.tangent_optimality,
-        "search_evaluations": found.identification.search.evaluations,
+        "noise_std": identification.noise_std,
+        "tangent_optimality": identification.tangent_optimality,
+        "search_evaluations": identification.search.evaluations,
     }
 
 
