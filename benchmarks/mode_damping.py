@@ -26,7 +26,7 @@ import control
 import numpy as np
 import pandas as pd
 
-from benchmarks.harness import RESULTS, Print, main, reading
+from benchmarks.harness import Print, main, reading
 from control_design import (
     Controller,
     LoopFunction,
@@ -133,45 +133,6 @@ def design(part: str, ratio: float | None, seed: int) -> dict[str, Any]:
     }
 
 
-def draw(curves: dict[str, pd.DataFrame]) -> None:
-    """Cost over damping as benchmarks/results/mode_damping.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
-    axes.plot(
-        *zip(*PUBLISHED, strict=True),
-        "ks--",
-        label="full-order hinfsyn, no ellipses (published, nearest pole)",
-    )
-    for part, points in curves.items():
-        best = pareto(points)
-        axes.plot(
-            best.least,
-            best.cost,
-            "o:" if part.endswith("damped") else "o-",
-            color={"e": "C0", "A": "C1", "B": "C2"}[part[0]],
-            label=f"order 6, {NAMES[part]}",
-        )
-    axes.axvline(0.015, color="0.6", linewidth=0.8, label="open loop")
-    axes.set_xscale("log")
-    axes.set_xlabel("least damping ratio of closed-loop poles, 10 to 22.5 rad/s [-]")
-    axes.set_ylabel("largest max(|W1 S|, |W3 K S|) [-]")
-    axes.set_title("Flexible link: what damping of the mode costs")
-    axes.grid(True, which="both", alpha=0.3)
-    axes.legend(fontsize=8)
-    figure.savefig(RESULTS / "mode_damping.png", dpi=110)
-    plt.close(figure)
-
-
-def pareto(points: pd.DataFrame) -> pd.DataFrame:
-    """Points that no other one beats in both cost and least damping, by damping."""
-    beaten = [((points.cost < p.cost) & (points.least > p.least)).any() for p in points.itertuples()]
-    return points[~np.array(beaten)].sort_values("least", kind="stable")
-
-
 def summarise(out: Print, curves: dict[str, pd.DataFrame]) -> None:
     """Least cost of a damping over all parts, whose pole is the least damped one, distance from Youla."""
     out("least cost max(|W1 S|, |W3 K S|) of order 6 with at least the damping (nearest and least pole)")
@@ -214,11 +175,8 @@ def measure(out: Print, part: str, ratios: tuple[float, ...], seed: int) -> pd.D
 def run(
     out: Print, *, parts: tuple[str, ...] = tuple(NAMES), ratios: tuple[float, ...] = RATIOS, seed: int = 1
 ) -> None:
-    """Every part, then all compared and drawn."""
-    curves = {part: measure(out, part, ratios, seed) for part in parts}
-    summarise(out, curves)
-    if set(parts) == set(NAMES):
-        draw(curves)
+    """Every part, then all compared."""
+    summarise(out, {part: measure(out, part, ratios, seed) for part in parts})
 
 
 if __name__ == "__main__":
