@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import control
 import numpy as np
@@ -39,29 +39,9 @@ class Trial:
     fresh_clean: RealArray
 
 
-class PaperMachine(Protocol):
-    """What both machines offer: a true linear response, its mode, and records."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def gain_unit(self) -> str: ...
-    @property
-    def mode(self) -> tuple[float, float]:
-        """(omega [rad/s], damping ratio) of the first mode."""
-        ...
-
-    def response(self, omega_rad_s: RealArray) -> ComplexArray:
-        """True response (F,) with the input held over a sample."""
-        ...
-
-    def trial(self, rng: np.random.Generator) -> Trial: ...
-
-
 def _response(system: Any, omega_rad_s: RealArray, row: int = 0, column: int = 0) -> ComplexArray:
-    resolvent = np.exp(1j * omega_rad_s * DT_S)[:, None, None] * np.eye(system.A.shape[0]) - system.A
-    states = np.linalg.solve(resolvent, np.broadcast_to(system.B[:, [column]], (*resolvent.shape[:2], 1)))
-    return np.asarray(states[:, :, 0] @ system.C[row] + system.D[row, column], dtype=np.complex128)
+    at = system(np.exp(1j * omega_rad_s * DT_S), squeeze=False)
+    return np.asarray(at[row, column], dtype=np.complex128)
 
 
 def _record(name: str, u: RealArray, y: RealArray, input_name: str, input_unit: str) -> Record:
@@ -91,6 +71,7 @@ class SimulationExample:
 
     @property
     def mode(self) -> tuple[float, float]:
+        """(omega [rad/s], damping ratio) of the mode."""
         poles = paper_example().poles()
         pole = complex(poles[np.argmax(poles.imag)])
         return abs(pole), -pole.real / abs(pole)
@@ -147,6 +128,7 @@ class LinkExperiment:
 
     @property
     def mode(self) -> tuple[float, float]:
+        """(omega [rad/s], damping ratio) of the first mode."""
         poles = linear_arm(self.rig).poles()
         pairs = poles[poles.imag > 0]
         pole = complex(pairs[np.argmin(np.abs(pairs))])
@@ -165,3 +147,6 @@ class LinkExperiment:
             records.append(_record(name, u, run.tip_m, "voltage_V", "V"))
             clean = run.tip_true_m
         return Trial(records[0], records[1], clean)
+
+
+PaperMachine = SimulationExample | LinkExperiment
