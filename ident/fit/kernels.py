@@ -187,10 +187,20 @@ def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
 
 
 @numba.njit(cache=True)
-def candidate_rss(
-    blocks: Any, n_real: int, drive: Any, frozen: Any, starts: Any, local_q: Any, free: bool
+def cost_of_point(
+    unit: Any,
+    n_real: int,
+    low: Any,
+    high: Any,
+    raw: bool,
+    drive: Any,
+    frozen: Any,
+    starts: Any,
+    local_q: Any,
+    free: bool,
 ) -> float:
-    """Residual sum of squares when the given blocks join what is already fitted.
+    """Residual sum of squares when the blocks of a point (D,) of the unit cube join what is already fitted;
+    low and high are the box of its search space.
 
     drive (U, N) are the signals that drive the candidate blocks (the inputs, or what the all-pass of the
     frozen poles makes of them); frozen (Q + 1, N) are the columns common to all records made orthonormal,
@@ -200,6 +210,7 @@ def candidate_rss(
     J = |r|^2 - b^T G^-1 b with the products G of what the new columns add to the frozen ones, b = those with
     r: good to about 1e-10 of |r|^2, enough to rank candidates.
     """
+    blocks = blocks_of_point(unit, n_real, low, high, raw)
     n_records, n_inputs, n_total = starts.size - 1, drive.shape[0], drive.shape[1]
     order, n_frozen = 2 * blocks.shape[0] - n_real, frozen.shape[0] - 1
     # Free responses first: that of record r and state i is row r * order + i.
@@ -235,24 +246,6 @@ def candidate_rss(
     _subtract_squares(gram[:, :], on_frozen[:, :n_frozen], 0)
     residual = frozen[n_frozen]
     return float(_dot(residual, residual, 0, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
-
-
-@numba.njit(cache=True)
-def cost_of_point(
-    unit: Any,
-    n_real: int,
-    low: Any,
-    high: Any,
-    raw: bool,
-    drive: Any,
-    frozen: Any,
-    starts: Any,
-    local_q: Any,
-    free: bool,
-) -> float:
-    """`candidate_rss` at a point (D,) of the unit cube of a search space."""
-    blocks = blocks_of_point(unit, n_real, low, high, raw)
-    return float(candidate_rss(blocks, n_real, drive, frozen, starts, local_q, free))
 
 
 @numba.njit(cache=True)
