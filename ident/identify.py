@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ident.basis.miso_model import MisoModel
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
@@ -18,7 +19,6 @@ from ident.checks.integrators_prior import integrators_test
 from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
 from ident.checks.plausible_modes import implausible_pairs
 from ident.checks.prior_tests import (
-    Fitted,
     best_under_relative_degree,
     delay_test,
     direct_term_test,
@@ -30,13 +30,13 @@ from ident.coloured_noise import identify_in_noise
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.finding import Finding, PriorTest
-from ident.fit.least_squares import LinearFit, Regression, fit
-from ident.fit.refinement import Bounds, Refined, free_optimality
+from ident.fit.least_squares import Regression, fit
+from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification
 from ident.search.order_selection import OrderSelection, Progress, silent
-from ident.search.pole_search import PoleSearch
+from ident.search.pole_search import Fitted, PoleSearch
 from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import PolishedMinimum, SearchTrace
 
@@ -88,12 +88,22 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, part = searched(records, data, options, report)
-    data, best, verdicts = fitted_on_all(records, outcome)
+    fitted, verdicts = fitted_on_all(records, outcome)
     report(0.9, "tests of what is stated as known")
-    data, best, tests = _priors_judged(records, part, outcome, data, best)
-    result = _result(records, data, best, outcome, verdicts, tests)
+    fitted, tests = _priors_judged(records, part, outcome, fitted)
+    model, found = description(records, outcome, fitted)
+    refused = tuple(
+        test.finding for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
+    )
+    only = model.channel(0)
     report(1.0, "identified")
-    return result
+    return Identification(
+        model=only,
+        verdicts=(*verdicts, *(test.finding for test in tests)),
+        prior_tests=tests,
+        advise=partial(_advice, tuple(records), fitted, only, found["residuals"], refused),
+        **found,
+    )
 
 
 def least_order(options: IdentOptions) -> int:
@@ -121,17 +131,14 @@ def searched(
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(Fitted):
     """A search that has come to an end on one structure.
 
     `from_rest` is the test that left the initial states out; where it took a descent with them, `free` is its
     end.
     """
 
-    data: Regression
-    search: PoleSearch
     selection: OrderSelection
-    best: Refined
     free: Refined | None = None
     from_rest: NuisanceTest | None = None
 
@@ -141,7 +148,7 @@ def _searched(
 ) -> Outcome:
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
-    return Outcome(data, search, selection, selection.run(start))
+    return Outcome(search, selection.run(start), selection)
 
 
 def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, report: Progress) -> Outcome:
@@ -149,7 +156,7 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, re
     them."""
     data, options = outcome.data, outcome.search.options
     free = restructured(records, data, replace(data.structure, estimate_initial_state=True))
-    without = outcome.best
+    without: Fitted = outcome
     if not free.n_samples > free.n_parameters(max(without.poles.order, 4)):
         return outcome
     search = PoleSearch(free, options)
@@ -160,75 +167,56 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, re
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         end = search.joint(n_real, min(1, most_pairs))
-        without = PoleSearch(data, options).descend(end.poles, "from rest")
+        rest = PoleSearch(data, options)
+        without = Fitted(rest, rest.descend(end.poles, "from rest"))
     else:
-        if without.poles.order > 0 and (
-            clear := clearly_left_out(
-                "initial state",
-                (data, without),
-                free,
-                search.bounds,
-                search.fixed,
-                outcome.selection.worth(without),
-            )
-        ):
+        if without.poles.order > 0 and (clear := clearly_left_out("initial state", without, free)):
             return replace(outcome, from_rest=clear)
-        end = search.descend(without.poles, "with initial state")
-        polished = end
+        end = polished = search.descend(without.poles, "with initial state")
         # Transients no larger than the noise leave the search from rest its bearings: go on from its poles.
-        start = end if without.rss < _MISLED * end.rss else None
-    if end.poles.order == 0 or not nuisance_test("initial state", (data, without), (free, end)).needed:
+        start = end if without.end.rss < _MISLED * end.rss else None
+    if end.poles.order == 0 or not nuisance_test("initial state", without, Fitted(search, end)).needed:
         return replace(outcome, free=polished)
     return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
 
 
-def fitted_on_all(
-    records: Sequence[Record], outcome: Outcome
-) -> tuple[Regression, Refined, tuple[Finding, ...]]:
+def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, tuple[Finding, ...]]:
     """Refine on all samples and decide what was left to the data: initial state first, then the offset."""
-    structure, search, best = outcome.data.structure, outcome.search, outcome.best
-    options = search.options
-    if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
-        structure = replace(structure, estimate_initial_state=False)
-    if outcome.data.n_samples == sum(record.n_samples - structure.input_delay_samples for record in records):
-        data = restructured(records, outcome.data, structure)
-    else:
-        data = prepare_inputs(records, structure)
-        best = _moved(data, best, search)
+    options, structure = outcome.search.options, outcome.data.structure
+    here: Fitted = outcome
+    if outcome.data.n_samples < sum(record.n_samples - structure.input_delay_samples for record in records):
+        if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
+            structure = replace(structure, estimate_initial_state=False)
+        here = _moved(outcome, prepare_inputs(records, structure), outcome.poles)
     verdicts = []
-    for name, key, chosen in (
-        ("initial state", "estimate_initial_state", options.estimate_initial_state),
-        ("offset", "estimate_offset", options.estimate_offset),
-    ):
-        if chosen != "auto":
+    for name, key in (("initial state", "estimate_initial_state"), ("offset", "estimate_offset")):
+        if getattr(options, key) != "auto":
             continue
-        if key == "estimate_initial_state" and outcome.from_rest and best is outcome.best:
+        # The search put this question to the very same records.
+        again = key == "estimate_initial_state" and here is outcome
+        if again and outcome.from_rest:
             verdicts.append(outcome.from_rest.finding)
             continue
-        here = (data, best)
-        other_structure = replace(data.structure, **{key: not getattr(data.structure, key)})
-        other_data = restructured(records, data, other_structure)
-        order = best.poles.order
-        if other_data.n_parameters(order) == data.n_parameters(order):
-            continue  # the polynomials that integrators leave free contain the offset
-        if not other_data.n_samples > other_data.n_parameters(order):
+        present = getattr(here.data.structure, key)
+        other = restructured(records, here.data, replace(here.data.structure, **{key: not present}))
+        needed = other.n_parameters(here.poles.order)
+        # With integrators the polynomials that they leave free contain the offset.
+        if needed == here.data.n_parameters(here.poles.order) or not other.n_samples > needed:
             continue
-        if key == "estimate_initial_state" and outcome.free and best is outcome.best:
-            there = (other_data, outcome.free)  # the very same descent was made when the search was judged
+        if again and outcome.free:
+            there = Fitted(PoleSearch(other, options), outcome.free)
         else:
-            there = (other_data, _moved(other_data, best, search))
-        with_it, without = (here, there) if getattr(data.structure, key) else (there, here)
-        known = with_it[1] is outcome.best and with_it[0].structure == outcome.data.structure
-        worth = outcome.selection.worth(outcome.best) if known else None
-        test = nuisance_test(name, without, with_it, worth)
+            there = _moved(outcome, other, here.poles)
+        with_it, without = (here, there) if present else (there, here)
+        test = nuisance_test(name, without, with_it)
         verdicts.append(test.finding)
-        data, best = with_it if test.needed else without
-    return data, best, tuple(verdicts)
+        here = with_it if test.needed else without
+    return here, tuple(verdicts)
 
 
 def _priors_judged(
-    records: Sequence[Record], part: Sequence[Record], outcome: Outcome, data: Regression, best: Refined
-) -> tuple[Regression, Refined, tuple[PriorTest, ...]]:
+    records: Sequence[Record], part: Sequence[Record], outcome: Outcome, fitted: Fitted
+) -> tuple[Fitted, tuple[PriorTest, ...]]:
     """Test what the options state as known, and impose the relative degree.
 
     Each test starts from a model that the data have not refused yet: where the integrators are refused, the
@@ -236,11 +224,11 @@ def _priors_judged(
     """
     options = outcome.search.options
     stated = options.integrators or options.fixed_poles or options.relative_degree is not None
-    if best.poles.order == 0 or not (stated or "input_delay_samples" in options.model_fields_set):
-        return data, best, ()
-    search = PoleSearch(data, options)
+    if fitted.poles.order == 0 or not (stated or "input_delay_samples" in options.model_fields_set):
+        return fitted, ()
+    search = PoleSearch(fitted.data, options)
     search.minima = list(outcome.search.minima)
-    given = judged = Fitted(data, best, search)
+    given = judged = Fitted(search, fitted.end)
     searched = part, outcome.data.structure
     tests: list[PriorTest] = []
     if options.integrators:
@@ -254,12 +242,12 @@ def _priors_judged(
     asked = options.relative_degree
     if asked in (1, "auto"):
         tests.append(direct_term_test(records, judged))
-    relative_degree, end = 1, best
+    relative_degree, end = 1, fitted.end
     trials = (2, 3) if asked == "auto" else (asked,) if asked is not None and asked > 1 else ()
     for trial in trials:
-        if trial > min(best.poles.order, judged.end.poles.order):
+        if trial > min(given.poles.order, judged.poles.order):
             if asked != "auto":
-                tests.append(too_few_poles(trial, best.poles.order))
+                tests.append(too_few_poles(trial, given.poles.order))
             break
         test, constrained = relative_degree_test(judged, trial)
         if asked == "auto" and test.refused:
@@ -271,10 +259,10 @@ def _priors_judged(
     if "input_delay_samples" in options.model_fields_set:
         tests.append(delay_test(records, given, relative_degree))
     if relative_degree > 1:
-        data = replace(data, structure=replace(data.structure, relative_degree=relative_degree))
-        best = end
-        outcome.search.minima.append(PolishedMinimum("relative degree", best.poles, best.rss))
-    return data, best, tuple(tests)
+        structure = replace(fitted.data.structure, relative_degree=relative_degree)
+        fitted = Fitted(PoleSearch(replace(fitted.data, structure=structure), options), end)
+        outcome.search.minima.append(PolishedMinimum("relative degree", end.poles, end.rss))
+    return fitted, tuple(tests)
 
 
 def in_order(poles: Poles, fixed: Poles) -> Poles:
@@ -287,70 +275,42 @@ def in_order(poles: Poles, fixed: Poles) -> Poles:
     )
 
 
-def _moved(data: Regression, best: Refined, search: PoleSearch) -> Refined:
-    """The best poles polished on other rows or columns; noted in the trace of the search."""
-    other = PoleSearch(data, search.options)
-    end = other.descend(best.poles, "final polish")
-    search.minima += other.minima
-    search.evaluations += other.evaluations
-    return end
-
-
-def _result(
-    records: Sequence[Record],
-    data: Regression,
-    best: Refined,
-    outcome: Outcome,
-    verdicts: tuple[Finding, ...],
-    tests: tuple[PriorTest, ...],
-) -> Identification:
-    options, fixed = outcome.search.options, outcome.search.fixed
-    poles = in_order(best.poles, fixed)
-    degree = data.structure.relative_degree
-    linear = structured_fit(data, poles, degree) if degree > 1 else fit(data, poles)
-    bounds = Bounds.from_options(options, data.longest, data.dt_s)
-    model = GobfModel(
-        poles=poles,
-        coefficients=linear.coefficients[0],
-        dt_s=data.dt_s,
-        feedthrough=float(linear.feedthrough[0]),
-        integrators=options.integrators,
-        input_delay_samples=options.input_delay_samples,
-        input_name=records[0].input_names[0],
-        output_name=records[0].output_names[0],
-    )
-    if degree > 1:
-        optimality = UnderRelativeDegree(data, degree, fixed).optimality(poles, bounds)
-    else:
-        optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, fixed)
-    refused = tuple(
-        test.finding for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
-    )
-    described = description(records, data, poles, linear, outcome, optimality)
-    residuals = described["residuals"]
-    return Identification(
-        model=model,
-        verdicts=(*verdicts, *(test.finding for test in tests)),
-        prior_tests=tests,
-        advise=partial(_advice, tuple(records), data, model, residuals, fixed, bounds, refused),
-        **described,
-    )
+def _moved(outcome: Outcome, data: Regression, poles: Poles) -> Fitted:
+    """The poles polished on other rows or columns; noted in the trace of the search."""
+    search = PoleSearch(data, outcome.search.options)
+    end = search.descend(poles, "final polish")
+    outcome.search.minima += search.minima
+    outcome.search.evaluations += search.evaluations
+    return Fitted(search, end)
 
 
 def description(
-    records: Sequence[Record],
-    data: Regression,
-    poles: Poles,
-    linear: LinearFit,
-    outcome: Outcome,
-    optimality: float,
-) -> dict[str, Any]:
-    """Fields of `ident.identification.FittedRecords` that are read from the fit and the search."""
-    search = outcome.search
+    records: Sequence[Record], outcome: Outcome, fitted: Fitted
+) -> tuple[MisoModel, dict[str, Any]]:
+    """The model, and the fields of `ident.identification.FittedRecords` that are read from fit and search."""
+    data, search, options = fitted.data, outcome.search, outcome.search.options
+    degree = data.structure.relative_degree
+    poles, bounds = in_order(fitted.poles, search.fixed), fitted.search.bounds
+    if degree > 1:
+        linear = structured_fit(data, poles, degree)
+        optimality = UnderRelativeDegree(data, degree, search.fixed).optimality(poles, bounds)
+    else:
+        linear = fit(data, poles)
+        optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, search.fixed)
+    model = MisoModel(
+        poles=poles,
+        coefficients=linear.coefficients,
+        feedthrough=linear.feedthrough,
+        dt_s=data.dt_s,
+        input_names=records[0].input_names,
+        output_name=records[0].output_names[0],
+        integrators=options.integrators,
+        input_delay_samples=options.input_delay_samples,
+    )
     residuals = tuple(linear.residual[here] for here in data.segments)
     spread = [np.linalg.norm(data.y[here] - data.y[here].mean()) for here in data.segments]
-    unknowns = data.n_parameters(poles.order) - (data.structure.relative_degree - 1)
-    return {
+    unknowns = data.n_parameters(poles.order) - (degree - 1)
+    return model, {
         "structure": data.structure,
         "record_names": tuple(record.name for record in records),
         "residuals": residuals,
@@ -360,7 +320,7 @@ def description(
         "rss": linear.rss,
         "noise_std": float(np.sqrt(linear.rss / (data.n_samples - unknowns))),
         "tangent_optimality": optimality,
-        "order_table": outcome.selection.table(outcome.best),
+        "order_table": outcome.selection.table(outcome.end),
         "n_fixed": search.fixed.counts,
         "search": SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
     }
@@ -368,14 +328,13 @@ def description(
 
 def _advice(
     records: tuple[Record, ...],
-    data: Regression,
+    fitted: Fitted,
     model: GobfModel,
     residuals: tuple[RealArray, ...],
-    fixed: Poles,
-    bounds: Bounds,
     refused: tuple[Finding, ...],
 ) -> list[Finding]:
     """All that `Identification.warnings` has to say."""
+    data, fixed, bounds = fitted.data, fitted.search.fixed, fitted.search.bounds
     return [
         *advice(records, data, model, residuals, fixed),
         *pole_warnings(model.poles, fixed, bounds, data.dt_s),

@@ -10,19 +10,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
+import numpy as np
+
 from ident.basis.miso_model import MisoModel
 from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
 from ident.checks.input_checks import few_samples, least_independence, refuse_unusable
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.finding import Finding, FindingKind, finding
-from ident.fit.least_squares import Regression, fit
-from ident.fit.refinement import Bounds, free_optimality
 from ident.fit.regression import prepare_inputs
 from ident.identification import MisoIdentification
-from ident.identify import description, fitted_on_all, in_order, least_order, searched
+from ident.identify import description, fitted_on_all, least_order, searched
 from ident.search.order_selection import Progress, silent
+from ident.search.pole_search import Fitted
 from ident.search.pole_warnings import pole_warnings
 
 # Where a combination of the inputs has less of the power the channels are told apart badly.
@@ -70,37 +70,21 @@ def identify_miso(
     data = prepare_inputs(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, _ = searched(records, data, options, report)
-    data, best, verdicts = fitted_on_all(records, outcome)
-    fixed, poles = outcome.search.fixed, in_order(best.poles, outcome.search.fixed)
-    bounds = Bounds.from_options(options, data.longest, data.dt_s)
-    linear = fit(data, poles)
-    model = MisoModel(
-        poles=poles,
-        coefficients=linear.coefficients,
-        feedthrough=linear.feedthrough,
-        dt_s=data.dt_s,
-        input_names=records[0].input_names,
-        output_name=records[0].output_names[0],
-        integrators=options.integrators,
-        input_delay_samples=options.input_delay_samples,
-    )
-    optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, fixed)
+    fitted, verdicts = fitted_on_all(records, outcome)
+    model, found = description(records, outcome, fitted)
     report(1.0, "identified")
     return MisoIdentification(
-        model=model,
-        verdicts=verdicts,
-        advise=partial(_advice, data, model, linear.residual, fixed, bounds),
-        **description(records, data, poles, linear, outcome, optimality),
+        model=model, verdicts=verdicts, advise=partial(_advice, fitted, model, found["residuals"]), **found
     )
 
 
-def _advice(
-    data: Regression, model: MisoModel, residual: RealArray, fixed: Poles, bounds: Bounds
-) -> list[Finding]:
-    found = pole_warnings(model.poles, fixed, bounds, data.dt_s) + few_samples(data, model.order)
+def _advice(fitted: Fitted, model: MisoModel, residuals: tuple[RealArray, ...]) -> list[Finding]:
+    data, search = fitted.data, fitted.search
+    found = pole_warnings(model.poles, search.fixed, search.bounds, data.dt_s)
+    found += few_samples(data, model.order)
     if least_independence(data) < _ALIKE_INPUT:
         found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
-    worth = data.colour(residual).effective_samples
+    worth = data.colour(np.concatenate(residuals)).effective_samples
     if worth < _COLOURED * data.n_samples:
         found.append(finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=worth))
     return found

@@ -9,13 +9,13 @@ import numpy as np
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
-from ident.checks.prior_tests import ROUGH, Fitted, judged, limit, statistic
+from ident.checks.prior_tests import ROUGH, judged, limit, statistic
 from ident.data.record import Record
 from ident.finding import FindingKind, PriorTest
 from ident.fit.least_squares import Regression
 from ident.fit.regression import prepare
 from ident.search.order_selection import OrderSelection
-from ident.search.pole_search import PoleSearch
+from ident.search.pole_search import Fitted, PoleSearch
 
 # Slow poles that freed integrators start from, as decays over the whole record.
 _SLOW_STARTS = {
@@ -62,7 +62,7 @@ def _without_integrators(
     records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
 ) -> Fitted:
     k, fixed = given.data.structure.integrators, given.search.fixed
-    plain = given.end.poles
+    plain = given.poles
     others = Poles(plain.real[k:], plain.pairs)
     n_real = plain.real.size - fixed.real.size + k
     n_pairs = plain.pairs.size - fixed.pairs.size
@@ -87,21 +87,20 @@ def _without_integrators(
     ends = [small.descend(start, "integrators freed", ROUGH) for start in starts]
     ends.append(OrderSelection(small).run())
     best = min(ends, key=lambda end: end.rss)
-    data = prepared(records, given.data.structure)
-    search = PoleSearch(data, options)
+    search = PoleSearch(prepared(records, given.data.structure), options)
     search.evaluations = small.evaluations
-    return Fitted(data, search.descend(best.poles, "integrators freed"), search)
+    return Fitted(search, search.descend(best.poles, "integrators freed"))
 
 
 def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
     """Statistic of `fewer` integrators against none: the slowest real poles of the free fit become theirs."""
     n_fixed = free.search.fixed.real.size
-    own = np.sort(free.end.poles.real[n_fixed:])
+    own = np.sort(free.poles.real[n_fixed:])
     if own.size < fewer:
         return np.inf
     start = Poles(
-        np.concatenate([np.zeros(fewer), free.end.poles.real[:n_fixed], own[: own.size - fewer]]),
-        free.end.poles.pairs,
+        np.concatenate([np.zeros(fewer), free.poles.real[:n_fixed], own[: own.size - fewer]]),
+        free.poles.pairs,
     )
     return statistic(free.refitted(records, start, integrators=fewer).end.rss, free)
 
@@ -111,7 +110,7 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, f
     needed."""
     k = given.data.structure.integrators
     one = 2 * float(np.log(given.worth()))
-    others = Poles(given.end.poles.real[k:], given.end.poles.pairs)
+    others = Poles(given.poles.real[k:], given.poles.pairs)
     found: tuple[int, float, float] | None = None
     for fewer in range(k - 1, -1, -1):
         if others.order + fewer == 0:
@@ -131,7 +130,7 @@ def _other_pole_to_spare(given: Fitted, price: float) -> bool:
 
     Then the pole too many was another one: it can take the place of an integrator, or a pair that of two.
     """
-    poles, fixed = given.end.poles, given.search.fixed
+    poles, fixed = given.poles, given.search.fixed
     fewer = [(poles.without_real(i), price) for i in range(fixed.real.size, poles.real.size)]
     fewer += [(poles.without_pair(i), 2 * price) for i in range(fixed.pairs.size, poles.pairs.size)]
     return any(

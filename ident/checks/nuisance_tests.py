@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from ident.basis.poles import Poles
 from ident.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression
-from ident.fit.refinement import Bounds, Refined, free_optimality
+from ident.fit.refinement import free_optimality
+from ident.search.pole_search import Fitted
 
 # A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
 NUISANCE_LEVEL = 0.99
@@ -56,42 +56,27 @@ class NuisanceTest:
         )
 
 
-def nuisance_test(
-    name: str,
-    without: tuple[Regression, Refined],
-    with_it: tuple[Regression, Refined],
-    worth: float | None = None,
-) -> NuisanceTest:
-    """Likelihood ratio of two optima; `worth` of the residual with the nuisance, if it is known."""
-    data, end = with_it
-    if worth is None:
-        worth = data.colour(data.residual(end.poles)).effective_samples
-    ratio = max(without[1].rss, 1e-300) / max(end.rss, 1e-300)
-    return NuisanceTest(name, _columns(without, data), float(worth * np.log(ratio)))
+def nuisance_test(name: str, without: Fitted, with_it: Fitted) -> NuisanceTest:
+    """Likelihood ratio of two optima."""
+    ratio = max(without.end.rss, 1e-300) / max(with_it.end.rss, 1e-300)
+    return NuisanceTest(name, _columns(without, with_it.data), float(with_it.worth() * np.log(ratio)))
 
 
-def clearly_left_out(
-    name: str,
-    without: tuple[Regression, Refined],
-    with_it: Regression,
-    bounds: Bounds,
-    fixed: Poles,
-    worth: float,
-) -> NuisanceTest | None:
+def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> NuisanceTest | None:
     """The score test if it leaves no doubt that the nuisance is not needed, else None: descend and compare.
 
-    No doubt: well below the limit even if each of the N samples counted; `worth` of the residual without the
-    nuisance, for the statistic that is shown.
+    No doubt: well below the limit even if each of the N samples counted. The statistic that is shown counts
+    what the residual without the nuisance is worth.
     """
-    end = without[1]
-    here = with_it.linearise(*end.poles.writable())
-    share = free_optimality(here, end.poles, bounds, fixed)
+    poles, search = without.poles, without.search
+    here = with_it.linearise(*poles.writable())
+    share = free_optimality(here, poles, search.bounds, search.fixed)
     promised = here.rss * (1 - share**2)
-    gain = float(np.log(max(end.rss, 1e-300) / max(promised, 1e-300)))
-    test = NuisanceTest(name, _columns(without, with_it), worth * gain)
+    gain = float(np.log(max(without.end.rss, 1e-300) / max(promised, 1e-300)))
+    test = NuisanceTest(name, _columns(without, with_it), without.worth() * gain)
     return test if with_it.n_samples * gain < _CLEARLY_BELOW * test.limit else None
 
 
-def _columns(without: tuple[Regression, Refined], with_it: Regression) -> int:
-    order = without[1].poles.order
-    return with_it.n_parameters(order) - without[0].n_parameters(order)
+def _columns(without: Fitted, with_it: Regression) -> int:
+    order = without.poles.order
+    return with_it.n_parameters(order) - without.data.n_parameters(order)

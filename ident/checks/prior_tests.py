@@ -13,8 +13,7 @@ was left to the data (`relative_degree = "auto"`) is imposed only as far as the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -29,38 +28,10 @@ from ident.fit.refinement import Refined
 from ident.fit.regression import prepare
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.search.order_selection import OrderSelection
-from ident.search.pole_search import PoleSearch
+from ident.search.pole_search import Fitted, PoleSearch
 
 # Descents that only compare starts stop when this fraction of J is left to gain.
 ROUGH = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """An optimum on all samples, and the search (options, bounds, trace) it belongs to."""
-
-    data: Regression
-    end: Refined
-    search: PoleSearch
-
-    @property
-    def residual(self) -> RealArray:
-        return self.data.residual(self.end.poles)
-
-    def worth(self) -> float:
-        """Independent samples that the residual is worth."""
-        return self.data.colour(self.residual).effective_samples
-
-    def refitted(self, records: Sequence[Record], start: Poles, **changed: Any) -> Fitted:
-        """The optimum from `start` with other settings, which structure and options call by the same names.
-
-        Where the rows are the same their nuisances are, so that both sides of a comparison have them.
-        """
-        data = prepare(records, replace(self.data.structure, **changed))
-        if data.n_samples == self.data.n_samples:
-            data = replace(data, polynomials=self.data.polynomials)
-        search = PoleSearch(data, self.search.options.model_copy(update=changed))
-        return Fitted(data, search.descend(start, "other structure"), search)
 
 
 def statistic(rss_with_prior: float, without: Fitted) -> float:
@@ -89,7 +60,7 @@ def fixed_poles_test(
     records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
 ) -> PriorTest:
     """Poles fixed by the user against as many free ones, from where they are and searched anew."""
-    k, fixed, poles = given.data.structure.integrators, given.search.fixed, given.end.poles
+    k, fixed, poles = given.data.structure.integrators, given.search.fixed, given.poles
     options = given.search.options.model_copy(
         update={
             "fixed_poles": (),
@@ -101,9 +72,9 @@ def fixed_poles_test(
     ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small).run()]
     best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
-    freed = Fitted(given.data, search.descend(best.poles, "fixed poles freed"), search)
-    real = ", ".join(f"{a:.6g}" for a in np.sort(freed.end.poles.real[k:]))
-    pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.end.poles.pairs)
+    freed = Fitted(search, search.descend(best.poles, "fixed poles freed"))
+    real = ", ".join(f"{a:.6g}" for a in np.sort(freed.poles.real[k:]))
+    pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.poles.pairs)
     return judged(
         FindingKind.FIXED_POLES,
         "fixed_poles",
@@ -128,13 +99,13 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
     for other in (delay - 1, delay + 1):
         if other < 0:
             continue
-        shifted = given.refitted(records, given.end.poles, input_delay_samples=other)
+        shifted = given.refitted(records, given.poles, input_delay_samples=other)
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
         residuals = [
             item.residual
             if structure.feedthrough  # which a relative degree of 1, the least there is, would refuse
-            else structured_fit(item.data, item.end.poles, relative_degree).residual
+            else structured_fit(item.data, item.poles, relative_degree).residual
             for item in (given, shifted)
         ]
         common = max(delay, other)
@@ -156,7 +127,7 @@ def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
 
 def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
     """Relative degree 1 (no direct term) against a model with one."""
-    free = given.refitted(records, given.end.poles, feedthrough=True)
+    free = given.refitted(records, given.poles, feedthrough=True)
     return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(given.end.rss, free), 1)
 
 
@@ -190,7 +161,7 @@ def too_few_poles(relative_degree: int, order: int) -> PriorTest:
 
 def best_under_relative_degree(free: Fitted, relative_degree: int) -> Refined:
     """Best descent under the relative degree from the free optimum and the next two other ones."""
-    search, poles = free.search, free.end.poles
+    search, poles = free.search, free.poles
     starts = [poles]
     for minimum in sorted(search.minima, key=lambda item: item.rss):
         other = minimum.poles

@@ -10,6 +10,7 @@ import numpy as np
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.fit.least_squares import EXPLAINED
+from ident.fit.problem import PoleProblem
 from ident.fit.refinement import Refined
 from ident.search.pole_search import GAIN, PoleSearch
 
@@ -49,7 +50,7 @@ class OrderStep:
 class OrderSelection:
     """Grows and prunes the set of poles of one search."""
 
-    def __init__(self, search: PoleSearch, progress: Progress = silent) -> None:
+    def __init__(self, search: PoleSearch[PoleProblem], progress: Progress = silent) -> None:
         self.search = search
         self.options: IdentOptions = search.options
         self.progress = progress
@@ -104,10 +105,6 @@ class OrderSelection:
         ]
         return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
 
-    def worth(self, end: Refined) -> float:
-        """Independent samples that the residual of an end is worth."""
-        return self.search.colour(end).effective_samples
-
     def _grow_pairs(self, best: Refined, most_pairs: int) -> Refined:
         while (count := self._counts(best)[1]) < most_pairs and self._visible(best):
             self.progress(0.1 + 0.8 * count / max(most_pairs, 1), f"search for pole pair {count + 1}")
@@ -155,7 +152,7 @@ class OrderSelection:
 
     def _criterion(self, end: Refined) -> Criterion:
         """The criterion read from the residual of this model."""
-        return self.search.data.criterion(end.rss, end.poles.order, self.worth(end))
+        return self.search.data.criterion(end.rss, end.poles.order, self.search.colour(end).effective_samples)
 
     def _better(self, trial: Refined, best: Refined) -> bool:
         """Is the larger trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne (design 4.3)."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import combinations_with_replacement, cycle, islice, pairwise
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -13,11 +15,16 @@ from ident.basis.coordinates import SearchSpace, search_space
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.least_squares import Regression
 from ident.fit.problem import CandidateCost, PoleProblem
 from ident.fit.refinement import FAR, NEAR, Bounds, Refined, refine
+from ident.fit.regression import prepare
 from ident.fit.residual_colour import ResidualColour
 from ident.search.direct import best_apart, minimise
 from ident.search.search_trace import PolishedMinimum, SearchStage
+
+Problem = TypeVar("Problem", bound=PoleProblem, covariant=True)
 
 # A rescan or an exchange has to gain this fraction of J to count.
 GAIN = 1e-6
@@ -43,13 +50,13 @@ _SAME_POLE = 0.1
 _LITTLE_NOISE = 0.02
 
 
-class PoleSearch:
+class PoleSearch(Generic[Problem]):
     """The search on one problem; collects the trace on the way.
 
     The fixed poles come first among the poles of each type and are never moved.
     """
 
-    def __init__(self, data: PoleProblem, options: IdentOptions) -> None:
+    def __init__(self, data: Problem, options: IdentOptions) -> None:
         self.data = data
         self.options = options
         self.fixed = options.fixed()
@@ -246,6 +253,41 @@ class PoleSearch:
         self.evaluations += cost.evaluations
         self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
         return best_apart(points, costs, count)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An optimum, and the search (records, options, bounds, trace) it belongs to."""
+
+    search: PoleSearch[Regression]
+    end: Refined
+
+    @property
+    def data(self) -> Regression:
+        return self.search.data
+
+    @property
+    def poles(self) -> Poles:
+        return self.end.poles
+
+    @property
+    def residual(self) -> RealArray:
+        return self.data.residual(self.poles)
+
+    def worth(self) -> float:
+        """Independent samples that the residual is worth."""
+        return self.search.colour(self.end).effective_samples
+
+    def refitted(self, records: Sequence[Record], start: Poles, **changed: Any) -> Fitted:
+        """The optimum from `start` with other settings, which structure and options call by the same names.
+
+        Where the rows are the same their nuisances are, so that both sides of a comparison have them.
+        """
+        data = prepare(records, replace(self.data.structure, **changed))
+        if data.n_samples == self.data.n_samples:
+            data = replace(data, polynomials=self.data.polynomials)
+        search = PoleSearch(data, self.search.options.model_copy(update=changed))
+        return Fitted(search, search.descend(start, "other structure"))
 
 
 def _rates(poles: Poles) -> list[float]:

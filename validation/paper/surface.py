@@ -21,6 +21,7 @@ from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import fit
+from ident.fit.problem import PoleProblem
 from ident.fit.refinement import refine
 from ident.fit.regression import prepare
 from ident.identify import identify
@@ -193,7 +194,7 @@ def _costs(record: Record, options: IdentOptions, evaluations: int) -> dict[tupl
     return found
 
 
-def direct_alone(search: PoleSearch, evaluations: int) -> Poles:
+def direct_alone(search: PoleSearch[PoleProblem], evaluations: int) -> Poles:
     """The paper's search: the best point DIRECT looked at; no descent."""
     options = search.options
     space = search.space(options.n_real or 0, options.n_pairs or 0)
