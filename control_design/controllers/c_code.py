@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
+from functools import cache
+from importlib.resources import files
+from string import Template
+from typing import Any, Literal
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Real
 
 Number = Literal["double", "float"]
+
+_INPUT_LIMIT = """\
+    if (command > INPUT_LIMIT) command = INPUT_LIMIT;
+    if (command < -INPUT_LIMIT) command = -INPUT_LIMIT;
+"""
+_RATE_LIMIT = """\
+    if (command > state->last + LARGEST_CHANGE) command = state->last + LARGEST_CHANGE;
+    if (command < state->last - LARGEST_CHANGE) command = state->last - LARGEST_CHANGE;
+"""
 
 
 def c_header(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
@@ -19,7 +31,15 @@ def c_header(controller: Controller, prefix: str = "controller", number: Number 
     ValueError
         If names that start with the prefix are no C identifiers.
     """
-    return _header(controller, _checked(prefix), number)
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix):
+        raise ValueError(f"prefix must be a C identifier; got {prefix!r}")
+    return _template("controller.h.in").substitute(
+        about=re.sub(r"[^ -~]|\*/", "?", controller.name),
+        delay=controller.computational_delay_samples,
+        dt_s=repr(controller.dt_s),
+        guard=f"{prefix.upper()}_H",
+        **_names(controller, prefix, number),
+    )
 
 
 def c_source(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
@@ -52,11 +72,8 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     real-time loop that writes its command one sample later has it by itself. Not covered: fixed point, and an
     error that is not finite (the command then is not finite either: check the sensor before the call).
     """
-    name = _checked(prefix)
-    n = controller.order
     assert controller.anti_windup_gain is not None
     suffix = "f" if number == "float" else ""
-    size = max(n, 1)  # C has no arrays of length zero
 
     def literal(value: float) -> str:
         # The shortest decimal that reads back as the same double.
@@ -64,79 +81,34 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         return text + suffix if any(mark in text for mark in ".e") else f"{text}.0{suffix}"
 
     def vector(values: Real) -> str:
-        return "{" + ", ".join(literal(value) for value in values) + "}" if n else "{" + literal(0.0) + "}"
+        return "{" + ", ".join(literal(value) for value in (values if values.size else [0.0])) + "}"
 
-    rows = ",\n    ".join(vector(row) for row in controller.A) if n else vector(controller.C[0])
-    lines = [
-        _header(controller, name, number),
-        f"static const {number} A[{size}][{size}] = {{\n    {rows}}};",
-        f"static const {number} B[{size}] = {vector(controller.B[:, 0])};",
-        f"static const {number} C[{size}] = {vector(controller.C[0])};",
-        f"static const {number} D = {literal(float(controller.D[0, 0]))};",
-        f"static const {number} M[{size}] = {vector(controller.anti_windup_gain[:, 0])};",
-    ]
+    constants, limits = "", ""
     if controller.input_limit is not None:
-        lines.append(f"static const {number} INPUT_LIMIT = {literal(controller.input_limit)};")
+        constants = f"static const {number} INPUT_LIMIT = {literal(controller.input_limit)};\n"
+        limits = _INPUT_LIMIT
     if controller.rate_limit is not None:
-        change = controller.rate_limit * controller.dt_s
-        lines.append(f"static const {number} LARGEST_CHANGE = {literal(change)};  /* rate_limit * dt_s */")
-    limits = []
-    if controller.rate_limit is not None:
-        limits += [
-            "    if (command > state->last + LARGEST_CHANGE) command = state->last + LARGEST_CHANGE;",
-            "    if (command < state->last - LARGEST_CHANGE) command = state->last - LARGEST_CHANGE;",
-        ]
-    if controller.input_limit is not None:
-        limits += [
-            "    if (command > INPUT_LIMIT) command = INPUT_LIMIT;",
-            "    if (command < -INPUT_LIMIT) command = -INPUT_LIMIT;",
-        ]
-    lines += [
-        f"\nvoid {name}_reset({name}_state *state)\n{{",
-        f"    for (int i = 0; i < {size}; i++) state->x[i] = 0;",
-        "    state->last = 0;\n    state->limited = 0;\n}",
-        f"\n{number} {name}_step({name}_state *state, {number} error)\n{{",
-        f"    {number} next[{size}];",
-        f"    {number} wanted = 0;",
-        f"    for (int i = 0; i < {n}; i++) wanted += C[i] * state->x[i];",
-        "    wanted += D * error;",
-        f"    {number} command = wanted;",
-        *limits,
-        "    state->limited = command != wanted;",
-        f"    for (int i = 0; i < {n}; i++) {{",
-        f"        {number} sum = 0;",
-        f"        for (int j = 0; j < {n}; j++) sum += A[i][j] * state->x[j];",
-        "        next[i] = sum + B[i] * error + M[i] * (command - wanted);",
-        "    }",
-        f"    for (int i = 0; i < {n}; i++) state->x[i] = next[i];",
-        "    state->last = command;\n    return command;\n}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _header(controller: Controller, name: str, number: Number) -> str:
-    guard = f"{name.upper()}_H"
-    delay = controller.computational_delay_samples
-    about = re.sub(r"[^ -~]|\*/", "?", controller.name)
-    return "\n".join(
-        [
-            f"/* {about}: order {controller.order}, one call every {controller.dt_s!r} s.",
-            "   u = C x + D e limited; x+ = A x + B e + M (u_limited - u); e = reference - measurement.",
-            f"   Designed for a command that takes effect {delay} sample(s) after its measurement. */",
-            f"#ifndef {guard}\n#define {guard}",
-            "typedef struct {",
-            f"    {number} x[{max(controller.order, 1)}];",
-            f"    {number} last;  /* previous command */",
-            "    int limited;  /* 1 while a limit was active in the last call */",
-            f"}} {name}_state;",
-            f"void {name}_reset({name}_state *state);",
-            f"{number} {name}_step({name}_state *state, {number} error);",
-            "#endif\n",
-        ]
+        change = literal(controller.rate_limit * controller.dt_s)
+        constants += f"static const {number} LARGEST_CHANGE = {change};  /* rate_limit * dt_s */\n"
+        limits = _RATE_LIMIT + limits
+    return _template("controller.c.in").substitute(
+        header=c_header(controller, prefix, number),
+        A=",\n    ".join(vector(row) for row in controller.A) or vector(controller.C[0]),
+        B=vector(controller.B[:, 0]),
+        C=vector(controller.C[0]),
+        D=literal(float(controller.D[0, 0])),
+        M=vector(controller.anti_windup_gain[:, 0]),
+        constants=constants,
+        limits=limits,
+        **_names(controller, prefix, number),
     )
 
 
-def _checked(prefix: str) -> str:
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix):
-        raise ValueError(f"prefix must be a C identifier; got {prefix!r}")
-    return prefix
+def _names(controller: Controller, prefix: str, number: Number) -> dict[str, Any]:
+    # C has no arrays of length zero.
+    return {"name": prefix, "number": number, "order": controller.order, "size": max(controller.order, 1)}
+
+
+@cache
+def _template(name: str) -> Template:
+    return Template((files("control_design.controllers") / name).read_text("ascii"))
