@@ -8,7 +8,7 @@ import numpy as np
 
 from control_design.analysis.worst_case import PlantData
 from control_design.plants.ellipses import Real
-from control_design.plants.frequency_grid import GridOptions, dense_grid, lean_grid
+from control_design.plants.frequency_grid import GridOptions, programme_grid
 from control_design.plants.plant_set import Mode, UncertainPlant
 from control_design.specification import Specification
 
@@ -25,9 +25,9 @@ class Grids:
         for plant in plants:
             modes = _grid_modes(plant, specification)
             edges = [edge for asked in specification.weighted(plant) for edge in asked.band or ()]
-            lean = lean_grid(plant, modes, options, edges)
+            lean = programme_grid(plant, modes, options, edges)
             self.grids.append(lean)
-            dense = dense_grid(plant, modes, options, lean)
+            dense = programme_grid(plant, modes, options, lean, dense=True)
             self.dense.append(PlantData.build(plant, specification, dense))
 
     def lean(self, grids: Sequence[Real] | None = None) -> list[PlantData]:

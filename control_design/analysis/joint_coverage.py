@@ -20,7 +20,7 @@ import numpy.typing as npt
 from control_design.analysis.stability import closed_loop_poles, loop_integrators, winds
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Ellipses, Real, radius_of
+from control_design.plants.ellipses import Complex, Real, radius_of
 from control_design.plants.first_order import Intervals
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.guards import Guard, different_responses, guard_grid
@@ -161,7 +161,7 @@ class _Sampled:
         specification: Specification,
         omega_min_rad_s: float,
     ) -> None:
-        self.plant, self.controller = plant, controller
+        self.plant, self.controller, self.specification = plant, controller, specification
         self.draw = _drawn(plant.channel)
         poles = closed_loop_poles(controller, plant)
         modes = (*plant.modes, *modes_of(poles, plant.dt_s), *modes_of(controller.poles, plant.dt_s))
@@ -173,26 +173,14 @@ class _Sampled:
         )
         self.omega_rad_s, self.data = grid, PlantData.build(plant, specification, grid)
         self.unit = self.data.ellipses.scaled(1 / radius_of(plant.level))
-        self.unit_performance: dict[str, Ellipses] = {}
-        for each in self.data.weightings:
-            channel = each.requirement.channel
-            if channel is not None and np.any(each.own > 0):
-                asked = channel.at(grid[each.own > 0])
-                self.unit_performance[each.requirement.name] = asked.scaled(1 / radius_of(channel.level))
         self.loop = controller.response(grid, with_delay=False)
         integrators, unstable = loop_integrators(controller, plant)
         self._required = {"integrators": integrators, "unstable_poles": unstable}
 
     def worst(self, radius: float) -> float:
         """Largest weighted worst case over ellipses of a radius in standard deviations."""
-        weightings = []
-        for each in self.data.weightings:
-            ellipses, channel = self.unit_performance.get(each.requirement.name), each.channel
-            if ellipses is not None and channel is not None:
-                channel = channel.copy()
-                channel[each.own > 0] = ellipses.scaled(radius).farthest()
-            weightings.append(replace(each, channel=channel))
-        data = replace(self.data, ellipses=self.unit.scaled(radius), weightings=tuple(weightings))
+        plant = at_level(self.plant, _level(radius))
+        data = PlantData.build(plant, self.specification, self.omega_rad_s)
         return float(np.max(worst_of(data.weighted(self.loop))))
 
     def gamma_of(self, members: Complex, performance: Responses | None) -> Real:
@@ -236,11 +224,12 @@ class _Sampled:
     def gamma(self, rng: np.random.Generator, draws: int) -> SampledGamma:
         """Draw whole responses and evaluate them."""
         other = None if self.plant.performance is None else _drawn(self.plant.performance)
+        asked = any(each.channel is not None and np.any(each.own > 0) for each in self.data.weightings)
         gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
         for here, count in _chunks(draws):
             responses = self.draw(rng, count)
             members = responses(self.omega_rad_s)
-            performance = None if other is None or not self.unit_performance else other(rng, count)
+            performance = other(rng, count) if other is not None and asked else None
             stable[here] = self.stable_of(responses, members)
             gamma[here] = np.where(stable[here], self.gamma_of(members, performance), np.inf)
             distance[here] = self.distance_of(members)

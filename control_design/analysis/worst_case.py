@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -169,31 +169,17 @@ def worst_case(
     response: controller without delay. Each round puts `inserted` points between the neighbours of the
     `peaks` largest local maxima (ten times finer); plants known on their own grid only are not refined.
     """
-    data = PlantData.build(plant, specification, start)
     omega = np.asarray(start, dtype=np.float64)
-    values = data.weighted(response(omega))
-    ellipses, loop = data.ellipses, response(omega) * data.delay
-    if plant.own_grid is not None:
-        rounds = 0
-    for _ in range(rounds):
-        wanted: list[Real] = []
+    for left in range(rounds if plant.own_grid is None else 0, -1, -1):
+        data, k = PlantData.build(plant, specification, omega), response(omega)
+        values = data.weighted(k)
+        finer = [omega]
         for name, value in values.items():
-            if name == "distance" or not np.any(value > 0):
-                continue
-            for index in local_maxima(value)[:peaks]:
-                low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
-                wanted.append(np.linspace(low, high, inserted + 2)[1:-1])
-        extra = np.setdiff1d(np.concatenate(wanted), omega) if wanted else np.zeros(0)
-        if extra.size == 0:
+            if name != "distance" and np.any(value > 0):
+                for index in local_maxima(value)[:peaks]:
+                    low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
+                    finer.append(np.linspace(low, high, inserted + 2)[1:-1])
+        if left == 0:
             break
-        more = PlantData.build(plant, specification, extra)
-        k = response(extra)
-        added = more.weighted(k)
-        omega = np.concatenate([omega, extra])
-        order = np.argsort(omega, kind="stable")
-        values = {key: np.concatenate([values[key], added[key]])[order] for key in values}
-        loop = np.concatenate([loop, k * more.delay])[order]
-        pairs = ([getattr(e, field.name) for e in (ellipses, more.ellipses)] for field in fields(Ellipses))
-        ellipses = Ellipses(*(np.concatenate(pair)[order] for pair in pairs))
-        omega = omega[order]
-    return WorstCase(omega, ellipses, loop, values)
+        omega = np.unique(np.concatenate(finer))
+    return WorstCase(omega, data.ellipses, k * data.delay, values)

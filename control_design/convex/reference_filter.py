@@ -37,7 +37,7 @@ from control_design.plants.ellipses import (
     distance_to_minus_one,
     largest_ratio,
 )
-from control_design.plants.frequency_grid import GridOptions, dense_grid, lean_grid
+from control_design.plants.frequency_grid import GridOptions, programme_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
 from ident.basis.functions import basis_state_space
@@ -149,9 +149,9 @@ class _Matching:
         self.grids: list[Real] = []
         self.dense: list[Ellipses] = []
         for plant in plants:
-            self.grids.append(lean_grid(plant, plant.modes, options))
+            self.grids.append(programme_grid(plant, plant.modes, options))
             # The check stands on frequencies of its own, not on the programme's.
-            self.dense.append(plant.at(dense_grid(plant, plant.modes, options)))
+            self.dense.append(plant.at(programme_grid(plant, plant.modes, options, dense=True)))
         for plant, ellipses in zip(plants, self.dense, strict=True):
             if not np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1:
                 raise ValueError(

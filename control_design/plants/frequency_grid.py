@@ -55,34 +55,23 @@ def frequency_grid(
     return np.asarray(grid[keep], dtype=np.float64)
 
 
-def lean_grid(
-    plant: UncertainPlant, modes: Sequence[Mode], options: GridOptions, extra: npt.ArrayLike = ()
+def programme_grid(
+    plant: UncertainPlant,
+    modes: Sequence[Mode],
+    options: GridOptions,
+    extra: npt.ArrayLike = (),
+    *,
+    dense: bool = False,
 ) -> Real:
-    """Frequencies of a programme, to begin with."""
+    """Frequencies of a programme, to begin with, or of its dense check."""
+    points = options.grid_points, options.mode_points
+    if dense:
+        points = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
+    low = options.omega_min_rad_s
     grid = frequency_grid(
-        plant.nyquist_rad_s,
-        modes,
-        omega_min_rad_s=options.omega_min_rad_s,
-        n_log=options.grid_points,
-        n_mode=options.mode_points,
-        extra=extra,
+        plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra
     )
-    return plant_grid(plant, grid)
-
-
-def dense_grid(
-    plant: UncertainPlant, modes: Sequence[Mode], options: GridOptions, extra: npt.ArrayLike = ()
-) -> Real:
-    """Frequencies of its dense check."""
-    grid = frequency_grid(
-        plant.nyquist_rad_s,
-        modes,
-        omega_min_rad_s=options.omega_min_rad_s,
-        n_log=int(0.7 * options.dense_points),
-        n_mode=int(0.3 * options.dense_points),
-        extra=extra,
-    )
-    return with_own_grid(plant, grid)
+    return (with_own_grid if dense else plant_grid)(plant, grid)
 
 
 def _outside(own: Real, wanted: Real) -> Real:

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any
@@ -77,17 +77,7 @@ class WorkPool:
 
     def do(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
         """Answers in the order of the tasks. Whoever stops asking leaves the rest undone."""
-        if self._pool is None:
-            for task in tasks:
-                yield self._workshop.do(task)
-            return
-        waiting: list[Future[Candidate]] = [self._pool.submit(_do, task) for task in tasks]
-        try:
-            for future in waiting:
-                yield future.result()
-        finally:
-            for future in waiting:
-                future.cancel()
+        return map(self._workshop.do, tasks) if self._pool is None else self._pool.map(_do, tasks)
 
     def __enter__(self) -> WorkPool:
         return self
