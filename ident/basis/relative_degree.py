@@ -8,7 +8,7 @@ constrained descent needs (`ident.fit.structured_fit`).
 
 The states are [hold, integrators 1/(z - 1)^j, lossless cascade of the other poles], which is block lower
 triangular. A unitary change of the two states of each pair makes it triangular, and the logarithm is taken
-there by repeated square roots; scipy's general one takes a hundred times as long.
+there by repeated square roots and quadrature; scipy's general one takes a hundred times as long.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import comb
 
-from ident.basis.functions import LosslessCascade, basis_state_space
+from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, RealArray
 
@@ -105,38 +105,23 @@ def _functionals(
     if coefficients is not None:
         drive = np.concatenate([coefficients[:k] @ expansion, coefficients[k:]])
         scale = float(np.max(np.abs(drive), initial=0.0)) or 1.0
-        _append(matrix, parts, blocks, drive / scale, size, pairs)
+        at = size
+        for part, block in zip(parts, blocks, strict=True):
+            if block.real.size + block.pairs.size != 1:
+                raise ValueError("a block is one real pole or one pair")
+            here = slice(at, at + block.order)
+            matrix[here, here] = part.A
+            matrix[here, 1:size] = part.B @ (drive / scale)[None, :]
+            pairs += [(at, complex(pole)) for pole in block.pairs]
+            at = here.stop
     change = np.eye(total, dtype=np.complex128)
     for at, pole in pairs:
         change[at : at + 2, at : at + 2] = _schur_vectors(matrix[at : at + 2, at : at + 2], pole)
     triangular = change.conj().T @ matrix @ change
-    vector = np.zeros(total, dtype=np.complex128)
-    vector[0] = 1.0
-    moments = _log_moments(triangular, vector, relative_degree - 1, _NODES, _WEIGHTS)
-    values = (moments @ change.T).real
+    values = (_log_moments(triangular, relative_degree - 1) @ change.T).real
     rows = values[:, 1:size].copy()
     rows[:, :k] = rows[:, :k] @ expansion.T
     return rows, values[:, size:] * scale
-
-
-def _append(
-    matrix: RealArray,
-    parts: list[LosslessCascade],
-    blocks: tuple[Poles, ...],
-    drive: RealArray,
-    at: int,
-    pairs: list[tuple[int, complex]],
-) -> None:
-    """Put each block behind the output drive @ (states 1 ..) into the matrix, from row `at` on."""
-    for part, block in zip(parts, blocks, strict=True):
-        if block.real.size + block.pairs.size != 1:
-            raise ValueError("a block is one real pole or one pair")
-        here = slice(at, at + part.A.shape[0])
-        matrix[here, here] = part.A
-        matrix[here, 1 : 1 + drive.size] = part.B @ drive[None, :]
-        if block.pairs.size:
-            pairs.append((at, complex(block.pairs[0])))
-        at = here.stop
 
 
 def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
@@ -147,53 +132,33 @@ def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
 
 
 @numba.njit(cache=True)
-def _log_moments(matrix: Any, vector: Any, count: int, nodes: Any, weights: Any) -> Any:
-    """log(T)^m v for m = 1 .. count, rows (count, n); T (n, n) complex, lower triangular, no eigenvalue on
-    (-inf, 0]."""
-    n = vector.size
-    root = matrix.copy()
-    factor = 1.0
-    for _ in range(40):
-        largest = 0.0
-        for i in range(n):
-            row = 0.0
-            for j in range(i + 1):
-                row += abs(root[i, j] - (1.0 if i == j else 0.0))
-            largest = max(largest, row)
-        if largest <= _NEAR_IDENTITY:
-            break
-        for i in range(n):
-            root[i, i] = np.sqrt(root[i, i])
-        for gap in range(1, n):
-            for j in range(n - gap):
-                i = j + gap
-                value = root[i, j]
-                for k in range(j + 1, i):
-                    value -= root[i, k] * root[k, j]
-                root[i, j] = value / (root[i, i] + root[j, j])
-        factor *= 2.0
-    for i in range(n):
-        root[i, i] -= 1.0
-    moments = np.zeros((count, n), dtype=np.complex128)
-    present = vector.copy()
-    for m in range(count):
-        product = np.zeros(n, dtype=np.complex128)
-        for i in range(n):
-            for j in range(i + 1):
-                product[i] += root[i, j] * present[j]
-        solved = np.zeros(n, dtype=np.complex128)
-        for q in range(nodes.size):
-            # (I + t X) solved = X v, forward.
-            for i in range(n):
-                value = product[i]
-                for j in range(i):
-                    value -= nodes[q] * root[i, j] * solved[j]
-                solved[i] = value / (1.0 + nodes[q] * root[i, i])
-            for i in range(n):
-                moments[m, i] += factor * weights[q] * solved[i]
-        for i in range(n):
-            present[i] = moments[m, i]
-    return moments
+def _square_root(matrix: Any) -> Any:
+    """Of a lower triangular complex matrix, from the diagonal outwards (scipy's sqrtm loses two digits)."""
+    root = np.zeros_like(matrix)
+    for i in range(len(matrix)):
+        root[i, i] = np.sqrt(matrix[i, i])
+    for gap in range(1, len(matrix)):
+        for j in range(len(matrix) - gap):
+            i = j + gap
+            value = matrix[i, j]
+            for k in range(j + 1, i):
+                value -= root[i, k] * root[k, j]
+            root[i, j] = value / (root[i, i] + root[j, j])
+    return root
+
+
+def _log_moments(matrix: ComplexArray, count: int) -> ComplexArray:
+    """First columns of log(T)^m for m = 1 .. count, rows (count, n); T (n, n) lower triangular, no eigenvalue
+    on (-inf, 0]."""
+    one, root, factor = np.eye(len(matrix)), matrix, 1.0
+    while np.linalg.norm(root - one, np.inf) > _NEAR_IDENTITY:
+        root, factor = _square_root(root), 2 * factor
+    moments = [one[0]]
+    for _ in range(count):
+        product = (root - one) @ moments[-1]
+        parts = np.linalg.solve(one + _NODES[:, None, None] * (root - one), product[:, None])
+        moments.append(factor * _WEIGHTS @ parts[..., 0])
+    return np.array(moments[1:])
 
 
 def null_space(rows: RealArray, column_scale: npt.ArrayLike) -> tuple[RealArray, RealArray]:
