@@ -196,7 +196,7 @@ class _Boundary:
         """Logarithms (R,) of all weighted values, block by block, and, if asked, their slopes (R, n)."""
         bare = self._cascade.response(x, self._omega)
         k = bare * self._delay
-        nearest, _, _ = self._nearest(k)
+        nearest, _, _ = self._worst(k, np.arange(k.size), 0.0)
         back = 1.0 + nearest * k
         distance = -np.log(np.maximum(np.abs(back), 1e-300))
         size = np.log(np.maximum(np.abs(bare), 1e-300))
@@ -206,7 +206,7 @@ class _Boundary:
         for function, at, weight in self._blocks:
             of_k = size[at] if function.of_controller else 0.0
             if function.of_plant:
-                worst, _, _ = self._loudest(k[at], at)
+                worst, _, _ = self._worst(k[at], at, 1.0)
                 here = 1.0 + worst * k[at]
                 gain = np.abs(worst) / np.maximum(np.abs(here), 1e-300)
                 log = np.log(weight * gain) + of_k
@@ -236,69 +236,39 @@ class _Boundary:
             if function.of_controller:
                 of_controller[at] += own
             if function.of_plant:
-                more, factor = self._bent(
-                    relative[at], k[at], own, self._loudest(k[at], at), np.ones(at.size)
-                )
+                member = self._worst(k[at], at, 1.0)
+                more, factor = self._bent(relative[at], k[at], own, member, 1.0)
                 total, second[at] = total + more, second[at] + factor
             else:
                 shared[at] += own
-        more, factor = self._bent(relative, k, shared, self._nearest(k), np.zeros(k.size))
+        member = self._worst(k, np.arange(k.size), 0.0)
+        more, factor = self._bent(relative, k, shared, member, 0.0)
         return total + more + self._section_curvature(x, second + factor + of_controller)
 
     @staticmethod
     def _bent(
-        relative: Complex, k: Complex, share: Real, member: tuple[Complex, Complex, Complex], open_loop: Real
+        relative: Complex, k: Complex, share: Real, member: tuple[Complex, Complex, Complex], open_loop: float
     ) -> tuple[Real, Complex]:
-        """Curvature of sum share (open_loop log|g| - log|1 + g K|) but for that of log K, and the factor of
-        the latter, (F,)."""
-        g, g1, g2 = member
-        back = 1.0 + g * k
-        back = np.where(np.abs(back) < 1e-300, 1e-300, back)
+        """Curvature of sum share log|g^open_loop/(1 + g K)| but for that of log K, and the factor of the
+        latter, (F,)."""
+        g, g1, _ = member
+        back = _not_zero(1.0 + g * k)
         w = g * k / back
         total = -np.real((relative * (share * (w - w**2))[:, None]).T @ relative)
         mixed = -np.real((g1 * k / back**2)[:, None] * relative)
-        safe = np.where(np.abs(g) > 0, g, 1.0)
-        bend = np.real(open_loop * (g2 / safe - (g1 / safe) ** 2) - g2 * k / back + (g1 * k / back) ** 2)
+        bend = _along_boundary(member, k, open_loop)[1]
         use = (bend < -1e-12) & (share > 0)
         total = total + (mixed[use] * (share[use] / -bend[use])[:, None]).T @ mixed[use]
         return total, np.asarray(-share * w, dtype=np.complex128)
 
-    def _nearest(self, k: Complex) -> tuple[Complex, Complex, Complex]:
-        """Members (F,) with the smallest |1 + g K|, and their first and second derivative along the
-        boundary."""
-        everywhere = np.arange(k.size)
-
-        def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
-            back = 1.0 + g * k
-            first = (back.conj() * g1 * k).real
-            return -np.abs(back), -first, -(np.abs(g1 * k) ** 2 + (back.conj() * g2 * k).real)
-
-        return self._worst(everywhere, -np.abs(1.0 + self._members * k[:, None]), newton)
-
-    def _loudest(self, k: Complex, at: npt.NDArray[np.int64]) -> tuple[Complex, Complex, Complex]:
-        """The same for the largest |g/(1 + g K)| at some of the frequencies; k (D,)."""
-        members = self._members[at]
-        ratio = np.abs(members) / np.maximum(np.abs(1.0 + members * k[:, None]), 1e-300)
-
-        def newton(g: Complex, g1: Complex, g2: Complex) -> tuple[Real, Real, Real]:
-            back, safe = 1.0 + g * k, np.where(np.abs(g) > 0, g, 1.0)
-            back = np.where(np.abs(back) < 1e-300, 1e-300, back)
-            first = (g1 / safe - g1 * k / back).real
-            second = (g2 / safe - (g1 / safe) ** 2 - g2 * k / back + (g1 * k / back) ** 2).real
-            return np.abs(g) / np.abs(back), first, second
-
-        return self._worst(at, ratio, newton)
-
     def _worst(
-        self,
-        index: npt.NDArray[np.int64],
-        value: Real,
-        newton: Callable[[Complex, Complex, Complex], tuple[Real, Real, Real]],
+        self, k: Complex, index: npt.NDArray[np.int64], open_loop: float
     ) -> tuple[Complex, Complex, Complex]:
-        """Largest member: best boundary point, vertex of the parabola through it, Newton from there.
+        """Members (D,) with the largest |g^open_loop/(1 + g K)| at some of the frequencies, and their first
+        and second derivative along the boundary; k (D,).
 
-        newton: (value, slope, bend) along the boundary from a member and its derivatives. A point that does
-        not gain on the boundary's best is not taken.
+        Best boundary point, vertex of the parabola through it, Newton from there. A point that does not gain
+        on the boundary's best is not taken.
         """
         e = self._ellipses
         centre, turn = e.centre[index], e.direction[index]
@@ -309,21 +279,23 @@ class _Boundary:
             away = turn * (major * cos + 1j * minor * sin)
             return centre + away, turn * (-major * sin + 1j * minor * cos), -away
 
+        def size(g: Complex, k: Complex) -> Real:
+            return np.asarray(np.abs(g) ** open_loop / np.maximum(np.abs(1.0 + g * k), 1e-300))
+
+        value = size(self._members[index], k[:, None])
         row = np.arange(index.size)
         top = np.argmax(value, axis=1)
         here, before, after = (value[row, (top + step) % _BOUNDARY] for step in (0, -1, 1))
         bend = before - 2 * here + after
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
         width = 2 * np.pi / _BOUNDARY
         best = width * top
-        angle = best + width * np.clip(shift, -0.5, 0.5)
+        angle = best + width * np.clip(_newton(0.5 * (after - before), bend), -0.5, 0.5)
         for _ in range(_REFINEMENTS + 1):
-            found, slope, curve = newton(*member(angle))
-            better = found > here
-            best, here = np.where(better, angle, best), np.where(better, found, here)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                change = np.where(curve < 0, -slope / np.where(curve < 0, curve, -1.0), 0.0)
+            found = member(angle)
+            value = size(found[0], k)
+            better = value > here
+            best, here = np.where(better, angle, best), np.where(better, value, here)
+            change = _newton(*_along_boundary(found, k, open_loop))
             angle = angle + np.clip(change, -0.5 * width, 0.5 * width)
         return member(best)
 
@@ -367,6 +339,25 @@ class _Boundary:
     def _relative_slope(self, x: Real) -> Complex:
         """(dK/dx)/K, (F, n)."""
         return np.concatenate([tops - bottoms for tops, bottoms, _ in self._sections(x)], axis=1)
+
+
+def _not_zero(value: Complex) -> Complex:
+    return np.where(np.abs(value) < 1e-300, 1e-300, value)
+
+
+def _along_boundary(
+    member: tuple[Complex, Complex, Complex], k: Complex, open_loop: float
+) -> tuple[Real, Real]:
+    """Slope and bend of log|g^open_loop/(1 + g K)| along the boundary, from a member and its derivatives."""
+    g, g1, g2 = member
+    back, own = _not_zero(1.0 + g * k), open_loop / _not_zero(g)
+    first = (own * g1 - g1 * k / back).real
+    return first, (own * g2 - own**2 * g1**2 - g2 * k / back + (g1 * k / back) ** 2).real
+
+
+def _newton(slope: Real, bend: Real) -> Real:
+    """Step to the maximum of a parabola; 0 where it has none."""
+    return np.asarray(np.where(bend < 0, -slope / np.where(bend < 0, bend, -1.0), 0.0), dtype=np.float64)
 
 
 def natural_units(cascade: Cascade, x: Real) -> Real:
