@@ -35,7 +35,7 @@ from control_design import (
     synthesise,
     synthesise_jointly,
 )
-from control_design.analysis.joint_coverage import gamma_of_draws, joint_coverage
+from control_design.analysis.joint_coverage import SampledLoop, joint_coverage
 from control_design.analysis.worst_case import worst_case, worst_of
 from control_design.plants.ellipses import scale_to_minus_one
 from validation.example_plants import (
@@ -49,7 +49,7 @@ from workflow.text.templates import said
 BRUTE = 400_000
 MANY = 20_000
 CALIBRATION_SEED, CHECK_SEED = 11, 12
-CHUNK = 250  # draws at a time in `gamma_of_draws`
+CHUNK = 250  # draws at a time in `SampledLoop.gamma`
 
 
 def brute_force(controller: Controller, plant: UncertainPlant, specification: Specification) -> float:
@@ -83,7 +83,7 @@ def joint_line(
     found = joint_coverage(
         controller, [plant], specification, rng=np.random.default_rng(CALIBRATION_SEED), draws=4000
     )
-    fresh = gamma_of_draws(controller, plant, specification, np.random.default_rng(CHECK_SEED), draws)
+    fresh = SampledLoop(controller, plant, specification).gamma(np.random.default_rng(CHECK_SEED), draws)
     return (
         f"{name:18s} {found.gamma:9.4f} {100 * found.level:8.3f} "
         f"{100 * np.mean(fresh.gamma <= found.gamma):9.2f} {100 * np.mean(fresh.stable):8.2f} "
@@ -98,7 +98,7 @@ def unstable_line(scenario: Scenario, name: str, controller: Controller) -> str:
     omega = np.unique(np.append(np.geomspace(1e-4, plant.nyquist_rad_s, 20_000), np.linspace(12, 18, 4000)))
     loop = controller.response(omega)
     reach = RADIUS * float(np.min(scale_to_minus_one(loop, plant.at(omega))))
-    many = gamma_of_draws(controller, plant, specification, np.random.default_rng(CHECK_SEED + 1), MANY)
+    many = SampledLoop(controller, plant, specification).gamma(np.random.default_rng(CHECK_SEED + 1), MANY)
     rng, modes = np.random.default_rng(CHECK_SEED + 1), []
     for start in range(0, MANY, CHUNK):
         modes += mode_shifts(scenario, rng, min(CHUNK, MANY - start))

@@ -56,7 +56,9 @@ def run(out: Print, *, scenarios: tuple[Scenario, ...] = ("A", "B", "C"), fine: 
         out("The ellipse problem is not convex: its value from five starts between the discs' answers.")
         for scenario in scenarios:
             problem = BracketProblem(flexible_link(scenario), flexible_link_specification(5), YoulaOptions())
-            values = problem.other_ellipse_values((0.0, 0.25, 0.5, 0.75, 1.0))
+            outer, inner = (problem.exchanged(region, None)[2] for region in ("enclosing", "inscribed"))
+            starts = ((1 - f) * outer + f * inner for f in (0.0, 0.25, 0.5, 0.75, 1.0))
+            values = [problem.exchanged("ellipse", start)[0] for start in starts]
             out(f"{scenario:>8}  " + "  ".join(f"{value:.4f}" for value in values))
 
 

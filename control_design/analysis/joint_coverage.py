@@ -97,7 +97,7 @@ def joint_coverage(
         raise ValueError(f"joint coverage needs at least 100 draws; got {draws}")
     if not plants:
         raise ValueError("joint coverage needs at least one plant")
-    loops = [_Sampled(controller, plant, specification, omega_min_rad_s) for plant in plants]
+    loops = [SampledLoop(controller, plant, specification, omega_min_rad_s) for plant in plants]
     found = [loop.gamma(rng, draws) for loop in loops]
     gamma = np.max([one.gamma for one in found], axis=0)
     outside = np.max([one.distance for one in found], axis=0)
@@ -148,8 +148,8 @@ class SampledGamma:
     distance: Real
 
 
-class _Sampled:
-    """One plant on one grid, ellipses of radius 1 (standard deviation).
+class SampledLoop:
+    """One plant and controller on one grid, to draw whole responses for.
 
     Raises ValueError if an uncertainty cannot be drawn from.
     """
@@ -159,7 +159,7 @@ class _Sampled:
         controller: Controller,
         plant: UncertainPlant,
         specification: Specification,
-        omega_min_rad_s: float,
+        omega_min_rad_s: float = 1e-4,
     ) -> None:
         self.plant, self.controller, self.specification = plant, controller, specification
         self.draw = _drawn(plant.channel)
@@ -222,7 +222,7 @@ class _Sampled:
         return stable
 
     def gamma(self, rng: np.random.Generator, draws: int) -> SampledGamma:
-        """Draw whole responses and evaluate them."""
+        """Draw whole responses and evaluate them (a Monte Carlo check)."""
         other = None if self.plant.performance is None else _drawn(self.plant.performance)
         asked = any(each.channel is not None and np.any(each.own > 0) for each in self.data.weightings)
         gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
@@ -257,7 +257,7 @@ def unstable_draws(
     unstable = np.zeros(draws, dtype=bool)
     guards: list[Guard] = []
     for number, plant in enumerate(plants):
-        loop = _Sampled(controller, plant, specification, omega_min_rad_s)
+        loop = SampledLoop(controller, plant, specification, omega_min_rad_s)
         grid, found = guard_grid(plant, omega_min_rad_s), list[Complex]()
         for here, count in _chunks(draws):
             responses = loop.draw(rng, count)
@@ -269,19 +269,6 @@ def unstable_draws(
             together = np.concatenate(found)
             guards += [Guard(number, grid, together[at]) for at in different_responses(together, most)]
     return int(np.count_nonzero(unstable)), guards
-
-
-def gamma_of_draws(
-    controller: Controller,
-    plant: UncertainPlant,
-    specification: Specification,
-    rng: np.random.Generator,
-    draws: int,
-    *,
-    omega_min_rad_s: float = 1e-4,
-) -> SampledGamma:
-    """gamma(G), stability and distance of sampled responses of one plant (a Monte Carlo check)."""
-    return _Sampled(controller, plant, specification, omega_min_rad_s).gamma(rng, draws)
 
 
 def _chunks(draws: int) -> Iterator[tuple[slice, int]]:

@@ -97,11 +97,13 @@ def smallest_ratio(
 ) -> MinimaxPoint:
     """Minimise the largest numerator/denominator over real x (n,).
 
-    basis (F, n): y = basis x. start: x (n,) to begin from, None = the least-squares solution of the
-    numerators, shortened until the denominators are positive; where that fails, the denominators are made
-    positive first.
+    basis (F, n): y = basis x. start: x (n,) to begin from; None, or where a denominator is not positive: the
+    least-squares solution of the numerators, shortened until they are; where that fails, the denominators are
+    made positive first.
     """
     step = _Scaled(basis, rows)
+    if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
+        start = None
     z = step.least_squares() if start is None else step.coordinates(start)
     if start is None:
         for _ in range(30):

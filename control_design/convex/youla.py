@@ -169,11 +169,11 @@ class BracketProblem:
         self.dense_basis = self._basis(self.dense)
 
     def solve(self) -> PlantBracket:
-        enclosing, _, x = self._exchanged("enclosing", None)
+        enclosing, _, x = self.exchanged("enclosing", None)
         # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
         # inscribed.
-        inscribed, grid_value, x_inscribed = self._exchanged("inscribed", None)
-        ellipse, _, _ = self._exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
+        inscribed, grid_value, x_inscribed = self.exchanged("inscribed", None)
+        ellipse, _, _ = self.exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
         offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
         exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
         ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
@@ -194,21 +194,14 @@ class BracketProblem:
         lean = self.grids.lean()[0]
         return hull_bound(lean, self._loop(lean), self._basis(lean), inscribed_grid, ellipse)
 
-    def other_ellipse_values(self, shares: Sequence[float]) -> list[float]:
-        """Ellipse values from other starts: a share of the inscribed answer, the rest of the enclosing one.
-
-        A check of the one problem that is not convex: values that differ are different local optima.
-        """
-        _, _, outer = self._exchanged("enclosing", None)
-        _, _, inner = self._exchanged("inscribed", None)
-        return [self._exchanged("ellipse", (1 - f) * outer + f * inner)[0] for f in shares]
-
-    def _exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
+    def exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
         """Optimum with violated frequencies added: (value on the dense grid, on the programme's, x)."""
 
         def solve(begin: Real | None) -> MinimaxPoint:
             lean = self.grids.lean()[0]
-            return self._ellipse(lean, begin) if region == "ellipse" else self._disc(lean, region, begin)
+            if region == "ellipse":
+                return self._ellipse(lean, begin)
+            return smallest_ratio(self._basis(lean), self._rows(lean, region), begin)
 
         found = exchanged(
             solve,
@@ -222,28 +215,19 @@ class BracketProblem:
         x = start if found.x is None else found.x
         return found.worst, found.gamma, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
-    def _disc(self, data: PlantData, region: Region, start: Real | None) -> MinimaxPoint:
-        basis, rows = self._basis(data), self._rows(data, region)
-        if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
-            start = None
-        return smallest_ratio(basis, rows, start)
-
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         basis, loop = self._basis(data), self._loop(data)
-        point: MinimaxPoint | None = None
+        point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
         for _ in range(self.options.ellipse_rounds):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
             rows = self._rows(data, "ellipse", angles)
-            if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
-                start = None
             new = smallest_ratio(basis, rows, start)
-            before = np.inf if point is None else point.gamma
+            before = point.gamma
             if new.gamma < before:
                 point, start = new, new.x
             if not new.gamma < before * (1 - 1e-4):
                 break
-        assert point is not None or not np.isfinite(new.gamma)
-        return new if point is None else point
+        return point
 
     def _loop(self, data: PlantData) -> AffineLoop:
         if self.factors is None:

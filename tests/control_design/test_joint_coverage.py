@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import norm
 
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
-from control_design.analysis.joint_coverage import gamma_of_draws, joint_coverage
+from control_design.analysis.joint_coverage import SampledLoop, joint_coverage
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
@@ -43,7 +43,7 @@ def test_unstable_draws_are_those_whose_poles_say_so():
     plant, controller = uncertain_lag(0.3), gain(40.0)
     omega = np.array([1.0])
     rng = np.random.default_rng(2)
-    found = gamma_of_draws(controller, plant, Specification(), rng, 400)
+    found = SampledLoop(controller, plant, Specification()).gamma(rng, 400)
     posterior = plant.uncertainty
     again = posterior.sample(np.random.default_rng(2), 250)  # the first chunk
     share = posterior.response_of(again, omega)[:, 0] / posterior.centre(omega)[0]
@@ -63,7 +63,7 @@ def test_link_holds_in_95_percent_of_fresh_draws(scenario):
     k = [[0.99999]], [[0.002]], [[1.0]], [[0.25]]
     controller = Controller(*k, plant.dt_s, computational_delay_samples=0)
     found = joint_coverage(controller, [plant], spec, rng=np.random.default_rng(1))
-    fresh = gamma_of_draws(controller, plant, spec, np.random.default_rng(2), 3000)
+    fresh = SampledLoop(controller, plant, spec).gamma(np.random.default_rng(2), 3000)
     # binomial of 3000 (0.4 %) and of the 4000 calibrating draws (0.34 %): 2 % is almost four of their sum
     assert np.mean(fresh.gamma <= found.gamma) == pytest.approx(0.95, abs=0.02)
 
@@ -91,16 +91,12 @@ def test_performance_channel_and_several_plants_are_drawn_together():
     spec = Specification(modulus_margin=0.3, mode_peak_ratio=0.9)
     controller = gain(0.3)
     one = joint_coverage(controller, [arm], spec, rng=np.random.default_rng(3), draws=3000)
-    fresh = gamma_of_draws(controller, arm, spec, np.random.default_rng(4), 3000)
+    fresh = SampledLoop(controller, arm, spec).gamma(np.random.default_rng(4), 3000)
     # binomial, both sides: 0.56 %; four of it
     assert np.mean(fresh.gamma <= one.gamma) == pytest.approx(0.95, abs=0.023)
     # The damping weight rules: gamma is W4 |Gp| |S| at the peak, Gp drawn apart from G.
-    centre = gamma_of_draws(
-        controller,
-        UncertainPlant("exact", system, performance=Channel(tip)),
-        spec,
-        np.random.default_rng(0),
-        1,
+    centre = SampledLoop(controller, UncertainPlant("exact", system, performance=Channel(tip)), spec).gamma(
+        np.random.default_rng(0), 1
     )
     assert one.gamma > centre.gamma[0]
     # Twice the same plant, drawn independently: P(max <= q) = P(gamma <= q)^2, so the quantile moves up.

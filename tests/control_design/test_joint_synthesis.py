@@ -15,7 +15,7 @@ from control_design import (
     synthesise,
     synthesise_jointly,
 )
-from control_design.analysis.joint_coverage import gamma_of_draws, unstable_draws
+from control_design.analysis.joint_coverage import SampledLoop, unstable_draws
 from control_design.analysis.stability import winds
 from control_design.plants.guards import different_responses, guard_grid
 from control_design.plants.plant_set import frequency_response
@@ -129,5 +129,7 @@ def test_link_b_is_stable_for_999_of_1000_parameter_draws():
     design = synthesise_jointly([plant], specification, rng=np.random.default_rng(1))
     assert design.reached
     assert design.result.gamma < 1.13  # plain 1.085: the price of the guards
-    fresh = gamma_of_draws(design.result.controller, plant, specification, np.random.default_rng(2), 10_000)
+    fresh = SampledLoop(design.result.controller, plant, specification).gamma(
+        np.random.default_rng(2), 10_000
+    )
     assert np.count_nonzero(~fresh.stable) <= 10
