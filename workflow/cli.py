@@ -54,6 +54,10 @@ Jobs = Annotated[
     int | None,
     typer.Option(help="Processes on this machine [default: one per processor]"),
 ]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is taken up.")
+]
+Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -82,10 +86,8 @@ def run(
         Path | None,
         typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]"),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in --out; finished stages are taken up.")
-    ] = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Delete an earlier run in --out first.")] = False,
+    resume: Resume = False,
+    replace: Replace = False,
     as_json: Json = False,
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
@@ -319,12 +321,8 @@ def study(
             help="Compute the points on a Dask cluster, e.g. tcp://host:8786 (extra 'distributed')."
         ),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the study in --out; finished points are taken up.")
-    ] = False,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Delete an earlier study in --out first.")
-    ] = False,
+    resume: Resume = False,
+    replace: Replace = False,
     as_json: Json = False,
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
@@ -358,12 +356,8 @@ def diagnose(
         ),
     ] = None,
     jobs: Jobs = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the diagnosis in --out; finished cases are taken up.")
-    ] = False,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Delete an earlier diagnosis in --out first.")
-    ] = False,
+    resume: Resume = False,
+    replace: Replace = False,
     controller: Annotated[
         bool,
         typer.Option(help="Compare controllers designed on the nominal rig and on the repaired one."),

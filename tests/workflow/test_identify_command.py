@@ -277,7 +277,7 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--export", "{out}/model.txt"), "the ending must be .json or .mat"),
         (("--export", "{out}/gone/model.mat"), "is not a directory"),
         (("--report", "{out}"), "it is a directory"),
-        (("--report", "{log}"), "that is a log already"),
+        (("--report", "{log}"), "that is a source already"),
         (("--report", "{out}/a", "--out", "{out}/a"), "that is --out already"),
         (("--reference", "r"), "no column 'r'"),
         (("--level", "0.2"), "--level must lie between"),

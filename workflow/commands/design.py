@@ -80,8 +80,12 @@ def design_controller(
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(path) for path in sources]
     if not paths:
         raise InputError("nothing to design for: give at least one run directory or file with a plant")
-    if out is not None:
-        _check_out(out, paths)
+    written = [] if out is None else targets(out)
+    if out is not None and not out.is_dir() and out.suffix.lower() not in SUFFIXES:
+        raise InputError(f"--out {out}: the ending must be one of {', '.join(SUFFIXES)}, or a directory")
+    storage.refuse_in_the_way(
+        paths, [("--out", one) for path in written for one in (path, filter_file(path))]
+    )
     need(*paths)
     file = read_design_file(specification_path) if specification_path is not None else DesignFile()
     sources_found = load_sources(paths, file)
@@ -136,13 +140,3 @@ def design_controller(
         certified=certified,
         verdict=reason,
     )
-
-
-def _check_out(out: Path, sources: Sequence[Path]) -> None:
-    """Refuse a place for the controller before anything is computed."""
-    if not out.is_dir() and out.suffix.lower() not in SUFFIXES:
-        raise InputError(f"--out {out}: the ending must be one of {', '.join(SUFFIXES)}, or a directory")
-    for path in (one for target in targets(out) for one in (target, filter_file(target))):
-        storage.check_writable(path)
-        if path.absolute() in [source.absolute() for source in sources]:
-            raise InputError(f"--out {out}: {path} is a source; give the controller a name of its own")

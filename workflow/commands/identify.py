@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,9 @@ def identify_logs(
         raise InputError(f"--level must lie between 0.5 and 1, got {level}")
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
         raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
-    _refuse_files_in_the_way([*logs, *validation], {"--out": out, "--report": report, "--export": export})
+    # A log given twice would count its noise twice as well known, or validate what it was fitted to.
+    written = [("--out", out), ("--report", report), ("--export", export)]
+    storage.refuse_in_the_way([*logs, *validation], [(name, path) for name, path in written if path])
     progress = progress or Progress()
     progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
     references = [] if reference is None else [reference]
@@ -131,24 +133,3 @@ def _log_numbers(record: Record) -> dict[str, Any]:
         "input_unit": "".join(record.input_units),
         "output_unit": "".join(record.output_units),
     }
-
-
-def _refuse_files_in_the_way(logs: Sequence[Path], written: Mapping[str, Path | None]) -> None:
-    """Refuse before the work is done.
-
-    A log given twice would count its noise twice as well known, or validate what it was fitted to; an output
-    file must not be a log, another output, or out of reach.
-    """
-    seen: dict[Path, str] = {}
-    for path in logs:
-        place = Path(path).resolve()
-        if place in seen:
-            raise InputError(f"{path}: given twice; expected different experiments")
-        seen[place] = "a log"
-    for option, target in written.items():
-        if target is None:
-            continue
-        if target.resolve() in seen:
-            raise InputError(f"{option} {target}: that is {seen[target.resolve()]} already")
-        seen[target.resolve()] = option
-        storage.check_writable(target)

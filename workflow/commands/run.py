@@ -26,8 +26,6 @@ def run_from_files(
     Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
     without `out` a new directory below runs/ is made. Raises InputError.
     """
-    if resume and replace:
-        raise InputError("--resume and --replace contradict each other")
     if (resume or replace) and out is None:
         raise InputError(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"

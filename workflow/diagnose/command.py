@@ -92,10 +92,6 @@ def diagnose_cases(
     progress = progress or Progress()
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
-    if resume and replace:
-        raise InputError(
-            "--resume and --replace contradict each other: continue the diagnosis or start it afresh"
-        )
     loaded, unreadable = _load(places, rig)
     code = code_digest("diagnosis", drawing=True)
     work = [Work(one, controller, code, engine or Engine()) for one in loaded]

@@ -16,7 +16,7 @@ it). File and hash appear in one rename, so there is no instant at which one is 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -146,16 +146,18 @@ class RunDirectory(Store):
                 return path
         return None
 
+    def _finished(self, name: str) -> Path:
+        if (path := self.stage_file(name)) is None:
+            raise InputError(f"{self.path}: stage {name} is not there; run flexlink run --resume first")
+        return path
+
     def stage_files(self, names: Iterable[str]) -> dict[str, bytes]:
         """Contents of stage files by file name; stages that are not there are left out."""
         return {path.name: path.read_bytes() for path in map(self.stage_file, names) if path is not None}
 
     def stage_digest(self, name: str) -> str:
         """SHA-256 of a finished stage's file: the input hash of the stages after it builds on this."""
-        path = self.stage_file(name)
-        if path is None:
-            raise InputError(f"{self.path}: stage {name} is not there; run flexlink run --resume first")
-        return storage.sha256_of_file(path)
+        return storage.sha256_of_file(self._finished(name))
 
     def is_done(self, name: str, input_hash: str) -> bool:
         """True when the stage's file is there and was made from exactly this input."""
@@ -176,9 +178,7 @@ class RunDirectory(Store):
 
     def load_stage(self, name: str, kind: type[T]) -> T:
         """The result of a finished stage. Raises InputError when it is not there or not readable."""
-        path = self.stage_file(name)
-        if path is None:
-            raise InputError(f"{self.path}: stage {name} is not there; run flexlink run --resume first")
+        path = self._finished(name)
         with naming(str(path)):
             if path.suffix == ".npz":
                 return codec.from_arrays(kind, storage.read_npz(path))
@@ -240,27 +240,28 @@ def hash_of(document: Mapping[str, Any]) -> str:
     return storage.sha256_of_bytes(text.encode("utf-8"))
 
 
-def first_difference(old: Any, new: Any, where: str = "") -> str | None:
+def first_difference(old: Any, new: Any) -> str | None:
     """Dotted key of the first difference between two JSON-able values with both values, or None."""
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for key in [*old, *(key for key in new if key not in old)]:
-            inner = f"{where}.{key}" if where else str(key)
-            if key not in new:
-                return f"{inner} (was {shortened(old[key])}, now absent)"
-            if key not in old:
-                return f"{inner} (was absent, now {shortened(new[key])})"
-            found = first_difference(old[key], new[key], inner)
-            if found:
-                return found
-        return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        for index, (left, right) in enumerate(zip(old, new, strict=True)):
-            found = first_difference(left, right, f"{where}[{index}]")
-            if found:
-                return found
-        return None
-    # repr tells 1 from 1.0 and True, and nan from nan is no difference.
-    return None if repr(old) == repr(new) else f"{where} (was {shortened(old)}, now {shortened(new)})"
+    before, after = dict(_leaves(old)), dict(_leaves(new))
+    for key in before | after:
+        # repr tells 1 from 1.0 and True, and nan from nan is no difference.
+        if key not in before or key not in after or repr(before[key]) != repr(after[key]):
+            was, now = (shortened(one[key]) if key in one else "absent" for one in (before, after))
+            return f"{key} (was {was}, now {now})"
+    return None
+
+
+def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of everything in a JSON-able value that has nothing inside."""
+    inner: list[tuple[str, Any]] = []
+    if isinstance(value, Mapping):
+        inner = [(f"{where}.{key}" if where else str(key), item) for key, item in value.items()]
+    elif isinstance(value, list):
+        inner = [(f"{where}[{index}]", item) for index, item in enumerate(value)]
+    if not inner:
+        yield where, value
+    for name, item in inner:
+        yield from _leaves(item, name)
 
 
 def _recorded_hash(path: Path) -> str | None:

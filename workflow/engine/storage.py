@@ -14,7 +14,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,21 @@ def check_writable(path: Path) -> None:
         trial.unlink()
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def refuse_in_the_way(read: Iterable[Path], written: Iterable[tuple[str, Path]]) -> None:
+    """Refuse, before the work is done, a file that is read twice, and an output (option, file) that is read,
+    another output, or out of reach."""
+    seen: dict[Path, str] = {}
+    for path in read:
+        if path.resolve() in seen:
+            raise InputError(f"{path}: given twice; every source counts once")
+        seen[path.resolve()] = "a source"
+    for option, target in written:
+        if target.resolve() in seen:
+            raise InputError(f"{option} {target}: that is {seen[target.resolve()]} already")
+        seen[target.resolve()] = option
+        check_writable(target)
 
 
 def write_text(path: Path, content: str) -> None:

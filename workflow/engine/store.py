@@ -62,6 +62,8 @@ class Store:
         Returns whether there is something to continue. Raises InputError: not writable, not a directory, not
         empty with neither `resume` nor `replace`, or holding something else (which is never replaced).
         """
+        if resume and replace:
+            raise InputError("--resume and --replace contradict each other")
         held = self.held()
         there = self.manifest_name in held
         strangers = held if there else held - set(self.own_entries())

@@ -182,10 +182,6 @@ class DesignSource:
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
     """All plants, by different names and with one sampling time. Raises InputError: one line that names the
     file."""
-    paths = [Path(path) for path in paths]
-    for number, path in enumerate(paths):
-        if path.absolute() in [other.absolute() for other in paths[:number]]:
-            raise InputError(f"{path} is given twice: every plant counts once")
     sources = [load_source(path, design) for path in paths]
     stated = [source for source in sources if isinstance(source.plant.uncertainty, StatedDiscs)]
     if design.uncertainty is not None and not stated:
