@@ -28,6 +28,7 @@ from control_design.plants.ellipses import (
     Real,
     farthest_distance,
     largest_disturbance_gain,
+    secular_root,
 )
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.frequency_grid import starting_edges
@@ -205,26 +206,14 @@ def _ratio(size: Real, low: Real) -> Real:
 
 
 def _normal(point: Complex, shape: Real) -> Complex:
-    """Unit normal, from the ellipse e^T P^-1 e <= 1 at the origin, towards `point`: (P + t)^-1 point, t >= 0
-    the root of the secular equation (`ellipses.nearest_distance`). Any normal gives a valid bound, so the
-    root may be rough; inside the ellipse the direction means nothing."""
+    """Unit normal, from the ellipse e^T P^-1 e <= 1 at the origin, towards `point`: (P + t)^-1 point, t the
+    `secular_root`. Any normal gives a valid bound; inside the ellipse the direction means nothing."""
     major, minor, axis = _axes(shape)
     # Lengths in units of the largest: squares of squares stay far from the ends of the number range.
     scale = np.maximum(np.maximum(np.abs(point), major), 1e-100)
-    turned = point * np.conj(axis) / scale
-    x, y = turned.real, turned.imag
-    large, small = (major / scale) ** 2, (minor / scale) ** 2
-    t = np.maximum(np.sqrt(large) * np.abs(x) - large, np.sqrt(small) * np.abs(y) - small)
-    t = np.maximum(t, 1e-30)
-    for _ in range(40):
-        pa, pb = large * x**2 / (large + t) ** 2, small * y**2 / (small + t) ** 2
-        slope = 2.0 * (pa / (large + t) + pb / (small + t))
-        step = np.where(slope > 0, (pa + pb - 1.0) / np.where(slope > 0, slope, 1.0), 0.0)
-        step = np.maximum(step, 0.0)
-        t = t + step
-        if np.all(step <= 1e-9 * t):
-            break
-    normal = (x / (large + t) + 1j * y / (small + t)) * axis
+    turned, a, b = point * np.conj(axis) / scale, major / scale, minor / scale
+    t = np.maximum(secular_root(np.abs(turned.real), np.abs(turned.imag), a, b), 1e-30)
+    normal = (turned.real / (a**2 + t) + 1j * turned.imag / (b**2 + t)) * axis
     size = np.abs(normal)
     return np.where(size > 0, normal / np.where(size > 0, size, 1.0), 1.0)
 

@@ -66,43 +66,34 @@ def nominal_margins(
     """Margins of one loop: crossings bracketed on the grid, then refined by root finding (or
     interpolated)."""
     value = loop_gain(omega_rad_s)
-    crossings: list[complex] = []
-    places: list[float] = []
+    found: list[tuple[float, complex]] = []
 
     def refine(function: Callable[[complex], float], k: int) -> tuple[float, complex]:
         low, high = float(omega_rad_s[k]), float(omega_rad_s[k + 1])
         if refinable:
-            omega = float(
-                brentq(
-                    lambda w: function(complex(loop_gain(np.array([w]))[0])),
-                    low,
-                    high,
-                    xtol=1e-13 * high,
-                    rtol=1e-14,
-                )
-            )
-            return omega, complex(loop_gain(np.array([omega]))[0])
+
+            def at(omega: float) -> complex:
+                return complex(loop_gain(np.array([omega]))[0])
+
+            omega = float(brentq(lambda w: function(at(w)), low, high, xtol=1e-13 * high, rtol=1e-14))
+            return omega, at(omega)
         a, b = function(complex(value[k])), function(complex(value[k + 1]))
         share = a / (a - b)
         return low + share * (high - low), complex(value[k] + share * (value[k + 1] - value[k]))
 
-    imag = np.imag(value)
+    imag, size = np.imag(value), np.abs(value) - 1.0
     for k in np.flatnonzero(np.sign(imag[:-1]) * np.sign(imag[1:]) < 0):
         if min(value[k].real, value[k + 1].real) < 0:
             omega, x = refine(lambda v: v.imag, int(k))
-            crossings.append(complex(x.real, 0.0))
-            places.append(omega)
-    size = np.abs(value) - 1.0
+            found.append((omega, complex(x.real, 0.0)))
     for k in np.flatnonzero(size[:-1] * size[1:] < 0):
         omega, x = refine(lambda v: abs(v) - 1.0, int(k))
-        crossings.append(x / abs(x))
-        places.append(omega)
+        found.append((omega, x / abs(x)))
     # At Nyquist the loop is real: the gain limit may sit there without a sign change.
     if value[-1].real < 0 and abs(value[-1].imag) <= 1e-9 * abs(value[-1]):
-        crossings.append(complex(value[-1].real, 0.0))
-        places.append(float(omega_rad_s[-1]))
-    modulus = float(np.min(np.abs(1 + value)))
-    return crossing_margins(np.array(crossings, dtype=np.complex128), np.array(places), modulus)
+        found.append((float(omega_rad_s[-1]), complex(value[-1].real, 0.0)))
+    places, crossings = np.array([omega for omega, _ in found]), np.array([x for _, x in found], complex)
+    return crossing_margins(crossings, places, float(np.min(np.abs(1 + value))))
 
 
 def ellipse_margins(loop_gain: Complex, ellipses: Ellipses, distance: Real) -> Margins:

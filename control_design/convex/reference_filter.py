@@ -125,11 +125,6 @@ def design_reference_filter(
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)
     if not listed:
         raise ValueError("no plant given: the reference filter needs at least one uncertain plant")
-    for plant in listed:
-        if not np.isclose(plant.dt_s, controller.dt_s, rtol=1e-9, atol=0):
-            raise ValueError(
-                f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}"
-            )
     return _Matching(controller, listed, model, weight, options).solve()
 
 
@@ -151,8 +146,8 @@ class _Matching:
         for plant in plants:
             self.grids.append(programme_grid(plant, plant.modes, options))
             # The check stands on frequencies of its own, not on the programme's.
-            self.dense.append(plant.at(programme_grid(plant, plant.modes, options, dense=True)))
-        for plant, ellipses in zip(plants, self.dense, strict=True):
+            ellipses = plant.at(programme_grid(plant, plant.modes, options, dense=True))
+            self.dense.append(ellipses)
             if not np.max(np.abs(closed_loop_poles(controller, plant)), initial=0.0) < 1:
                 raise ValueError(
                     f"plant {plant.name!r}: the nominal loop is unstable; no reference filter helps"
@@ -209,19 +204,17 @@ class _Matching:
 
         corner = self._model_corner()
         spread = np.log(corner) + np.log(4.0) * (np.arange(self.options.order) - (self.options.order - 1) / 2)
-        best: tuple[float, Real] | None = None
-        for shift in np.log([0.3, 1.0, 4.0]):
-            start = np.clip(spread + shift, low + 0.1, high - 0.1)
-            answer = scipy.optimize.minimize(
+        answers = [
+            scipy.optimize.minimize(
                 cost,
-                start,
+                np.clip(spread + shift, low + 0.1, high - 0.1),
                 method="Nelder-Mead",
                 options={"maxfev": 30 * self.options.order, "xatol": 1e-2, "fatol": 1e-4},
             )
-            if best is None or float(answer.fun) < best[0]:
-                best = float(answer.fun), np.clip(np.sort(answer.x), low, high)
-        assert best is not None
-        return Poles(np.exp(-self.dt_s * np.exp(best[1])))
+            for shift in np.log([0.3, 1.0, 4.0])
+        ]
+        best = min(answers, key=lambda answer: float(answer.fun))
+        return Poles(np.exp(-self.dt_s * np.exp(np.clip(np.sort(best.x), low, high))))
 
     def _model_corner(self) -> float:
         """Frequency where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency."""

@@ -143,19 +143,11 @@ class Ellipses:
         return farthest_distance(-self.centre * np.conj(self.direction), self.semi_major, self.semi_minor)
 
 
-def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
-    """Distance from `point` to the filled axis-parallel ellipse at the origin; 0 inside. All (F,).
+def secular_root(x: Real, y: Real, a: Real, b: Real) -> Real:
+    """Root t >= 0 of (a x/(a^2 + t))^2 + (b y/(b^2 + t))^2 = 1 for x, y, a >= b >= 0; inside the ellipse 0.
 
-    The nearest point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)) for the root t >= 0 of
-    (a x/(a^2 + t))^2 + (b y/(b^2 + t))^2 = 1 (first-order condition; t is the multiplier). The left side is
-    convex and decreasing, so Newton from the left never overshoots; degenerate axes (segments, points) are
-    the limit b -> 0.
+    The left side is convex and decreasing, so Newton from the left never overshoots.
     """
-    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
-    a = np.asarray(semi_major, dtype=np.float64)
-    b = np.asarray(semi_minor, dtype=np.float64)
-    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
-    x, y, a, b = x / scale, y / scale, a / scale, b / scale
     ax, by = a * x, b * y
     # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
     t = np.maximum(np.maximum(ax - a * a, by - b * b), 0.0)
@@ -170,6 +162,21 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
         t = t + step
         if np.all(step <= 1e-15 * (t + 1e-16)):
             break
+    return np.asarray(t, dtype=np.float64)
+
+
+def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
+    """Distance from `point` to the filled axis-parallel ellipse at the origin; 0 inside. All (F,).
+
+    The nearest point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), t the `secular_root` (first-order condition; t is
+    the multiplier). Degenerate axes (segments, points) are the limit b -> 0.
+    """
+    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
+    a = np.asarray(semi_major, dtype=np.float64)
+    b = np.asarray(semi_minor, dtype=np.float64)
+    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
+    x, y, a, b = x / scale, y / scale, a / scale, b / scale
+    t = secular_root(x, y, a, b)
     da, db = a * a + t, b * b + t
     with np.errstate(invalid="ignore", divide="ignore"):
         # t = 0 on a degenerate axis: the point projects onto the segment itself.
