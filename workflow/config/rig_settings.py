@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, Validatio
 
 from plant import Rig, parse_effect
 from plant.presets import paper_link
-from workflow.config.settings import expand, resolve
+from workflow.config.settings import resolve
 
 PRESETS: dict[str, Callable[[], Rig]] = {"paper_link": paper_link}
 
@@ -24,7 +24,7 @@ def _choose_rig(value: Any, info: ValidationInfo) -> str | Path:
     text = str(value)
     if text in PRESETS:
         return text
-    path = resolve(Path(expand(text)), info, kind=f"rig file (presets: {', '.join(PRESETS)})")
+    path = resolve(Path(text), info, kind=f"rig file (presets: {', '.join(PRESETS)})")
     if not (info.context or {}).get("may_be_gone"):
         Rig.from_toml(path)
     return path

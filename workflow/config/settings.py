@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails, to_json
 
 from workflow.config.renamed_keys import with_current_keys
@@ -148,17 +148,14 @@ def expand(text: str) -> str:
     return _VARIABLE.sub(value, text)
 
 
-def _expand_before(value: Any) -> Any:
-    return expand(value) if isinstance(value, str) else value
-
-
 def resolve(path: Path, info: ValidationInfo, *, kind: str = "file") -> Path:
-    """Relative to the `base` of the validation context; must be a file unless `may_be_gone` is set there.
+    """With variables of the environment expanded, relative to the `base` of the validation context; must be a
+    file unless `may_be_gone` is set there.
 
     Raises ValueError saying what was found instead.
     """
     context = info.context or {}
-    base = context.get("base")
+    base, path = context.get("base"), Path(expand(str(path)))
     resolved = Path(os.path.normpath(Path(base) / path)) if base else path
     if not context.get("may_be_gone") and not resolved.is_file():
         if resolved.is_dir():
@@ -167,8 +164,4 @@ def resolve(path: Path, info: ValidationInfo, *, kind: str = "file") -> Path:
     return resolved
 
 
-def _input_path(path: Path, info: ValidationInfo) -> Path:
-    return resolve(path, info)
-
-
-InputPath = Annotated[Path, BeforeValidator(_expand_before), AfterValidator(_input_path)]
+InputPath = Annotated[Path, AfterValidator(resolve)]

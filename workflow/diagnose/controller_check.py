@@ -31,11 +31,10 @@ from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
 from diagnosis.machine.case import Case
-from ident.data.record import Record
 from plant import Effect, Rig, SampledArm
 from workflow.diagnose.linear_machine import sampled_linear_machine
 from workflow.engine import codec
-from workflow.tasks.loop_sensitivity import plan_sensitivity
+from workflow.tasks.loop_sensitivity import plan_sensitivity, rms_of, settling_samples
 
 Real = npt.NDArray[np.float64]
 
@@ -163,7 +162,7 @@ def _largest_voltage(case: Case) -> float:
 
 def _step(case: Case) -> float:
     """Half the spread of the hub angle in the records."""
-    return 0.5 * float(np.sqrt(np.mean([np.var(e.output[:, 0]) for e in case.estimation])))
+    return 0.5 * rms_of([e.output[:, 0] for e in case.estimation])
 
 
 def _designed(plant: _Plant, specification: Specification) -> Controller:
@@ -190,9 +189,7 @@ class Trial:
     def of(cls, case: Case, controller: Controller, plant: _Plant) -> Trial:
         dt = case.rig.sampling.dt_s
         radius = float(np.max(np.abs(closed_loop_poles(controller, plant.uncertain))))
-        # e^-7 is a thousandth: the slowest pole has died out by the end of either half.
-        wanted = 2 * 7 / -np.log(min(max(radius, 0.5), 1 - 1e-9))
-        k = np.arange(int(np.clip(round(wanted), _SHORTEST, _LONGEST)))
+        k = np.arange(settling_samples(radius, _SHORTEST, _LONGEST))
         half = k.size // 2
         voltage = float(np.sqrt(np.mean([np.mean(e.voltage_V**2) for e in case.estimation])))
         return cls(
@@ -242,17 +239,7 @@ def _measured_margin(
     controller: Controller, plant: _Plant, arm: SampledArm, case: Case, trial: Trial
 ) -> float:
     """One over the largest |S| measured on the arm."""
-    hub = [
-        Record(
-            e.name,
-            e.voltage_V[:, None],
-            e.output[:, :1],
-            case.rig.sampling.dt_s,
-            ("voltage_V",),
-            arm.output_names[:1],
-        )
-        for e in case.estimation
-    ]
-    plan = plan_sensitivity(controller, plant.uncertain, hub, trial.time_s.size // 2)
+    input_rms = rms_of([e.voltage_V for e in case.estimation])
+    plan = plan_sensitivity(controller, plant.uncertain, input_rms, trial.time_s.size // 2)
     seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
     return 1.0 / seen.peak[0]

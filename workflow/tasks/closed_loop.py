@@ -16,7 +16,7 @@ from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.engine.errors import naming
 from workflow.tasks.loop_conditions import ConditionBench
-from workflow.tasks.loop_sensitivity import sensitivity_on_arm
+from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
 from workflow.tasks.reference_filter import model_answer
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
@@ -29,7 +29,7 @@ _LEAD_IN = 0.05  # share of the record before the step, so that the picture show
 # A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
 # where tracking is asked for, has arrived within it.
 _SETTLED = 0.1
-_LONGEST_SAMPLES = 6000
+_SHORTEST, _LONGEST = 200, 6000
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
         channels, performance = results.uncertainty.channels, config.performance_index
         posterior = channels[config.control_index].posterior
         tip = None if performance is None else channels[performance].posterior
-        predicted = run_on_draws(
-            controller, posterior, tip, posterior.mean[None], None if tip is None else tip.mean[None], trial
-        )
+        mean = (posterior, posterior.mean[None]), None if tip is None else (tip, tip.mean[None])
+        predicted = run_on_draws(controller, *mean, trial)
         stage.progress.update("closed_loop", 0.1, "machine")
         sensitivity, conditions = None, []
         if config.machine == "simulated":
@@ -88,15 +87,11 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
                 conditions = bench.run_all()
         else:
             # Control and performance channel are drawn independently.
-            achieved = run_on_draws(
-                controller,
-                posterior,
-                tip,
-                posterior.sample(stage.rng("closed_loop", "control"), options.draws),
-                None if tip is None else tip.sample(stage.rng("closed_loop", "performance"), options.draws),
-                trial,
-                **_steps(options),
-            )
+            own = posterior.sample(stage.rng("closed_loop", "control"), options.draws)
+            shown = None
+            if tip is not None:
+                shown = tip, tip.sample(stage.rng("closed_loop", "performance"), options.draws)
+            achieved = run_on_draws(controller, (posterior, own), shown, trial, **_steps(options))
     model = None
     if reference_filter is not None and config.reference_filter is not None:
         model = model_answer(config.reference_filter.reference_model, trial.reference, controller.dt_s)
@@ -136,16 +131,13 @@ def make_trial(
     pole."""
     options, config = stage.config.closed_loop, stage.config
     used = stage.results.records.fitted(config.control_channel)
+    samples = settling_samples(pole_radius, _SHORTEST, _LONGEST)
     if options.duration_s is not None:
-        samples = round(options.duration_s / dt_s)
-    else:
-        # e^-7 is a thousandth: the slowest pole has died out by the end of either half.
-        samples = round(2 * 7 / -np.log(min(max(pole_radius, 0.5), 1 - 1e-9)))
-    samples = min(max(samples, 200), _LONGEST_SAMPLES)
-    step = options.reference_step or 0.5 * float(np.sqrt(np.mean([np.var(r.output) for r in used])))
+        samples = min(max(round(options.duration_s / dt_s), _SHORTEST), _LONGEST)
+    step = options.reference_step or 0.5 * rms_of([record.output for record in used])
     disturbance = options.disturbance
     if disturbance is None:
-        disturbance = 0.1 * float(np.sqrt(np.mean([np.var(r.input) for r in used])))
+        disturbance = 0.1 * rms_of([record.input for record in used])
     k = np.arange(samples)
     half = samples // 2
     reference = np.where(k >= round(_LEAD_IN * samples), step, 0.0)
@@ -194,30 +186,30 @@ def _steps(options: ClosedLoopOptions) -> dict[str, float]:
 
 def run_on_draws(
     controller: Controller,
-    posterior: ResponsePosterior,
-    tip: ResponsePosterior | None,
-    draws: Real,
-    tip_draws: Real | None,
+    drawn: tuple[ResponsePosterior, Real],
+    shown: tuple[ResponsePosterior, Real] | None,
     trial: Trial,
     measurement_step: float = 0.0,
     command_step: float = 0.0,
 ) -> LoopRuns:
     """One closed loop per draw of coefficients (R, P), of the performance channel (R, P') too where there is
     one: its output follows from the command that acted."""
+    posterior, draws = drawn
     runs = [
         simulate_draw(
             controller,
             posterior,
-            coefficients,
+            one,
             trial.given,
             input_disturbance=trial.disturbance,
             measurement_step=measurement_step,
             command_step=command_step,
         )
-        for coefficients in draws
+        for one in draws
     ]
-    if tip is None or tip_draws is None:
+    if shown is None:
         return _loop_runs(runs, None)
+    tip, tip_draws = shown
     pairs = zip(runs, tip_draws, strict=True)
     return _loop_runs(runs, [tip.simulate(run.command + trial.disturbance, own) for run, own in pairs])
 

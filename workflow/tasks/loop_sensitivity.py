@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,6 @@ import numpy.typing as npt
 from control_design.analysis.closed_loop import measure_sensitivity
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
-from ident.data.record import Record
 from workflow.config.run_config import SimulatedSource
 from workflow.tasks.results import MeasuredPeak, SensitivityCheck
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine
@@ -27,6 +27,18 @@ _INPUT_SHARE = 0.7  # of the input's rms in the records of the fit that the loop
 _CREST = 4.0  # peak over rms that a multisine's command stays below
 _LINES_BELOW_PEAK = 20
 _SHORTEST, _LONGEST = 500, 4000
+
+
+def rms_of(signals: Sequence[Real]) -> float:
+    """Root mean square of signals (T,), each about its mean, over all of them."""
+    return float(np.sqrt(np.mean([np.var(signal) for signal in signals])))
+
+
+def settling_samples(pole_radius: float, shortest: int, longest: int) -> int:
+    """Of a trial in two halves, in either of which the slowest closed-loop pole dies out (to e^-7, a
+    thousandth)."""
+    wanted = round(2 * 7 / -np.log(min(max(pole_radius, 0.5), 1 - 1e-9)))
+    return int(min(max(wanted, shortest), longest))
 
 
 @dataclass(frozen=True)
@@ -56,11 +68,11 @@ class SensitivityPlan:
 def plan_sensitivity(
     controller: Controller,
     plant: UncertainPlant,
-    records: list[Record],
+    input_rms: float,
     transient_samples: int,
 ) -> SensitivityPlan:
     """From a twentieth of the predicted peak's frequency to ten times it, lines a twentieth of it apart; as
-    large as the input of the records (SISO) and the voltage limit allow."""
+    large as the rms of the input in the records and the voltage limit allow."""
     dt = controller.dt_s
     omega = np.geomspace(1e-3 / dt, plant.nyquist_rad_s, 8000)
     loop = controller.response(omega) * plant.channel.nominal_response(omega)
@@ -73,7 +85,7 @@ def plan_sensitivity(
     inside = np.arange(band[0], band[1], line)
     gain = np.abs(controller.response(inside))
     gain = gain / np.abs(1 + controller.response(inside) * plant.channel.nominal_response(inside))
-    command = _INPUT_SHARE * float(np.sqrt(np.mean([np.var(record.input) for record in records])))
+    command = _INPUT_SHARE * input_rms
     if controller.input_limit is not None:
         command = min(command, controller.input_limit / _CREST)
     return SensitivityPlan(
@@ -92,8 +104,8 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
     assert certificate is not None
     assert isinstance(source, SimulatedSource)
     options = config.closed_loop
-    records = stage.results.records.fitted(config.control_channel)
-    plan = plan_sensitivity(controller, stage.plant, records, transient_samples)
+    input_rms = rms_of([record.input for record in stage.results.records.fitted(config.control_channel)])
+    plan = plan_sensitivity(controller, stage.plant, input_rms, transient_samples)
     certified = certificate.plants[0].worst_peak_sensitivity
     arms: list[tuple[str, tuple[dict[str, Any], ...], bool]] = [
         ("arm as identified", (), False),
