@@ -122,7 +122,7 @@ def test_the_page_answers_in_order(files):
     assert "<td>torque</td><td>0.05 N m</td><td>0.049 to 0.051</td>" in html
     assert "<td>coulomb_friction</td>" not in html
     assert html.count("<figure>") >= 6
-    assert "nan" not in re.sub(r"<svg.*?</svg>", "", html, flags=re.DOTALL).lower().replace("nan m", "")
+    assert "nan" not in re.sub(r"<img[^>]*>", "", html).lower().replace("nan m", "")
 
 
 @pytest.mark.parametrize(

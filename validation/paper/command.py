@@ -145,11 +145,7 @@ def page_html(
             level=TWO_SIGMA_LEVEL,
             recipe_evaluations=RECIPE_BUDGET * results.settings.evaluations,
             drawings={
-                item.number: embedded(
-                    f"figure-{item.number}",
-                    f"Fig. {item.number}, redrawn: {item.title}",
-                    pictures[item.number],
-                )
+                item.number: embedded(f"Fig. {item.number}, redrawn: {item.title}", pictures[item.number])
                 for item in REPORTED
             },
             tables={figure: list(group) for figure, group in groupby(rows, key=lambda row: row.figure)},

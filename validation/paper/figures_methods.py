@@ -101,8 +101,7 @@ def _bode(shown: Comparison, curves: list[Curve], title: str) -> Figure:
         gain.set_ylabel(f"gain [dB re 1 {shown.machine.gain_unit}]")
         phase.set_ylabel("phase [deg]")
         phase.yaxis.set_major_locator(MultipleLocator(180))
-        figure.align_ylabels()
-        style.finish(figure, gain, columns=4)
+        style.finish(figure)
     return figure
 
 
@@ -122,8 +121,7 @@ def draw_gobf_run(shown: Comparison) -> Figure:
         lower.set_ylabel("residual [m]")
         lower.set_xlabel("time [s]")
         upper.set_xlim(time[0], time[-1])
-        figure.align_ylabels()
-        style.finish(figure, [upper, lower], columns=4)
+        style.finish(figure)
     return figure
 
 
@@ -144,7 +142,7 @@ def draw_peer_runs(shown: Comparison) -> Figure:
         panels[0].set_ylim(measured.min() - 0.6 * span, measured.max() + 0.6 * span)
         panels[0].set_xlim(0, shown.trial.fresh.time_s[-1])
         panels[-1].set_xlabel("time [s]")
-        style.finish(figure, panels, columns=4)
+        style.finish(figure)
     return figure
 
 
@@ -188,8 +186,7 @@ def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
         grid[0, 0].set_ylim(floor, decibels(np.abs(study.truth).max()) + 10)
         span = unwrapped_degrees(study.truth)
         grid[1, 0].set_ylim(span.min() - 200, span.max() + 100)
-        figure.align_ylabels()
-        style.finish(figure, [*grid[0], grid[2, 0]], columns=4)
+        style.finish(figure)
     return figure
 
 

@@ -34,7 +34,7 @@ def draw_surface(study: SurfaceStudy) -> Figure:
         _cuts(close, whole, study)
         _counts(counts, study.counts)
         _shares(shares, study.shares)
-        style.finish(figure, [left, whole, counts, shares], columns=3)
+        style.finish(figure)
     return figure
 
 

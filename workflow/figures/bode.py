@@ -41,7 +41,7 @@ def draw_channel(channel: ChannelView, name: str) -> Figure:
     )
 
 
-@style.house_style()
+@style.finished
 def draw_bode(
     uncertainty: FrequencyUncertainty,
     title: str,
@@ -56,8 +56,7 @@ def draw_bode(
     """
     band = response_band(uncertainty)
     omega = band.omega_rad_s
-    figure = style.new_figure(7.0)
-    gain, phase, size = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
+    figure, (gain, phase, size) = style.panels(7.0, 3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
     floor = _gain_floor(band.gain, np.abs(empirical.centre) if empirical else np.empty(0))
     if empirical is not None:
         inside = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
@@ -92,8 +91,6 @@ def draw_bode(
     size.set(xlabel="frequency [rad/s]", ylabel="ellipse / gain [%]")
     gain.set_xlim(omega[0], omega[-1])
     style.hertz_axis(gain)
-    figure.align_ylabels()
-    style.finish(figure, (gain, size), columns=5)
     return figure
 
 

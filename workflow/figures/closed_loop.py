@@ -42,7 +42,7 @@ def draw_run(run: RunView) -> Figure:
     )
 
 
-@style.house_style()
+@style.finished
 def draw_closed_loop(
     time_s: Real,
     reference: Real,
@@ -65,8 +65,9 @@ def draw_closed_loop(
     """
     both = (predicted,) if others is None else (predicted, others)
     onset, windows = _windows(time_s, disturbance, labels, both)
-    figure = style.new_figure(2.1 * len(labels) + 0.9)
-    grid = figure.subplots(len(labels), len(windows), squeeze=False, sharex="col", sharey="row")
+    figure, grid = style.panels(
+        2.1 * len(labels) + 0.9, len(labels), len(windows), squeeze=False, sharex="col", sharey="row"
+    )
     for (kind, label), row in zip(labels.items(), grid, strict=True):
         hold = {"drawstyle": "steps-post"} if kind == "command" else {}
         line: Real = getattr(predicted, kind)[0]
@@ -94,8 +95,6 @@ def draw_closed_loop(
         axes.set_title(title)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
-    figure.align_ylabels()
-    style.finish(figure, grid.ravel(), columns=4)
     return figure
 
 
@@ -203,8 +202,7 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
     measured, (low, high) = run.loop.sensitivity.measured, run.loop.sensitivity.band_rad_s
     omega = np.geomspace(0.9 * low, min(1.1 * high, run.plant.nyquist_rad_s), 900)
     curve = curves_of(run, omega)[0]
-    figure = style.new_figure(3.9)
-    whole, near = figure.subplots(1, 2)
+    figure, (whole, near) = style.panels(3.9, 1, 2)
     for axes in (whole, near):
         axes.fill_between(omega, curve.nominal, curve.worst, **style.BAND)
         label = f"worst case over the {share(run.level)} ellipses"
@@ -214,8 +212,7 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
             bars = {"yerr": 2 * m.std, "elinewidth": 0.6, "capsize": 0} if axes is near else {}
             axes.errorbar(m.omega_rad_s, m.magnitude, ls="none", label=m.name, **look, **bars)
         axes.set(xscale="log", xlabel="frequency [rad/s]")
-    whole.set(yscale="log", ylabel="|S| [1]")
-    whole.set_title("Sensitivity, reference to error")
+    whole.set(yscale="log", ylabel="|S| [1]", title="Sensitivity, reference to error")
     low = min(float(m.omega_rad_s[0]) for m in measured)
     high = max(float(m.omega_rad_s[-1]) for m in measured)
     whole.set_xlim(low / 1.1, high * 1.1)
@@ -232,7 +229,6 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
     near.set_xlim(start, stop)
     near.set_ylim(*style.pad_limits(float(curve.nominal[part].min()), top, 0.08))
     near.set_title("Around its peak (bars: two standard deviations)")
-    style.finish(figure, [whole, near], columns=3)
     return figure
 
 
@@ -261,6 +257,4 @@ def draw_conditions(run: RunView) -> Figure | None:
     for axes in panels[-columns:]:
         axes.set_xlabel("time [s]")
         axes.tick_params(labelbottom=True)
-    figure.align_ylabels()
-    style.finish(figure, panels, columns=3)
     return figure

@@ -38,8 +38,7 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     surface = _surface(channel, channel.shown_pair)
     omega, zeta = surface.first, surface.second
     ratio = np.sqrt(surface.mean_square.T / surface.mean_square.min())
-    figure = style.new_figure(4.9)
-    left, right = figure.subplots(1, 2, width_ratios=[1.75, 1.0])
+    figure, (left, right) = style.panels(4.9, 1, 2, width_ratios=[1.75, 1.0])
     top = max(float(np.percentile(ratio, 99)), 1.0001)
     levels = np.geomspace(1.0, top, 22)
     shades = np.clip(ratio, 1.0, top)
@@ -64,7 +63,6 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     right.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]))
     right.set(xlabel="frequency of the pair [rad/s]", ylabel="residual RMS / smallest [1]")
     right.set_title("Along frequency, best damping")
-    style.finish(figure, left, columns=4)
     return figure
 
 

@@ -31,8 +31,7 @@ def draw_probabilities(found: Diagnosis) -> Figure:
         names.append(f"all {len(ranked) - len(shown)} others together")
         percent.append(max(0.0, 100 - sum(percent)))
         colours.append(gap_style.PALE)
-    figure = style.new_figure(1.0 + 0.34 * len(names))
-    axes = figure.subplots()
+    figure, axes = style.panels(1.0 + 0.34 * len(names))
     bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
     labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
     axes.bar_label(bars, labels, padding=4, fontsize=9)
@@ -47,8 +46,7 @@ def draw_probabilities(found: Diagnosis) -> Figure:
 def draw_waterfall(found: Diagnosis) -> Figure:
     """Pooled root mean square of (measured - model)/noise: held-out records together, every record alone."""
     gaps, rows, floor = found.gaps, found.gap_by_experiment, found.noise_floor
-    figure = style.new_figure(max(3.4, 1.8 + 0.3 * len(rows)))
-    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
+    figure, (left, right) = style.panels(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
     bars = left.bar(
         np.arange(len(gaps)),
         list(gaps.values()),
@@ -71,7 +69,6 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
     right.set(ylim=(len(rows) - 0.5, -0.5), xlabel="residual over noise, RMS [1]")
     right.set_title("Every experiment alone")
-    style.finish(figure, (right, left))
     return figure
 
 
@@ -81,8 +78,7 @@ def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
     nominal parameters, and with the effects added."""
     before, after = ([case[key] for case in cases] for key in ("gap_before", "gap_after"))
     at, floor = np.arange(len(cases)), float(np.median([case["noise_floor"] for case in cases]))
-    figure = style.new_figure(1.5 + 0.32 * len(cases))
-    axes = figure.subplots()
+    figure, axes = style.panels(1.5 + 0.32 * len(cases))
     axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
     for model, values in (("stated", before), ("repaired", after)):
         axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
@@ -91,7 +87,6 @@ def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
     axes.set_yticks(at, [f"{style.plain(c['name'], 34)}: {style.plain(c['answer'], 44)}" for c in cases])
     axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
     axes.set_title("How far each gap shrinks")
-    style.finish(figure, axes)
     return figure
 
 

@@ -20,11 +20,9 @@ Real = npt.NDArray[np.float64]
 def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequence[str]) -> Figure:
     """Voltage, and difference (T, 2) of the two likeliest answers in noise deviations, hub before tip."""
     time_s = np.arange(proposal.voltage_V.size, dtype=np.float64) * proposal.dt_s
-    figure = style.new_figure(4.2)
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.3])
+    figure, (above, below) = style.panels(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
     above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
-    above.set_ylabel("voltage [V]")
-    above.set_title("Proposed experiment")
+    above.set(ylabel="voltage [V]", title="Proposed experiment")
     below.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
     for signal, colour, words in zip(
         difference.T, gap_style.SENSOR_COLOURS, gap_style.SENSOR_WORDS, strict=True
@@ -32,10 +30,8 @@ def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequ
         below.plot(*outline(time_s, signal), color=colour, lw=1.0, label=words)
     title = f"{style.plain(names[0], 48)} minus {style.plain(names[1], 48)}"
     below.set_title(title, fontweight="normal", fontsize=9.5)
-    below.set_xlabel("time [s]")
-    below.set_ylabel("difference\nover noise [1]")
+    below.set(xlabel="time [s]", ylabel="difference\nover noise [1]")
     below.margins(x=0.01)
-    style.finish(figure, below, columns=3)
     return figure
 
 
@@ -52,8 +48,7 @@ def draw_controller_check(
         ({**style.PREDICTED_LINE, "ls": (0, (4, 1.5))}, "predicted by its own model"),
         (style.ACHIEVED_LINE, "achieved on the repaired machine"),
     )
-    figure = style.new_figure(4.6)
-    grid = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=[1.6, 1.0])
+    figure, grid = style.panels(4.6, 2, 2, sharex=True, sharey="row", height_ratios=[1.6, 1.0])
     for column, design in enumerate(("nominal parameters", "repaired rig")):
         above, below = grid[:, column]
         above.plot(time_s, 1e3 * reference_m, **style.REFERENCE_LINE, label="asked for")
@@ -65,5 +60,4 @@ def draw_controller_check(
         above.margins(x=0.01)
     grid[0, 0].set_ylabel("tip position [mm]")
     grid[1, 0].set_ylabel("voltage [V]")
-    style.finish(figure, grid.ravel())
     return figure

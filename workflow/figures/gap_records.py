@@ -26,8 +26,9 @@ _MODES = 3
 def draw_residual_traces(found: Diagnosis) -> Figure:
     """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise."""
     case, models = found.case, dict.fromkeys(("stated", found.models[-1]))
-    figure = style.new_figure(0.9 + 1.25 * len(case.experiments))
-    grid = figure.subplots(len(case.experiments), 2, sharex="row", squeeze=False)
+    figure, grid = style.panels(
+        0.9 + 1.25 * len(case.experiments), len(case.experiments), 2, sharex="row", squeeze=False
+    )
     for row, experiment in zip(grid, case.experiments, strict=True):
         residuals = {model: found.residuals[model][experiment.name] for model in models}
         time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
@@ -46,7 +47,6 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
         row[0].set_ylabel("residual\nover noise [1]", fontsize=8.5)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
-    style.finish(figure, grid.ravel(), columns=3)
     return figure
 
 
@@ -71,10 +71,8 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
                 style.tag_below(axes, mode, f"mode {number}")
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.1), max(high, 10.0))
-        axes.set_xlabel("frequency [Hz]")
-        axes.set_title(f"Residual of the {gap_style.SENSOR_WORDS[column]}")
+        axes.set(xlabel="frequency [Hz]", title=f"Residual of the {gap_style.SENSOR_WORDS[column]}")
     panels[0].set_ylabel("power over that of the noise [1]")
-    style.finish(figure, panels)
     return figure
 
 

@@ -34,8 +34,9 @@ def draw_bands_and_experiments(where: Where) -> Figure:
     deviations; less is drawn at its edge.
     """
     experiments = where.experiments
-    figure = style.new_figure(max(3.7, 1.7 + 0.36 * len(experiments)))
-    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+    figure, (left, right) = style.panels(
+        max(3.7, 1.7 + 0.36 * len(experiments)), 1, 2, width_ratios=[1.25, 1.0]
+    )
     for sensor, shift in zip(SENSORS, (0.97, 1.03), strict=True):
         name, colour = _LOOKS[sensor]
         for band in (band for band in where.bands if band.sensor == sensor):
@@ -63,7 +64,6 @@ def draw_bands_and_experiments(where: Where) -> Figure:
     right.set_title("By experiment and sensor")
     right.grid(visible=False, axis="y")
     left.plot([], [], **_WHISKER, label="95 % interval")
-    style.finish(figure, (left, right))
     return figure
 
 
@@ -88,7 +88,6 @@ def draw_regimes(where: Where) -> Figure | None:
         axes.set_xlabel(_with_unit(_REGIMES[finding.axis], finding.unit))
         axes.set_ylabel("residual energy\nover that of the noise [1]")
         axes.set_title(name, fontsize=9.5, fontweight="normal")
-    style.finish(figure, panels)
     return figure
 
 
@@ -108,7 +107,6 @@ def draw_curves(where: Where) -> Figure | None:
         axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
         axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
         axes.set_title(f"{100 * curve.share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
-    style.finish(figure, panels)
     return figure
 
 

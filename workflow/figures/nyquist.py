@@ -68,8 +68,7 @@ def loop_of(run: RunView) -> UncertainLoop:
 def draw_nyquist(run: RunView) -> Figure:
     """Whole curve of a run's loop (as far as it fits) and the surroundings of -1."""
     loop, margin = loop_of(run), run.config.specification.modulus_margin
-    figure = style.new_figure(6.0)
-    whole, near = figure.subplots(1, 2)
+    figure, (whole, near) = style.panels(6.0, 1, 2)
     size = np.abs(loop.centre)
     reach = _reach(size)
     _draw_loop(whole, loop, (-reach, reach), (-reach, reach), run.level)
@@ -82,7 +81,6 @@ def draw_nyquist(run: RunView) -> Figure:
         words = below if slow[0] and not slow[-1] else "partly beyond the frame"
         box = {"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1}
         whole.text(0.02, 0.02, words, transform=whole.transAxes, fontsize=8.5, color="#555555", bbox=box)
-    style.finish(figure, (near, whole), columns=5)
     return figure
 
 

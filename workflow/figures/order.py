@@ -31,12 +31,10 @@ def draw_order(channel: ChannelView) -> Figure | None:
     plot, steps = channel.found.stabilisation, channel.found.identification.order_table
     if plot is None or not steps:
         return None
-    figure = style.new_figure(4.6)
-    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.7])
+    figure, (left, right) = style.panels(4.6, 1, 2, width_ratios=[1.0, 1.7])
     _criterion(left, steps, (plot.n_real, plot.chosen))
     left.set_title(f"Criterion: {style.plain(channel.name, 16)}")
     _stabilisation(right, plot, channel.spread.empirical)
-    style.finish(figure, (left, right), columns=4)
     return figure
 
 

@@ -18,8 +18,7 @@ from workflow.text.formats import share
 def draw_overview(run: RunView) -> Figure:
     """Left: identified gain with its ellipses; middle: the loop around -1; right: the reference step, without
     the disturbance that follows it."""
-    figure = style.new_figure(4.4, 12.0)
-    gain, around, step = figure.subplots(1, 3)
+    figure, (gain, around, step) = style.panels(4.4, 1, 3, width_in=12.0)
     spread, loop = run.control.spread, run.loop
     assert loop is not None
     band = response_band(spread.frequency)
@@ -48,7 +47,5 @@ def draw_overview(run: RunView) -> Figure:
     step.plot(time_s, predicted, **style.PREDICTED_LINE, label="predicted, nominal model")
     step.plot(time_s, loop.reference[half], **style.REFERENCE_STEPS, label="reference")
     name, unit = style.plain(run.config.control_channel.output, 24), style.plain(run.output_unit, 16)
-    step.set(xlabel="time [s]", ylabel=f"{name} [{unit or 'as logged'}]")
-    step.set_title("Checked in closed loop")
-    style.finish(figure, (gain, around, step), columns=5)
+    step.set(xlabel="time [s]", ylabel=f"{name} [{unit or 'as logged'}]", title="Checked in closed loop")
     return figure

@@ -26,8 +26,7 @@ def draw_poles(
     zeros (k,): the model's, drawn as circles where given.
     """
     poles = model.poles.values
-    figure = style.new_figure(5.6)
-    whole, near = figure.subplots(1, 2)
+    figure, (whole, near) = style.panels(5.6, 1, 2)
     for axes in (whole, near):
         _damping_lines(axes)
         if closed_loop is not None:
@@ -53,7 +52,6 @@ def draw_poles(
     near.set_title("Near z = 1 (dashed: damping, dotted: frequency)")
     _frequency_arcs(near, corner, model.dt_s)
     _name_dampings(near, corner)
-    style.finish(figure, whole, columns=5)
     return figure
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from ident.data.record import Record
 from workflow.figures import style
@@ -33,15 +32,17 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
     if not shown:
         raise ValueError("there is no record to draw")
     rows = [("input", name) for name in inputs] + [("output", name) for name in outputs]
-    figure = style.new_figure(1.55 * len(rows) + 1.0)
-    grid = figure.subplots(len(rows), 2, squeeze=False, sharex="col", width_ratios=[2.1, 1.0])
+    figure, grid = style.panels(
+        1.55 * len(rows) + 1.0, len(rows), 2, squeeze=False, sharex="col", width_ratios=[2.1, 1.0]
+    )
     starts = np.concatenate([[0.0], np.cumsum([item.duration_s * 1.02 for item in shown])])
     first = shown[0].record
     lively, _ = _signal(first, *rows[len(inputs) if outputs else 0])
     zoom = liveliest(lively, min(_ZOOM_SAMPLES, first.n_samples))
     for (kind, name), (left, right) in zip(rows, grid, strict=True):
         for item, start in zip(shown, starts, strict=False):
-            left.axvspan(start, start + item.duration_s, color=style.SHADE[item.role], alpha=0.10, lw=0)
+            shade = {"color": style.SHADE[item.role], "label": _WORDS[item.role], "alpha": 0.15, "lw": 0}
+            left.axvspan(start, start + item.duration_s, **shade)
             signal, _ = _signal(item.record, kind, name)
             left.plot(*outline(item.record.time_s + start, signal), **style.MEASURED_LINE | {"lw": 0.6})
         signal, unit = _signal(first, kind, name)
@@ -55,10 +56,6 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
     grid[0, 1].set_title("Close-up of record 1", pad=16)
     grid[-1, 0].set_xlabel("time, all records [s]")
     grid[-1, 1].set_xlabel("time in this record [s]")
-    figure.align_ylabels()
-    used = [role for role in _WORDS if any(item.role == role for item in shown)]
-    patches = [Patch(color=style.SHADE[role], alpha=0.25, label=_WORDS[role]) for role in used]
-    figure.legend(handles=patches, loc="outside lower center", ncols=len(used))
     return figure
 
 

@@ -6,20 +6,14 @@ import importlib
 import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import TypeVar
 
-from matplotlib.figure import Figure
-
-from workflow.figures.style import house_style
-
-Drawing = Callable[..., Figure | None]
-D = TypeVar("D", bound=Drawing)
+from workflow.figures.style import D, Drawing, finished
 
 _DRAWINGS: dict[str, Drawing] = {}
 
 
 def drawing(name: str) -> Callable[[D], D]:
-    """Give a drawing its name on the pages, and the house style.
+    """Give a drawing its name on the pages; it is `finished`.
 
     It takes typed results; None means there is nothing to draw.
     """
@@ -27,9 +21,8 @@ def drawing(name: str) -> Callable[[D], D]:
     def register(draw: D) -> D:
         if name in _DRAWINGS:
             raise ValueError(f"two drawings are called {name!r}")
-        styled: D = house_style()(draw)
-        _DRAWINGS[name] = styled
-        return styled
+        _DRAWINGS[name] = done = finished(draw)
+        return done
 
     return register
 

@@ -20,8 +20,7 @@ def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
     """
     if not rows:
         raise ValueError("there is no band of repeat scatter to draw")
-    figure = style.new_figure(4.4)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1.0])
+    figure, (upper, lower) = style.panels(4.4, 2, 1, sharex=True, height_ratios=[1.5, 1.0])
     for axes, field, factor, color, label in (
         (upper, "predicted", 100, style.MODEL, "one repeat, predicted by the ellipses"),
         (upper, "measured", 100, style.MEASURED, "measured between repeats"),
@@ -41,6 +40,4 @@ def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
     low, high = lower.get_ylim()
     lower.set_ylim(min(0.4, low), max(2.5, high))
     style.hertz_axis(upper)
-    figure.align_ylabels()
-    style.finish(figure, upper, columns=3)
     return figure

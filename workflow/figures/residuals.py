@@ -44,5 +44,4 @@ def draw_residual_tests(channel: ChannelView) -> Figure | None:
     name = style.plain(channel.name, 24)
     left.set_title(f"Residual, {name}: {'white' if whiteness.passed else 'not white'}")
     right.set_title(f"With the input: {'independent' if independence.passed else 'not independent'}")
-    style.finish(figure, panels, columns=3)
     return figure

@@ -109,7 +109,7 @@ def draw_run(run: RunView) -> Figure:
     return draw_sensitivities(curves_of(run), level=run.level, marks=marks)
 
 
-@style.house_style()
+@style.finished
 def draw_sensitivities(
     curves: Sequence[SensitivityCurve], *, level: float, marks: Sequence[tuple[float, str]] = ()
 ) -> Figure:
@@ -132,8 +132,6 @@ def draw_sensitivities(
                 style.tag_below(axes, at, word)
     for axes in panels[-2:]:
         axes.set_xlabel("frequency [rad/s]")
-    figure.align_ylabels()
-    style.finish(figure, panels, columns=4)
     return figure
 
 

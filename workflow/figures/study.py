@@ -52,7 +52,6 @@ def draw_pareto(panels: Sequence[Panel]) -> Figure:
     figure, places = style.small_multiples(len(panels), min(len(panels), 2), 4.3, 0.4)
     for axes, panel in zip(places, panels, strict=True):
         _draw(axes, panel)
-    style.finish(figure, places)
     return figure
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, Literal
+from functools import lru_cache, wraps
+from typing import Any, Literal, TypeVar, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -43,6 +43,9 @@ REFERENCE_STEPS: dict[str, Any] = REFERENCE_LINE | {"drawstyle": "steps-post"}
 BAND: dict[str, Any] = {"color": UNCERTAIN, "alpha": 0.42, "lw": 0}
 ACHIEVED_BAND: dict[str, Any] = {"color": ACHIEVED, "alpha": 0.22, "lw": 0}
 STAR: dict[str, Any] = {"ls": "none", "marker": "*", "mfc": HIGHLIGHT, "mec": "black"}
+
+Drawing = Callable[..., Figure | None]
+D = TypeVar("D", bound=Drawing)
 
 WIDTH_IN = 10.0  # 100 px per inch at the width of the page
 SVG_LIMIT_BYTES = 400_000
@@ -93,8 +96,7 @@ class Picture:
 
 
 def house_style() -> contextlib._GeneratorContextManager[None]:
-    """Context in which figures are built and rendered, or decorator; global matplotlib settings come back
-    afterwards."""
+    """Context in which figures are built and rendered; global matplotlib settings come back afterwards."""
     return mpl.rc_context(_RC)
 
 
@@ -105,16 +107,24 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     return figure
 
 
+def panels(
+    height_in: float, rows: int = 1, columns: int = 1, *, width_in: float = WIDTH_IN, **options: Any
+) -> tuple[Figure, Any]:
+    """An empty figure with its axes, as `Figure.subplots` gives them."""
+    figure = new_figure(height_in, width_in)
+    return figure, figure.subplots(rows, columns, **options)
+
+
 def small_multiples(
     count: int, columns: int, row_in: float, rest_in: float, **options: Any
 ) -> tuple[Figure, list[Axes]]:
     """So many panels in rows of `columns`, each row `row_in` high; a place left over stays empty."""
     rows = -(-count // columns)
-    figure = new_figure(row_in * rows + rest_in)
-    panels = figure.subplots(rows, columns, squeeze=False, **options).ravel()
-    for axes in panels[count:]:
+    figure, grid = panels(row_in * rows + rest_in, rows, columns, squeeze=False, **options)
+    places = list(grid.ravel())
+    for axes in places[count:]:
         axes.set_visible(False)
-    return figure, list(panels[:count])
+    return figure, places[:count]
 
 
 def render(figure: Figure) -> Picture:
@@ -178,13 +188,14 @@ def ratio_unit(output_unit: str, input_unit: str) -> str:
     return f"{output_unit or '?'} / {input_unit or '?'}"
 
 
-def finish(figure: Figure, axes: Axes | Iterable[Axes], columns: int = 4) -> None:
+def finish(figure: Figure) -> None:
     """Last step of a figure: labels of log axes, and one legend below, where it hides nothing, every entry
     once."""
+    figure.align_ylabels()
     plain_log_labels(figure)
     handles: dict[str, Any] = {}
-    for one in [axes] if isinstance(axes, Axes) else axes:
-        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if not handles:
         return
@@ -197,8 +208,22 @@ def finish(figure: Figure, axes: Axes | Iterable[Axes], columns: int = 4) -> Non
         list(handles),
         loc="outside lower center",
         borderaxespad=0.9,
-        ncols=min(columns, fitting, len(handles)),
+        ncols=min(fitting, len(handles)),
     )
+
+
+def finished(draw: D) -> D:
+    """Decorator of what draws a figure: the house style around it, and `finish` once at its end."""
+
+    @wraps(draw)
+    def styled(*what: Any, **more: Any) -> Figure | None:
+        with house_style():
+            figure = draw(*what, **more)
+            if figure is not None and not figure.legends:
+                finish(figure)
+        return figure
+
+    return cast(D, styled)
 
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -257,33 +282,6 @@ def hertz_axis(axes: Axes) -> None:
     top.xaxis.set_minor_formatter(NullFormatter())
     top.tick_params(labelsize=8.5, colors="#666666")
     top.set_xlabel("frequency [Hz]", fontsize=8.5, color="#666666")
-
-
-def inline_svg(svg: bytes, prefix: str, label: str) -> str:
-    """The <svg> element alone, ids made unique by `prefix`, `label` (already HTML-escaped) as its accessible
-    name.
-
-    Comments go (they carry the drawn texts a second time), so do the XML prologue, the metadata and the fixed
-    size.
-    """
-    text = svg.decode("utf-8")
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
-    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}\1"', text)
-    text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}\1"', text)
-    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}\1)", text)
-    # The common style rule of matplotlib would reach every other figure of the page: give it to this one's
-    # group.
-    text = re.sub(r"<defs>\s*<style[^>]*>.*?</style>\s*</defs>\s*", "", text, count=1, flags=re.DOTALL)
-    head, body = text.split(">", 1)
-    box = re.search(r'viewBox="([^"]+)"', head)
-    view = box.group(1) if box else "0 0 720 400"
-    return (
-        f'<svg viewBox="{view}" role="img" aria-label="{label}" xmlns="http://www.w3.org/2000/svg" '
-        f'xmlns:xlink="http://www.w3.org/1999/xlink" '
-        f'style="stroke-linejoin:round;stroke-linecap:butt">{body.rstrip()}'
-    )
 
 
 def pad_limits(low: float, high: float, share: float = 0.06) -> tuple[float, float]:

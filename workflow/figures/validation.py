@@ -33,8 +33,7 @@ def draw_validation(channel: ChannelView) -> Figure:
         record, role, fit = channel.fresh_records[shown], found.fresh_roles[shown], found.fresh[shown]
     measured, time_s = record.output[:, 0], record.time_s
     noise = 2 * found.identification.noise_std
-    figure = style.new_figure(4.7)
-    grid = figure.subplots(2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
+    figure, grid = style.panels(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
     length = min(400, max(time_s.size // 4, min(100, time_s.size)))
     for (upper, lower), part in zip(grid.T, (slice(None), liveliest(measured, length)), strict=True):
         time = time_s[part]
@@ -50,6 +49,4 @@ def draw_validation(channel: ChannelView) -> Figure:
     unit = record.output_units[0] if record.output_units else ""
     grid[0, 0].set_ylabel(style.two_lines(record.output_names[0], unit))
     grid[1, 0].set_ylabel(style.two_lines("residual", unit))
-    figure.align_ylabels()
-    style.finish(figure, grid.ravel(), columns=4)
     return figure

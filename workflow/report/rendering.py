@@ -7,7 +7,6 @@ A template sees the typed values it is given, the filters of `workflow.text.form
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 from markupsafe import Markup
 
 from workflow.figures.registry import drawings
-from workflow.figures.style import Picture, inline_svg, render
+from workflow.figures.style import Picture, render
 from workflow.text.templates import environment
 
 
@@ -53,19 +52,14 @@ def render_page(
         if stem in pictures:
             raise ValueError(f"the page has two pictures called {stem!r}: give one another `file`")
         pictures[stem] = render(figure)
-        return embedded(stem, Markup(caption).striptags(), pictures[stem])
+        return embedded(Markup(caption).striptags(), pictures[stem])
 
     page = environment(*filters).get_template(template).render(draw=draw, contents=[], **values)
     return RenderedPage(page.strip() + "\n", pictures)
 
 
-def embedded(name: str, label: str, picture: Picture) -> Markup:
-    """The picture inside the page: SVG elements with ids of their own, or a base64 image.
-
-    name: its file's, unlike any other on the page; begins those ids. label: plain text, read in its place.
-    """
-    label = html.escape(label, quote=True)
-    if picture.kind == "svg":
-        return Markup(inline_svg(picture.content, f"{name}-", label))
+def embedded(label: str, picture: Picture) -> Markup:
+    """The picture inside the page, an image of its own; label: plain text, read in its place."""
+    kind = "svg+xml" if picture.kind == "svg" else "png"
     content = base64.b64encode(picture.content).decode("ascii")
-    return Markup(f'<img src="data:image/png;base64,{content}" alt="{label}">')
+    return Markup('<img src="data:image/{};base64,{}" alt="{}">').format(kind, content, label)
