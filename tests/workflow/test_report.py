@@ -287,7 +287,9 @@ def test_hostile_names_are_escaped(tmp_path):
     assert ATTACK not in text
     assert "<img src=x" not in text
     page = Page(text)
-    assert not any(tag in ("script", "img", "b", "i") for tag, _ in page.tags)
+    assert not any(tag in ("script", "b", "i") for tag, _ in page.tags)
+    images = [attributes for tag, attributes in page.tags if tag == "img"]
+    assert all(image.keys() == {"src", "alt"} and "data:" in str(image["src"]) for image in images)
     assert ATTACK in page.text  # shown as it was written
     assert "{{ 7 * 7 }}" in page.text  # no template runs inside user text
     assert "{% raw %}" in page.text

@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -30,16 +30,17 @@ from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import StageError
 from workflow.engine.executor import LocalProcesses
-from workflow.figures.study import Mark, Panel, draw_pareto
 from workflow.figures.style import PREDICTED, render
+from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.keys import last_name, parse_key, with_values
-from workflow.study.page import StudyView, study_page
-from workflow.study.points import short
+from workflow.study.page import StudyView
+from workflow.study.pareto import draw_pareto
+from workflow.study.points import Point, short
 from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
-from workflow.study.task import Job, Task
+from workflow.study.task import Task
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -164,8 +165,14 @@ def test_margins_in_the_units_of_the_table():
     )
     certificate = SimpleNamespace(plants=(verdict,), gamma=math.inf, gamma_bound=None)
     certify = CertifyResult(certificate, certified=False, reason="")
-    rest = AchievablePerformance(), certify, ReferenceFilterResult(), ClosedLoopResult(skipped="why not")
-    found = numbers_of(design_of(0.8), *rest, (30.0, 100.0))
+    results = SimpleNamespace(
+        design=design_of(0.8),
+        achievable_performance=AchievablePerformance(),
+        certify=certify,
+        reference_filter=ReferenceFilterResult(),
+        closed_loop=ClosedLoopResult(skipped="why not"),
+    )
+    found = numbers_of(results, (30.0, 100.0))
     assert found["gain_margin_dB"] == pytest.approx(6.0206, abs=1e-4)  # down to a half: the nearer side
     assert found["nominal_gain_margin_dB"] == pytest.approx(12.0412, abs=1e-4)
     assert found["phase_margin_deg"] == pytest.approx(57.29578)
@@ -173,8 +180,8 @@ def test_margins_in_the_units_of_the_table():
     assert found["worst_gamma"] is None
     assert (found["mode_damping"], found["mode_omega_rad_s"]) == (0.2, 40.0)
     assert (found["design_gamma"], found["any_order_gamma"], found["matching_error"]) == (0.8, None, None)
-    nothing = DesignResult(None, met=False, reason="")
-    assert numbers_of(nothing, *rest, None)["mode_damping"] == 0.1
+    results.design = DesignResult(None, met=False, reason="")
+    assert numbers_of(results, None)["mode_damping"] == 0.1
 
 
 def test_numbers_beyond_the_margins():
@@ -186,14 +193,14 @@ def test_numbers_beyond_the_margins():
     )
     row = SimpleNamespace(**_METRICS)
     check = SimpleNamespace(settled_draws=1, draws=1, sensitivity=peaks, achieved=(row,))
-    found = numbers_of(
-        design_of(0.88),
-        achievable(0.8),
-        CertifyResult(None, certified=False, reason="", sampled=sampled_responses(0.9)),
-        ReferenceFilterResult(filtered),
-        ClosedLoopResult(check=check),
-        None,
+    results = SimpleNamespace(
+        design=design_of(0.88),
+        achievable_performance=achievable(0.8),
+        certify=CertifyResult(None, certified=False, reason="", sampled=sampled_responses(0.9)),
+        reference_filter=ReferenceFilterResult(filtered),
+        closed_loop=ClosedLoopResult(check=check),
     )
+    found = numbers_of(results, None)
     assert found["any_order_gamma"] == 0.8
     assert found["above_any_order_percent"] == pytest.approx(10.0)
     assert (found["whole_held_percent"], found["whole_stable_percent"]) == (99.0, 100.0)
@@ -206,13 +213,20 @@ _METRICS = dict.fromkeys(
 )
 
 
+def _view(rows: list[PointRow], plots: int = 1) -> StudyView:
+    config: Any = SimpleNamespace(pareto=(_PLOT,) * plots)
+    return StudyView("a study", config, "", "", rows, {})
+
+
 def test_picture_tells_certified_from_uncertified():
-    marks = (
-        Mark(1, 1.0, 0.9, good=True, front=True),
-        Mark(2, 1.0, 0.5, good=True, front=False),
-        Mark(3, 2.0, 0.9, good=False, front=False),
-    )
-    figure = draw_pareto([Panel("x", "y", "larger", "larger", marks, missing=2)])
+    rows = [
+        _row(1, 1.0, 0.9),
+        _row(2, 1.0, 0.5),
+        _row(3, 2.0, 0.9, good=False),
+        _row(4, None, 0.9),
+        _row(5, 1.0, None),
+    ]
+    figure = draw_pareto(_view(rows))
     axes = figure.axes[0]
     by_label = {line.get_label(): line for line in axes.lines}
     assert to_hex(by_label["certified, on the front"].get_color()) == PREDICTED.lower()
@@ -225,12 +239,14 @@ def test_picture_tells_certified_from_uncertified():
 
 
 def test_picture_of_nothing_is_drawn():
-    empty = Panel("x", "y", "larger", "smaller", (), missing=3)
-    assert render(draw_pareto([empty, empty, empty])).kind == "svg"
+    assert render(draw_pareto(_view([_row(1, None, None)] * 3, 3))).kind == "svg"
+
+
+NO_POINT = Point(1, "p", {}, cast(Any, None), {}, "", "", ())
 
 
 def test_other_code_on_the_worker_is_refused():
-    task = Task((Job("p", {}, {}),), {}, ("design",), "0" * 64)
+    task = Task((NO_POINT,), {}, ("design",), "0" * 64)
     with pytest.raises(StageError, match="code of the worker is not that of the study"):
         task.run(lambda fraction, message: None)
 
@@ -243,8 +259,8 @@ class Deadly:
 
 
 def test_a_task_that_kills_its_process_fails_alone():
-    harmless = Task((Job("harmless", {}, {}),), {}, ("design",), "0" * 64)
-    deadly = Task((Job("deadly", {}, {}),), {"bomb": Deadly()}, ("design",), "0" * 64)
+    harmless = Task((NO_POINT,), {}, ("design",), "0" * 64)
+    deadly = Task((NO_POINT,), {"bomb": Deadly()}, ("design",), "0" * 64)
     before = os.environ.get("OMP_NUM_THREADS")
     with closing(LocalProcesses(2, preload=["workflow.study.task"])) as processes:
         found = dict(processes.run([harmless, deadly, harmless, harmless]))
@@ -328,7 +344,8 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
     row = PointRow(1, "a", {axis.key: 1.0}, "does not come to rest", "why", numbers)
     search = SimpleNamespace(method="grid")
     config: Any = SimpleNamespace(axes=(axis,), pareto=(), search=search)
-    page = study_page("a study", StudyView(config, "[study]", "the arm", [row], [], {})).html
+    view = StudyView("a study", config, "[study]", "the arm", [row], {})
+    page = render_page("study.html.j2", title="a study", study=view).html
     tables = re.findall(r"<thead>(.*?)</thead>\s*<tbody>(.*?)</tbody>", page, re.DOTALL)
     heads = [re.findall(r"<th[^>]*>(.*?)</th>", head) for head, _ in tables]
     rows = [re.findall(r"<td>(.*?)</td>", body) for _, body in tables]

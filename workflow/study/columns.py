@@ -9,13 +9,7 @@ from typing import Literal
 
 from control_design.analysis.margins import Margins
 from workflow.tasks.achievable_performance import bracket_numbers
-from workflow.tasks.results import (
-    AchievablePerformance,
-    CertifyResult,
-    ClosedLoopResult,
-    DesignResult,
-    ReferenceFilterResult,
-)
+from workflow.tasks.results import RunResults
 
 Number = float | int | None
 
@@ -68,14 +62,7 @@ _ALL = (
 COLUMNS: Mapping[str, Column] = {column.name: column for column in _ALL}
 
 
-def numbers_of(
-    design: DesignResult,
-    achievable: AchievablePerformance,
-    certify: CertifyResult,
-    reference_filter: ReferenceFilterResult,
-    loop: ClosedLoopResult,
-    mode_band_rad_s: tuple[float, float] | None,
-) -> dict[str, Number]:
+def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None) -> dict[str, Number]:
     """Numbers of a point from the results of its stages; None where there is none.
 
     Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
@@ -83,17 +70,19 @@ def numbers_of(
     that was identified, at the larger of two sizes.
     """
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
-    found["design_gamma"] = _finite(design.gamma)
-    bracket = bracket_numbers(achievable, design.gamma)
+    gamma, certify = results.design.gamma, results.certify
+    found["design_gamma"] = _finite(gamma)
+    bracket = bracket_numbers(results.achievable_performance, gamma)
     found["any_order_gamma"] = bracket["reached"]
     found["above_any_order_percent"] = bracket["above_percent"]
     joint = certify.sampled.joint
     if joint is not None:
         found["whole_held_percent"] = 100.0 * joint.coverage_given
         found["whole_stable_percent"] = 100.0 * joint.stable_share
-    if reference_filter.filter is not None:
-        found["matching_error"] = reference_filter.filter.error_after
-        found["matching_error_unfiltered"] = reference_filter.filter.error_before
+    prefilter = results.reference_filter.filter
+    if prefilter is not None:
+        found["matching_error"] = prefilter.error_after
+        found["matching_error_unfiltered"] = prefilter.error_before
     certificate = certify.certificate
     if certificate is not None:
         verdict = certificate.plants[0]
@@ -106,7 +95,7 @@ def numbers_of(
         if modes:
             least = min(modes, key=lambda mode: mode.zeta)
             found["mode_damping"], found["mode_omega_rad_s"] = least.zeta, least.omega_rad_s
-    check = loop.check
+    check = results.closed_loop.check
     if check is not None:
         found["settled_draws"], found["draws"] = check.settled_draws, check.draws
         for name in (

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from workflow.figures.study import Mark, Panel
-from workflow.report.rendering import RenderedPage, render_page
+from workflow.engine import codec
 from workflow.study.columns import COLUMNS, Column
 from workflow.study.points import short
-from workflow.study.rows import PointRow, State
-from workflow.study.settings import ParetoPlot, StudyConfig
+from workflow.study.rows import PointRow, State, pareto_front
+from workflow.study.settings import StudyConfig
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import render_text, rows_of
 
@@ -21,15 +21,19 @@ _BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "rise_time_s")
 
 @dataclass(frozen=True, eq=False)
 class StudyView:
-    """A finished study. text: its file; fronts: numbers of the points on the Pareto front of each plot of the
-    settings; units: those of columns whose unit the rig decides."""
+    """A finished study. text: its file; units: those of columns whose unit the rig decides."""
 
+    title: str
     config: StudyConfig
     text: str
     base: str
     rows: Sequence[PointRow]
-    fronts: Sequence[Sequence[int]]
     units: Mapping[str, str]
+
+    @cached_property
+    def fronts(self) -> list[list[int]]:
+        """Numbers of the points on the Pareto front of each plot of the settings."""
+        return [pareto_front(self.rows, plot) for plot in self.config.pareto]
 
     @property
     def counts(self) -> Mapping[State, int]:
@@ -71,43 +75,35 @@ class StudyView:
                 together.setdefault((row.state, row.why), []).append(row.number)
         return [(state, why, numbers) for (state, why), numbers in together.items()]
 
-    @property
-    def panels(self) -> list[Panel]:
-        plots = zip(self.config.pareto, self.fronts, strict=True)
-        return [self._panel(plot, front) for plot, front in plots]
+    def heading(self, name: str) -> str:
+        unit = self.unit(name)
+        return f"{COLUMNS[name].label} [{unit}]" if unit else COLUMNS[name].label
 
-    def _panel(self, plot: ParetoPlot, front: Sequence[int]) -> Panel:
-        marks = []
-        for row in self.rows:
-            a, b = row.numbers[plot.x], row.numbers[plot.y]
-            if a is not None and b is not None:
-                marks.append(Mark(row.number, float(a), float(b), row.good, row.number in front))
-        x, y = COLUMNS[plot.x], COLUMNS[plot.y]
-        return Panel(
-            self._heading(x),
-            self._heading(y),
-            str(x.better),
-            str(y.better),
-            tuple(marks),
-            missing=len(self.rows) - len(marks),
+    @property
+    def document(self) -> Any:
+        """What table.json holds."""
+        return codec.plain(
+            {
+                "title": self.title,
+                "columns": {
+                    name: {"label": column.label, "unit": column.unit, "better": column.better}
+                    for name, column in COLUMNS.items()
+                },
+                "fronts": [
+                    {"x": plot.x, "y": plot.y, "points": front}
+                    for plot, front in zip(self.config.pareto, self.fronts, strict=True)
+                ],
+                "points": self.rows,
+            }
         )
 
-    def _heading(self, column: Column) -> str:
-        unit = self.unit(column.name)
-        return f"{column.label} [{unit}]" if unit else column.label
 
-
-def study_page(title: str, study: StudyView) -> RenderedPage:
-    """The page with its pictures."""
-    return render_page("study.html.j2", title=title, study=study)
-
-
-def study_summary(title: str, study: StudyView, numbers: Mapping[str, Any], path: str) -> RunSummary:
+def study_summary(study: StudyView, path: str) -> RunSummary:
     """What the terminal says of it."""
     return RunSummary(
-        title=title,
+        title=study.title,
         sections=rows_of("study_summary.j2", study=study),
-        numbers=numbers,
+        numbers=study.document,
         certified=any(row.good for row in study.rows),
         verdict=render_text("study_verdict.j2", study=study).strip(),
         report_path=path,

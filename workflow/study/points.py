@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,29 @@ class Base:
     inputs: Mapping[str, str]
     run: RunDirectory | None
     folder: Path
+
+    def changed(self, values: Mapping[str, Any], source: str) -> RunConfig:
+        """The configuration with dotted keys set. Raises InputError naming `source` where they do not fit."""
+        try:
+            document = with_values(self.document, values)
+        except ValueError as error:
+            raise InputError(f"{source}: {error}") from error
+        return check(RunConfig, document, source=source, context=self.context)
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        return self.config.to_document()
+
+    @property
+    def context(self) -> dict[str, Any]:
+        """What paths in changed values are relative to; logs behind a run that is there may be gone."""
+        return {"base": self.folder, "may_be_gone": self.run is not None}
+
+    def inputs_of(self, config: RunConfig) -> Mapping[str, str]:
+        """SHA-256 of the input files, those of the run where one was given."""
+        if self.run is not None:
+            return self.inputs
+        return {str(path): storage.sha256_of_file(path) for path in config.input_files}
 
     @property
     def digests(self) -> dict[str, str]:
@@ -100,10 +124,10 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
     values: dict[str, Any] = {"synthesis.jobs": 1, **study.changes}
     if study.study.seed is not None:
         values["run.seed"] = study.study.seed
-    folder = study_path.absolute().parent
-    changed = _checked(config.to_document(), values, f"{study_path}: changes", folder, gone=run is not None)
-    inputs = run.manifest()["inputs"] if run is not None else _input_hashes(changed)
-    return Base(changed, inputs, run, folder)
+    inputs = {} if run is None else run.manifest()["inputs"]
+    start = Base(config, inputs, run, study_path.absolute().parent)
+    changed = start.changed(values, f"{study_path}: changes")
+    return replace(start, config=changed, inputs=start.inputs_of(changed))
 
 
 class PointMaker:
@@ -111,7 +135,6 @@ class PointMaker:
 
     def __init__(self, study: StudyConfig, study_path: Path, base: Base) -> None:
         self._axes, self._path, self._base = study.axes, study_path, base
-        self._document = base.config.to_document()
         self._original = None if base.run is None else config_of(base.run)
         self._digests = base.digests
         self._made = 0
@@ -121,15 +144,12 @@ class PointMaker:
     def make(self, values: Mapping[str, Any]) -> Point | Contradiction:
         """The point of these values, one per axis. That they contradict one another is a result too."""
         self._made += 1
-        source = "the configuration contradicts itself"
         try:
-            config = _checked(
-                self._document, values, source, self._base.folder, gone=self._base.run is not None
-            )
+            config = self._base.changed(values, "the configuration contradicts itself")
         except InputError as error:
-            name = self._name(values, hash_of({"base": self._document, "values": values}))
+            name = self._name(values, hash_of({"base": self._base.document, "values": values}))
             return Contradiction(self._made, name, dict(values), str(error))
-        inputs = self._base.inputs if self._base.run is not None else _input_hashes(config)
+        inputs = self._base.inputs_of(config)
         given = () if self._original is None else shared_stages(config, self._original)
         plant_key = hash_of(
             {
@@ -166,23 +186,19 @@ class PointMaker:
 
     def _refuse_bad_values(self, index: int, axis: Axis) -> None:
         """A value no combination can make right is an error of the study, named with file and key."""
-        ends: list[tuple[str, Any]]
+        ends: dict[str, Any] = {"from": axis.from_, "to": axis.to}
         if axis.values is not None:
-            ends = [(f"values[{place}]", value) for place, value in enumerate(axis.values)]
-        else:
-            ends = [("from", axis.from_), ("to", axis.to)]
-        for where, value in ends:
-            source = f"{self._path}: axes[{index}].{where}"
-            gone = self._base.run is not None
+            ends = {f"values[{place}]": value for place, value in enumerate(axis.values)}
+        for where, value in ends.items():
             try:
-                document = with_values(self._document, {axis.key: value})
-                RunConfig.model_validate(document, context=_context(self._base.folder, gone))
+                document = with_values(self._base.document, {axis.key: value})
+                RunConfig.model_validate(document, context=self._base.context)
             except ValidationError as error:
                 if all(_only_a_contradiction(detail, axis.key) for detail in error.errors()):
                     continue
             except ValueError:
                 pass
-            _checked(self._document, {axis.key: value}, source, self._base.folder, gone=gone)
+            self._base.changed({axis.key: value}, f"{self._path}: axes[{index}].{where}")
 
 
 def shared_stages(one: RunConfig, other: RunConfig) -> tuple[str, ...]:
@@ -208,21 +224,3 @@ def _only_a_contradiction(detail: Any, key: str) -> bool:
     """True for what sections say about values that are each right by themselves."""
     named = last_name(key) in detail["loc"]
     return detail["type"] == "value_error" and not named
-
-
-def _context(folder: Path, gone: bool) -> dict[str, Any]:
-    return {"base": folder, "may_be_gone": gone}
-
-
-def _checked(
-    document: Mapping[str, Any], values: Mapping[str, Any], source: str, folder: Path, *, gone: bool
-) -> RunConfig:
-    try:
-        changed = with_values(document, values)
-    except ValueError as error:
-        raise InputError(f"{source}: {error}") from error
-    return check(RunConfig, changed, source=source, context=_context(folder, gone))
-
-
-def _input_hashes(config: RunConfig) -> dict[str, str]:
-    return {str(path): storage.sha256_of_file(path) for path in config.input_files}

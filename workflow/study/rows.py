@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
 
 from workflow.engine.run_directory import RunDirectory
@@ -20,12 +21,9 @@ State = Literal["certified", "does not come to rest", "not certified", "impossib
 
 
 @dataclass(frozen=True, eq=False)
-class PointRow:
+class PointRow(Combination):
     """A point in the table. `numbers` has every column, None where there is no number."""
 
-    number: int
-    name: str
-    values: Mapping[str, Any]
     state: State
     why: str
     numbers: Mapping[str, Number]
@@ -40,7 +38,6 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
     results, specification = RunResults(run), point.config.specification
     design, certify, loop = results.design, results.certify, results.closed_loop
-    achievable = results.achievable_performance
     state: State
     if design.synthesis is None:
         state = "impossible"
@@ -50,13 +47,12 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         state = "does not come to rest"
     else:
         state = "certified"
-    numbers = numbers_of(
-        design, achievable, certify, results.reference_filter, loop, specification.mode_band_rad_s
-    )
+    numbers = numbers_of(results, specification.mode_band_rad_s)
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
-        advice = said("order_advice", achievable, design.gamma, specification.controller_order)
+        achievable, order = results.achievable_performance, specification.controller_order
+        advice = said("order_advice", achievable, design.gamma, order)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         why = verdict_of(replace(design, met=True), certify, loop)
@@ -95,14 +91,9 @@ def _cell(value: Any) -> Any:
 
 def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
     """Numbers of the good points that no other good point beats in one column without losing in the other."""
-    x, y = COLUMNS[plot.x], COLUMNS[plot.y]
-    placed = []
-    for row in rows:
-        a, b = row.numbers[plot.x], row.numbers[plot.y]
-        if row.good and a is not None and b is not None:
-            placed.append((row.number, x.badness(a), y.badness(b)))
-    return [
-        number
-        for number, a, b in placed
-        if not any(c <= a and d <= b and (c < a or d < b) for _, c, d in placed)
-    ]
+    names = (plot.x, plot.y)
+    placed = [row for row in rows if row.good and None not in [row.numbers[name] for name in names]]
+    a, b = ([COLUMNS[name].badness(row.numbers[name] or 0.0) for row in placed] for name in names)
+    beats = np.less_equal.outer(a, a) & np.less_equal.outer(b, b)
+    beats &= np.less.outer(a, a) | np.less.outer(b, b)  # [j, i]: j beats i
+    return [placed[i].number for i in np.flatnonzero(~np.any(beats, axis=0))]

@@ -15,8 +15,8 @@ from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import Executor, Failure, LocalProcesses
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
-from workflow.study.columns import COLUMNS
 from workflow.study.directory import StudyDirectory
+from workflow.study.page import StudyView, study_summary
 from workflow.study.points import (
     PLANT_STAGES,
     POINT_STAGES,
@@ -27,10 +27,10 @@ from workflow.study.points import (
     load_base,
     shared_stages,
 )
-from workflow.study.rows import PointRow, csv_text, pareto_front, row_of, row_without_run
+from workflow.study.rows import PointRow, csv_text, row_of, row_without_run
 from workflow.study.search import ParzenSearch
 from workflow.study.settings import StudyConfig, load_study
-from workflow.study.task import Done, Job, Task
+from workflow.study.task import Done, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
@@ -197,8 +197,7 @@ class _Work:
 
 
 def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[Stage]) -> Task:
-    jobs = tuple(Job(point.name, point.config.to_document(), point.inputs) for point in points)
-    return Task(jobs, given, tuple(stage.name for stage in stages), code_digest())
+    return Task(tuple(points), given, tuple(stage.name for stage in stages), code_digest())
 
 
 def _done(
@@ -215,33 +214,20 @@ def _write_up(
     directory: StudyDirectory, study: StudyConfig, text: str, base: Base, rows: Sequence[PointRow]
 ) -> RunSummary:
     """Table, picture and page, the page last."""
-    from workflow.study.page import StudyView, study_page, study_summary
+    # Imported here: only this step draws, and matplotlib takes a second to load.
+    import workflow.study.pareto  # noqa: F401 (the page's drawing)
+    from workflow.report.rendering import render_page
 
-    fronts = [pareto_front(rows, plot) for plot in study.pareto]
     title = study.study.title or base.config.run.title or base.config.run.name
-    document = codec.plain(
-        {
-            "title": title,
-            "columns": {
-                name: {"label": column.label, "unit": column.unit, "better": column.better}
-                for name, column in COLUMNS.items()
-            },
-            "fronts": [
-                {"x": plot.x, "y": plot.y, "points": front}
-                for plot, front in zip(study.pareto, fronts, strict=True)
-            ],
-            "points": rows,
-        }
-    )
-    storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, fronts))
-    storage.write_text(directory.path / "table.json", codec.plain_text(document))
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
-    view = StudyView(study, text, where, rows, fronts, _units(directory, rows))
-    page = study_page(title, view)
+    view = StudyView(title, study, text, where, rows, _units(directory, rows))
+    storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, view.fronts))
+    storage.write_text(directory.path / "table.json", codec.plain_text(view.document))
+    page = render_page("study.html.j2", title=title, study=view)
     for name, picture in page.pictures.items():
         storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)
     storage.write_text(directory.page_path, page.html)
-    return study_summary(title, view, document, str(directory.page_path))
+    return study_summary(view, str(directory.page_path))
 
 
 def _units(directory: StudyDirectory, rows: Sequence[PointRow]) -> dict[str, str]:

@@ -13,15 +13,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import StageError
 from workflow.engine.executor import Failure, Report, attempt
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.study.points import Point
 from workflow.tasks.pipeline import stage_input_hash
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import StageInput
@@ -29,17 +28,8 @@ from workflow.tasks.stages import STAGES
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
-    """One directory to fill: a configuration (`RunConfig.to_document`) and its input files' hashes."""
-
-    name: str
-    config: Mapping[str, Any]
-    inputs: Mapping[str, str]
-
-
-@dataclass(frozen=True, eq=False)
 class Done:
-    """What became of a job: stage files by name, seconds and input hash by stage."""
+    """What became of a point: stage files by name, seconds and input hash by stage."""
 
     files: Mapping[str, bytes]
     seconds: Mapping[str, float]
@@ -48,19 +38,19 @@ class Done:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Jobs for one worker, one after the other: a result two of them share is computed once.
+    """Points for one worker, one after the other: a result two of them share is computed once.
 
-    given: stage files (name to content) that every job starts from. stages: names of those to compute.
+    given: stage files (name to content) that every point starts from. stages: names of those to compute.
     code: digest of the code of whoever asks.
     """
 
-    jobs: tuple[Job, ...]
+    points: tuple[Point, ...]
     given: Mapping[str, bytes]
     stages: tuple[str, ...]
     code: str
 
     def run(self, report: Report) -> tuple[Done | Failure, ...]:
-        """Every job in turn. Whatever goes wrong inside a job is that job's failure and nobody else's.
+        """Every point in turn. Whatever goes wrong with one is its own failure and nobody else's.
 
         Raises StageError where this is not the code of whoever asks.
         """
@@ -69,23 +59,22 @@ class Task:
                 "the code of the worker is not that of the study: another version, or edited meanwhile"
             )
         with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
-            runs = [RunDirectory(Path(folder) / str(index)) for index in range(len(self.jobs))]
+            runs = [RunDirectory(Path(folder) / str(index)) for index in range(len(self.points))]
             return tuple(
-                attempt(partial(self._fill, runs[index], job, runs[:index]))
-                for index, job in enumerate(self.jobs)
+                attempt(partial(self._fill, runs[index], point, runs[:index]))
+                for index, point in enumerate(self.points)
             )
 
-    def _fill(self, run: RunDirectory, job: Job, earlier: Sequence[RunDirectory]) -> Done:
+    def _fill(self, run: RunDirectory, point: Point, earlier: Sequence[RunDirectory]) -> Done:
         run.stages_path.mkdir(parents=True)
         for name, content in self.given.items():
             storage.write_bytes(run.stages_path / name, content)
-        config = RunConfig.from_document(job.config, source=job.name)
         seconds, hashes, results = {}, {}, RunResults(run)
         for stage in (stage for stage in STAGES if stage.name in self.stages):
             started = time.monotonic()
-            wanted = stage_input_hash(stage, config, run, job.inputs)
+            wanted = stage_input_hash(stage, point.config, run, point.inputs)
             if not _take_over(run, stage.name, wanted, earlier):
-                run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), wanted)
+                run.save_stage(stage.name, stage.run(StageInput(point.config, results, Progress())), wanted)
             seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
         return Done(run.stage_files(self.stages), seconds, hashes)
 
