@@ -28,6 +28,7 @@ from control_design.plants.ellipses import (
     Real,
     farthest_distance,
     largest_disturbance_gain,
+    quotient,
     secular_root,
 )
 from control_design.plants.first_order import FirstOrder, Intervals
@@ -153,7 +154,7 @@ class _Loop:
             numerator = weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
         else:
             numerator = weight.expand(intervals, own + i_plant)
-        upper, middle = _quotient(numerator, ends), _ratio(np.abs(numerator.value), at_middle)
+        upper, middle = _quotient(numerator, ends), quotient(np.abs(numerator.value), at_middle, np.inf)
         if each.channel is not None:
             channel = each.channel(intervals, 0)
             largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
@@ -196,13 +197,8 @@ def _quotient(numerator: FirstOrder, ends: dict[int, Real]) -> Real:
     """Upper bound of |numerator|/denominator: convex over concave is largest at an end."""
     result = np.zeros(numerator.value.size)
     for side, low in ends.items():
-        result = np.maximum(result, _ratio(np.abs(numerator.end(side)) + numerator.remainder, low))
+        result = np.maximum(result, quotient(np.abs(numerator.end(side)) + numerator.remainder, low, np.inf))
     return result
-
-
-def _ratio(size: Real, low: Real) -> Real:
-    """size/low, infinite where low is not positive."""
-    return np.asarray(np.where(low > 0, size / np.where(low > 0, low, 1.0), np.inf), dtype=np.float64)
 
 
 def _normal(point: Complex, shape: Real) -> Complex:
@@ -214,8 +210,7 @@ def _normal(point: Complex, shape: Real) -> Complex:
     turned, a, b = point * np.conj(axis) / scale, major / scale, minor / scale
     t = np.maximum(secular_root(np.abs(turned.real), np.abs(turned.imag), a, b), 1e-30)
     normal = (turned.real / (a**2 + t) + 1j * turned.imag / (b**2 + t)) * axis
-    size = np.abs(normal)
-    return np.where(size > 0, normal / np.where(size > 0, size, 1.0), 1.0)
+    return np.asarray(quotient(normal, np.abs(normal), 1.0), dtype=np.complex128)
 
 
 def _axes(shape: Real) -> tuple[Real, Real, Complex]:

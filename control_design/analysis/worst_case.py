@@ -14,6 +14,7 @@ from control_design.plants.ellipses import (
     Real,
     distance_to_minus_one,
     largest_disturbance_gain,
+    quotient,
 )
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.plant_set import UncertainPlant
@@ -110,8 +111,7 @@ class PlantData:
         """
         loop = k * self.delay
         distance = distance_to_minus_one(loop, self.ellipses)
-        with np.errstate(over="ignore"):
-            inverse = np.where(distance > 0, 1.0 / np.maximum(distance, 1e-300), np.inf)
+        inverse = quotient(1.0, distance, np.inf)
         values: dict[str, Real] = {}
         for each in self.weightings:
             # An infinite weight (integrator asked of the loop) at an infinite loop gain never occurs: the

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg
 
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Complex, Real, quotient
 from control_design.plants.frequency_grid import with_violations
 
 # Radii of the rounding of |.| at its kink. An active numerator is as large as gamma m, of which the rounding
@@ -66,8 +66,7 @@ class PlaneRows:
     def ratio(self, y: Real) -> Real:
         """Numerator over denominator for y (F, 2): (R,); infinite where the denominator is not positive."""
         below = self.denominator(y)
-        with np.errstate(divide="ignore"):
-            return np.where(below > 0, self.numerator(y) / np.maximum(below, 1e-300), np.inf)
+        return np.asarray(quotient(self.numerator(y), below, np.inf))
 
 
 def turning(factor: Complex) -> Real:

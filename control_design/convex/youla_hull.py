@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 
 from control_design.analysis.worst_case import PlantData
 from control_design.convex.youla_basis import AffineLoop
-from control_design.plants.ellipses import Complex, Real, nearest_distance
+from control_design.plants.ellipses import Complex, Real, nearest_distance, quotient
 from control_design.specification.requirement import LoopFunction
 
 _DIRECTIONS = 24  # half-planes of every hull
@@ -35,8 +35,7 @@ def hull_bound(data: PlantData, loop: AffineLoop, basis: Complex, floor: float, 
     w1, w3 = data.sensitivity, data.largest(LoopFunction.EFFORT)
     # The base plant itself is a member (or close to one): |q| <= gamma/W3 and |1 - G q| <= gamma/W1 contain
     # R.
-    with np.errstate(divide="ignore"):
-        by_effort = np.where(w3 > 0, ceiling / np.where(w3 > 0, w3, 1.0), np.inf)
+    by_effort = quotient(ceiling, w3, np.inf)
     by_tracking = ceiling / (w1 * np.abs(g))
     centre = np.where(by_tracking < by_effort, 1.0 / g, 0.0)
     radius = np.minimum(by_tracking, by_effort)
@@ -76,12 +75,10 @@ def _worst(data: PlantData, loop: AffineLoop, w1: float, w3: float, q: Complex, 
     size = np.abs(q)
     direction = e.direction[i] * data.delay[i]
     moved = 1.0 + (e.centre[i] * data.delay[i] - loop.base[i]) * q
-    turned = moved * np.conj(q * direction) / np.maximum(size, 1e-300)
-    turned = np.where(size > 0, turned, 1.0)
+    turned = quotient(moved * np.conj(q * direction), size, 1.0)
     distance = nearest_distance(turned, size * e.semi_major[i], size * e.semi_minor[i])
     asked = np.maximum(w1 * np.abs(1.0 - loop.base[i] * q), w3 * size)
-    with np.errstate(over="ignore"):
-        return np.asarray(np.where(distance > 0, asked / np.maximum(distance, 1e-300), np.inf))
+    return np.asarray(quotient(asked, distance, np.inf))
 
 
 class _Programme:

@@ -8,7 +8,7 @@ rounding: no sampling of the boundary, no enclosing disc.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,12 @@ Complex = npt.NDArray[np.complex128]
 def radius_of(level: float) -> float:
     """Radius, in standard deviations, of the ellipse that holds a plane Gaussian with probability level."""
     return float(np.sqrt(-2.0 * np.log1p(-level)))
+
+
+def quotient(above: Any, below: Real, otherwise: float = 0.0) -> Any:
+    """above/below where below is positive, `otherwise` elsewhere; real or complex, shapes broadcast."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return np.where(below > 0, above / np.where(below > 0, below, 1.0), otherwise)
 
 
 class ResponseSet(Protocol):
@@ -98,8 +104,7 @@ class Ellipses:
         large = trace / 2 + np.hypot((a - d) / 2, b)
         # small = determinant / large keeps the relative accuracy of thin ellipses.
         determinant = a * d - b * covariance[:, 1, 0]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            small = np.where(large > 0, determinant / np.where(large > 0, large, 1.0), 0.0)
+        small = quotient(determinant, large)
         tolerance = 1e-9 * np.abs(large) + 1e-300
         good = (
             np.isfinite(trace)
@@ -178,13 +183,10 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
     x, y, a, b = x / scale, y / scale, a / scale, b / scale
     t = secular_root(x, y, a, b)
     da, db = a * a + t, b * b + t
-    with np.errstate(invalid="ignore", divide="ignore"):
-        # t = 0 on a degenerate axis: the point projects onto the segment itself.
-        nx = np.where(da > 0, a * a * x / np.where(da > 0, da, 1.0), 0.0)
-        ny = np.where(db > 0, b * b * y / np.where(db > 0, db, 1.0), 0.0)
-        inside_a = np.where(a > 0, x / np.where(a > 0, a, 1.0), np.where(x > 0, np.inf, 0.0))
-        inside_b = np.where(b > 0, y / np.where(b > 0, b, 1.0), np.where(y > 0, np.inf, 0.0))
-    inside = inside_a**2 + inside_b**2 <= 1.0
+    # t = 0 on a degenerate axis: the point projects onto the segment itself.
+    nx, ny = quotient(a * a * x, da), quotient(b * b * y, db)
+    beside = ((a == 0) & (x > 0)) | ((b == 0) & (y > 0))
+    inside = (quotient(x, a) ** 2 + quotient(y, b) ** 2 <= 1.0) & ~beside
     distance = np.hypot(x - nx, y - ny)
     return np.asarray(np.where(inside, 0.0, distance) * scale, dtype=np.float64)
 
@@ -218,9 +220,7 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
         if np.all(high - low <= 2e-16 * (high + gap)):
             break
     n = 0.5 * (low + high)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sin_f = np.where(n + gap > 0, by / np.where(n + gap > 0, n + gap, 1.0), 0.0)
-    sin_f = np.clip(sin_f, 0.0, 1.0)
+    sin_f = np.clip(quotient(by, n + gap), 0.0, 1.0)
     # cos from sin: when x = 0 the cosine term of the secular equation degenerates (n -> 0).
     cos_f = np.sqrt(1.0 - sin_f**2)
     distance = np.hypot(x + a * cos_f, y + b * sin_f)
@@ -235,14 +235,8 @@ def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
     k (F,): what multiplies the member, the controller with its delay; not the loop gain.
     """
     size = np.abs(k)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k
-        # centre.
-        turned = np.where(
-            size > 0,
-            (1.0 + k * ellipses.centre) * np.conj(k * ellipses.direction) / np.where(size > 0, size, 1.0),
-            1.0,
-        )
+    # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k centre.
+    turned = quotient((1.0 + k * ellipses.centre) * np.conj(k * ellipses.direction), size, 1.0)
     return nearest_distance(turned, size * ellipses.semi_major, size * ellipses.semi_minor)
 
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Complex, Real, quotient
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows, parameter_bounds
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
@@ -357,7 +357,7 @@ def _along_boundary(
 
 def _newton(slope: Real, bend: Real) -> Real:
     """Step to the maximum of a parabola; 0 where it has none."""
-    return np.asarray(np.where(bend < 0, -slope / np.where(bend < 0, bend, -1.0), 0.0), dtype=np.float64)
+    return np.asarray(quotient(slope, -bend), dtype=np.float64)
 
 
 def natural_units(cascade: Cascade, x: Real) -> Real:

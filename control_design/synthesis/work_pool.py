@@ -17,6 +17,7 @@ from typing import Any
 
 import control
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
@@ -62,17 +63,8 @@ class WorkPool:
             ) from error
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=parts)
-        before = {name: os.environ.get(name) for name in _ONE_THREAD}
-        os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-        try:
-            with interrupts_wait():
-                pool.submit(_ready)  # the first task starts all processes, with these variables
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
+        with interrupts_wait():
+            pool.submit(_ready)  # the first task starts all processes
         self._pool = pool
 
     def do(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
@@ -107,6 +99,8 @@ def _begin(
     """First thing in a worker process."""
     global _own
     leave_to_parent()
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # for what IPOPT has yet to load
+    threadpool_limits(1)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
