@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-
-from ident.data.record import Record
 from workflow.config.run_config import SimulatedSource, built_in_config, load_simulation
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
@@ -27,40 +24,25 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
     out = Path(out)
     RunDirectory(out).refuse_unless_free()
-    records = []
+    texts = {}
     for index, entry in enumerate(config.source.records):
         with naming(f"source.records[{index}] ({entry.name})"):
-            records.append(simulate_record(config.source, entry, config.run.seed))
-    existed = out.is_dir()
-    files: list[Path] = []
+            record = simulate_record(config.source, entry, config.run.seed)
+        signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), [*record.input.T, *record.output.T], strict=True))
+        safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)
+        texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
+    texts[truth.FILE_NAME] = truth.truth_of(config.source).model_dump_json(indent=1) + "\n"
+    existed, files = out.is_dir(), list[Path]()
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        for number, record in enumerate(records, start=1):
-            path = out / f"{number:02d}_{file_name(record.name)}.csv"
-            storage.write_text(path, csv_text(record))
-            files.append(path)
-        path = out / truth.FILE_NAME
-        storage.write_text(path, truth.truth_of(config.source).model_dump_json(indent=1) + "\n")
-        files.append(path)
-    except (OSError, InputError) as error:
+        with naming(f"cannot write {out}"):
+            out.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            storage.write_text(out / name, text)
+            files.append(out / name)
+    except InputError:
         for path in files:  # all of the experiments or none
             path.unlink()
         if not existed and out.is_dir():
             out.rmdir()
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"cannot write {out}: {error.strerror or error}") from error
+        raise
     return files
-
-
-def file_name(name: str) -> str:
-    """A record's name in a file name: all but letters, digits, '_', '.' and '-' becomes '_'."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)
-
-
-def csv_text(record: Record) -> str:
-    """The record as CSV with one header line; nine digits, far below any sensor's noise."""
-    lines = [",".join(("time_s", INPUT_NAME, *OUTPUT_NAMES))]
-    table = np.column_stack([record.time_s, record.input, record.output])
-    lines += [",".join(f"{value:.9g}" for value in row) for row in table]
-    return "\n".join(lines) + "\n"

@@ -14,6 +14,7 @@ from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
 from plant.effects import LOOK_ALIKES, in_words
 from plant.simulate import simulate
+from workflow.engine import storage
 from workflow.text.formats import listing
 
 # Below this probability not even a runner-up competes.
@@ -37,9 +38,10 @@ class Following:
         """The proposed voltage, one row per sample; empty without a proposal."""
         if self.proposal is None:
             return ""
-        voltage, dt = self.proposal.voltage_V.tolist(), self.proposal.dt_s
-        rows = [f"{k * dt:.9g},{v:.9g}" for k, v in enumerate(voltage)]
-        return "\n".join(["time_s,voltage_V", *rows]) + "\n"
+        voltage = self.proposal.voltage_V
+        return storage.csv_text(
+            {"time_s": self.proposal.dt_s * np.arange(voltage.size), "voltage_V": voltage}
+        )
 
     def differences(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         """(T, 2) what the first hypothesis predicts minus what the second does, in noise deviations."""

@@ -87,6 +87,13 @@ def write_text(path: Path, content: str) -> None:
     write_bytes(path, content.encode("utf-8"))
 
 
+def csv_text(columns: Mapping[str, AnyArray]) -> str:
+    """Signals (T,) as CSV with one header line; nine digits, far below any sensor's noise."""
+    stream, table = io.StringIO(), np.column_stack(list(columns.values()))
+    np.savetxt(stream, table, "%.9g", ",", header=",".join(columns), comments="")
+    return stream.getvalue()
+
+
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Atomic JSON, strict: non-finite floats become `{"$float": "inf"}` and come back as floats."""
     tagged, _ = codec.pack(document)
