@@ -1,12 +1,12 @@
 """Compiled time stepping of the blind protocol's machine: classical Runge-Kutta, four stages.
 
 Rotary bodies are base, motor side, hub and link root; a matrix maps the free angles to these four, so that a
-rigid coupling is a missing coordinate and not a stiff spring.
+rigid coupling is a missing coordinate and not a stiff spring. `p` is the record of constants of `Truth`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -15,57 +15,6 @@ import numpy.typing as npt
 Real = npt.NDArray[np.float64]
 
 BASE, MOTOR, HUB, ROOT = 0, 1, 2, 3
-
-
-class Physics(NamedTuple):
-    """Constants of a machine in SI units; an effect that is absent has its neutral value."""
-
-    # rig
-    radius_m: float
-    length_m: float
-    kelvin_voigt_s: float
-    motor_inertia: float
-    hub_inertia: float
-    viscous: float
-    gear: float
-    torque_constant: float
-    back_emf: float
-    resistance: float
-    gravity: float
-    # joint
-    dry_static: float  # of two friction elements, as in the README: Coulomb ...
-    dry_minus: float  # ... its level in the negative direction ...
-    stribeck_static: float
-    stribeck_coulomb: float
-    stribeck_velocity: float
-    pre_sliding: float
-    ripple: float
-    ripple_cycles: float
-    ripple_phase: float
-    disturbance: float
-    disturbance_omega: float
-    disturbance_phase: float
-    cubic_spring: float
-    linear_spring: float
-    joint_stiffness: float
-    joint_damping: float
-    base_stiffness: float
-    base_damping: float
-    base_inertia: float
-    play: float  # negative: none
-    contact_stiffness: float
-    contact_damping: float
-    # voltage and motor
-    lag: float
-    inductance: float
-    current_limit: float
-    cogging: float
-    cogging_cycles: float
-    cogging_phase: float
-    heating_1_s: float
-    # link and sensor
-    drag: float  # N s^2/m^3
-    sensor_lag: float
 
 
 class Link(NamedTuple):
@@ -83,7 +32,7 @@ class Link(NamedTuple):
 
 
 @numba.njit(cache=True)
-def _level(p: Physics, speed: float) -> float:
+def _level(p: Any, speed: float) -> float:
     fall = np.exp(-abs(speed) / p.stribeck_velocity)
     return float(p.stribeck_coulomb + (p.stribeck_static - p.stribeck_coulomb) * fall)
 
@@ -94,20 +43,20 @@ def _clipped(value: float, low: float, high: float) -> float:
 
 
 @numba.njit(cache=True)
-def _coulomb(p: Physics, stretch: float) -> float:
+def _coulomb(p: Any, stretch: float) -> float:
     """Stretch of the pre-sliding spring after the slider has moved along."""
     return _clipped(stretch, -p.pre_sliding * p.dry_minus / max(p.dry_static, 1e-300), p.pre_sliding)
 
 
 @numba.njit(cache=True)
-def _stribeck(p: Physics, stretch: float, speed: float) -> float:
+def _stribeck(p: Any, stretch: float, speed: float) -> float:
     limit = p.pre_sliding * _level(p, speed) / max(p.stribeck_static, 1e-300)
     return _clipped(stretch, -limit, limit)
 
 
 @numba.njit(cache=True)
 def _accelerations(
-    p: Physics,
+    p: Any,
     link: Link,
     arms: Real,
     q: Real,
@@ -229,14 +178,14 @@ def _accelerations(
     twist = p.joint_stiffness * (alpha - body[HUB]) + p.joint_damping * (alpha_dot - speed[HUB])
     force[HUB] += twist
     force[ROOT] -= twist
-    if p.play >= 0.0:
+    if p.backlash >= 0.0:
         lead = body[MOTOR] - body[HUB]
         closing = speed[MOTOR] - speed[HUB]
         push = 0.0
-        if lead > 0.5 * p.play:
-            push = max(p.contact_stiffness * (lead - 0.5 * p.play) + p.contact_damping * closing, 0.0)
-        elif lead < -0.5 * p.play:
-            push = -max(p.contact_stiffness * (-lead - 0.5 * p.play) - p.contact_damping * closing, 0.0)
+        if lead > 0.5 * p.backlash:
+            push = max(p.contact_stiffness * (lead - 0.5 * p.backlash) + p.contact_damping * closing, 0.0)
+        elif lead < -0.5 * p.backlash:
+            push = -max(p.contact_stiffness * (-lead - 0.5 * p.backlash) - p.contact_damping * closing, 0.0)
         force[MOTOR] -= push
         force[HUB] += push
     for k in range(R):
@@ -269,7 +218,7 @@ def _accelerations(
 
 
 @numba.njit(cache=True)
-def _outputs(p: Physics, link: Link, q: Real) -> tuple[float, float]:
+def _outputs(p: Any, link: Link, q: Real) -> tuple[float, float]:
     """Hub angle as an encoder sees it, and (r + L) theta + deflection across the turned hub axis."""
     couple, angle, integral, _, _, _ = link
     G, n = angle.shape
@@ -293,7 +242,7 @@ def _outputs(p: Physics, link: Link, q: Real) -> tuple[float, float]:
 
 @numba.njit(cache=True)
 def run(
-    p: Physics,
+    p: Any,
     link: Link,
     acting: Real,
     commanded: Real,

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from validation.blind.beam import LinkBasis, link_basis
-from validation.blind.kernel import BASE, HUB, MOTOR, ROOT, Link, Physics, run
+from validation.blind.kernel import BASE, HUB, MOTOR, ROOT, Link, run
 
 Real = npt.NDArray[np.float64]
 RigTable = Mapping[str, Mapping[str, float]]
@@ -133,50 +133,56 @@ class Truth:
             raise ValueError(
                 "coulomb_friction and asymmetric_friction use the same contact: give one of them"
             )
-        self._physics = Physics(
-            radius_m=float(hub["radius_m"]),
-            length_m=float(link["length_m"]),
-            kelvin_voigt_s=link["kelvin_voigt_s"] * get("structural_damping", "ratio", 1.0),
-            motor_inertia=0.3 * J if backlash else 0.0,
-            hub_inertia=0.7 * J if backlash else J,
-            viscous=hub["viscous_friction_Nms"] + get("viscous_friction", "coefficient_Nms", 0.0),
-            gear=float(motor["gear_ratio"]),
-            torque_constant=float(motor["torque_constant_Nm_A"]),
-            back_emf=float(motor["back_emf_Vs_rad"]),
-            resistance=float(motor["resistance_ohm"]),
-            gravity=get("gravity", "acceleration_m_s2", 0.0),
-            dry_static=get("coulomb_friction", "torque_Nm", uneven[0]),
-            dry_minus=get("coulomb_friction", "torque_Nm", uneven[1]),
-            stribeck_static=get("stribeck_friction", "static_torque_Nm", 0.0),
-            stribeck_coulomb=get("stribeck_friction", "coulomb_torque_Nm", 0.0),
-            stribeck_velocity=get("stribeck_friction", "stribeck_velocity_rad_s", 1.0),
-            pre_sliding=PRE_SLIDING_RAD,
-            ripple=get("torque_ripple", "amplitude_Nm", 0.0),
-            ripple_cycles=get("torque_ripple", "cycles_per_rev", 1.0),
-            ripple_phase=get("torque_ripple", "phase_rad", 0.0),
-            disturbance=get("periodic_disturbance", "amplitude_Nm", 0.0),
-            disturbance_omega=2 * pi * get("periodic_disturbance", "frequency_Hz", 0.0),
-            disturbance_phase=get("periodic_disturbance", "phase_rad", 0.0),
-            cubic_spring=get("hardening_spring", "cubic_Nm_rad3", 0.0),
-            linear_spring=get("ground_spring", "stiffness_Nm_rad", 0.0),
-            joint_stiffness=get("joint_compliance", "stiffness_Nm_rad", 0.0),
-            joint_damping=get("joint_compliance", "damping_Nms", 0.0),
-            base_stiffness=get("base_compliance", "stiffness_Nm_rad", 0.0),
-            base_damping=get("base_compliance", "damping_Nms", 0.0),
-            base_inertia=get("base_compliance", "inertia_kg_m2", 0.0),
-            play=get("backlash", "gap_rad", -1.0),
-            contact_stiffness=contact,
-            contact_damping=0.8 * float(np.sqrt(0.3 * J * contact)),
-            lag=get("actuator_lag", "time_constant_s", 0.0),
-            inductance=get("inductance", "inductance_H", 0.0),
-            current_limit=get("inductance", "current_limit_A", 1e9),
-            cogging=get("cogging", "relative_amplitude", 0.0),
-            cogging_cycles=get("cogging", "cycles_per_rev", 0.0),
-            cogging_phase=get("cogging", "phase_rad", 0.0),
-            heating_1_s=get("winding_heat", "rate_1_s", 0.0),
-            drag=get("air_drag", "coefficient_Ns2_m3", 0.0),
-            sensor_lag=get("sensor_lag", "time_constant_s", 0.0),
-        )
+        # SI units; an effect that is absent has its neutral value (no backlash: negative).
+        constants: dict[str, float] = {
+            "radius_m": hub["radius_m"],
+            "length_m": link["length_m"],
+            "kelvin_voigt_s": link["kelvin_voigt_s"] * get("structural_damping", "ratio", 1.0),
+            "motor_inertia": 0.3 * J if backlash else 0.0,
+            "hub_inertia": 0.7 * J if backlash else J,
+            "viscous": hub["viscous_friction_Nms"] + get("viscous_friction", "coefficient_Nms", 0.0),
+            "gear": motor["gear_ratio"],
+            "torque_constant": motor["torque_constant_Nm_A"],
+            "back_emf": motor["back_emf_Vs_rad"],
+            "resistance": motor["resistance_ohm"],
+            "gravity": get("gravity", "acceleration_m_s2", 0.0),
+            # two friction elements: Coulomb, with a level of its own in the negative direction ...
+            "dry_static": get("coulomb_friction", "torque_Nm", uneven[0]),
+            "dry_minus": get("coulomb_friction", "torque_Nm", uneven[1]),
+            # ... and Stribeck
+            "stribeck_static": get("stribeck_friction", "static_torque_Nm", 0.0),
+            "stribeck_coulomb": get("stribeck_friction", "coulomb_torque_Nm", 0.0),
+            "stribeck_velocity": get("stribeck_friction", "stribeck_velocity_rad_s", 1.0),
+            "pre_sliding": PRE_SLIDING_RAD,
+            "ripple": get("torque_ripple", "amplitude_Nm", 0.0),
+            "ripple_cycles": get("torque_ripple", "cycles_per_rev", 1.0),
+            "ripple_phase": get("torque_ripple", "phase_rad", 0.0),
+            "disturbance": get("periodic_disturbance", "amplitude_Nm", 0.0),
+            "disturbance_omega": 2 * pi * get("periodic_disturbance", "frequency_Hz", 0.0),
+            "disturbance_phase": get("periodic_disturbance", "phase_rad", 0.0),
+            "cubic_spring": get("hardening_spring", "cubic_Nm_rad3", 0.0),
+            "linear_spring": get("ground_spring", "stiffness_Nm_rad", 0.0),
+            "joint_stiffness": get("joint_compliance", "stiffness_Nm_rad", 0.0),
+            "joint_damping": get("joint_compliance", "damping_Nms", 0.0),
+            "base_stiffness": get("base_compliance", "stiffness_Nm_rad", 0.0),
+            "base_damping": get("base_compliance", "damping_Nms", 0.0),
+            "base_inertia": get("base_compliance", "inertia_kg_m2", 0.0),
+            "backlash": get("backlash", "gap_rad", -1.0),
+            "contact_stiffness": contact,
+            "contact_damping": 0.8 * float(np.sqrt(0.3 * J * contact)),
+            "lag": get("actuator_lag", "time_constant_s", 0.0),
+            "inductance": get("inductance", "inductance_H", 0.0),
+            "current_limit": get("inductance", "current_limit_A", 1e9),
+            "cogging": get("cogging", "relative_amplitude", 0.0),
+            "cogging_cycles": get("cogging", "cycles_per_rev", 0.0),
+            "cogging_phase": get("cogging", "phase_rad", 0.0),
+            "heating_1_s": get("winding_heat", "rate_1_s", 0.0),
+            "drag": get("air_drag", "coefficient_Ns2_m3", 0.0),
+            "sensor_lag": get("sensor_lag", "time_constant_s", 0.0),
+        }
+        kinds = [(name, np.float64) for name in constants]
+        # A record with named fields, which compiled code reads as well.
+        self._physics = np.rec.array([tuple(constants.values())], dtype=kinds)[0]
         self.substeps = self._substeps()
 
     def record(
@@ -275,7 +281,7 @@ class Truth:
         spring(couple[MOTOR], couple[BASE], dry, p.viscous + motor)
         spring(couple[BASE], ground, p.base_stiffness, p.base_damping)
         spring(couple[ROOT], couple[HUB], p.joint_stiffness, p.joint_damping)
-        if p.play >= 0:
+        if p.backlash >= 0:
             spring(couple[MOTOR], couple[HUB], p.contact_stiffness, p.contact_damping)
         A = np.zeros((2 * size, 2 * size))
         A[:size, size:] = np.eye(size)
@@ -284,7 +290,7 @@ class Truth:
         fastest = float(np.max(np.abs(np.linalg.eigvals(A))))
         if p.inductance > 0:
             fastest = max(fastest, p.resistance / p.inductance)
-        fewest = _FEWEST_CONTACT if p.play >= 0 else _FEWEST
+        fewest = _FEWEST_CONTACT if p.backlash >= 0 else _FEWEST
         return int(np.clip(np.ceil(self.dt_s * fastest / 0.9), fewest, _MOST))
 
 
