@@ -38,44 +38,23 @@ def plan_experiments(truth: Truth, rng: np.random.Generator) -> tuple[Planned, .
         bend = float(np.max(np.abs(unit.tip_m - arm * unit.hub_angle_rad))) / length
         return np.asarray(np.round(1e-2 * shape * min(angle_rad / angle, share / bend), 4))
 
-    T = 1400
-    binary = [scaled(_binary(T, rng), angle, 0.065) for angle in (
-        rng.uniform(0.09, 0.15), rng.uniform(0.17, 0.35), rng.uniform(0.15, 0.23))]  # fmt: skip
-    multisine = scaled(_multisine(truth.dt_s, rng), rng.uniform(0.12, 0.25), rng.uniform(0.04, 0.07))
-    doublet = scaled(_doublet(truth.dt_s, rng), rng.uniform(0.15, 0.3), rng.uniform(0.04, 0.07))
+    T, dt = 1400, truth.dt_s
+    angles = rng.uniform(0.09, 0.15), rng.uniform(0.17, 0.35), rng.uniform(0.15, 0.23)
+    low, high, fresh = (scaled(_binary(T, rng), angle, 0.065) for angle in angles)
+    multisine = scaled(_multisine(dt, rng), rng.uniform(0.12, 0.25), rng.uniform(0.04, 0.07))
+    doublet = scaled(_doublet(dt, rng), rng.uniform(0.15, 0.3), rng.uniform(0.04, 0.07))
     slew = _slew(truth, 1200, rng)
+    periods = "random-phase multisine, two identical periods of 700 samples"
+    pulses = "voltage doublet, then zero volts (free decay)"
+    medium = "random binary voltage, medium amplitude, fresh sequence"
+    motion = "smooth point-to-point slew under PD control of the measured hub angle (closed loop)"
     return (
-        Planned("01_prbs_low", "prbs", "estimation", "random binary voltage, low amplitude", binary[0]),
-        Planned("02_prbs_high", "prbs", "estimation", "random binary voltage, high amplitude", binary[1]),
-        Planned(
-            "03_multisine",
-            "multisine",
-            "estimation",
-            "random-phase multisine, two identical periods of 700 samples",
-            multisine,
-        ),
-        Planned(
-            "04_doublet_decay",
-            "doublet",
-            "estimation",
-            "voltage doublet, then zero volts (free decay)",
-            doublet,
-        ),
-        Planned(
-            "05_prbs_fresh",
-            "prbs",
-            "held_out",
-            "random binary voltage, medium amplitude, fresh sequence",
-            binary[2],
-        ),
-        Planned(
-            "06_slew_closed_loop",
-            "slew",
-            "held_out",
-            "smooth point-to-point slew under PD control of the measured hub angle (closed loop)",
-            np.zeros(1200),
-            slew,
-        ),
+        Planned("01_prbs_low", "prbs", "estimation", "random binary voltage, low amplitude", low),
+        Planned("02_prbs_high", "prbs", "estimation", "random binary voltage, high amplitude", high),
+        Planned("03_multisine", "multisine", "estimation", periods, multisine),
+        Planned("04_doublet_decay", "doublet", "estimation", pulses, doublet),
+        Planned("05_prbs_fresh", "prbs", "held_out", medium, fresh),
+        Planned("06_slew_closed_loop", "slew", "held_out", motion, np.zeros(1200), slew),
     )
 
 

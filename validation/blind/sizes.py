@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import pi
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class Sizable:
 
 def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random.Generator) -> Sizable:
     """An effect with everything but its size drawn; plans give the voltages it has to be felt at."""
-    s = _Scales.of(rig, plans)
+    s = _scales(rig, plans)
     sign = float(rng.choice([-1.0, 1.0]))
     phase = rng.uniform(0, 2 * pi)
 
@@ -159,46 +160,27 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     raise ValueError(f"unknown effect {name!r}; known: {', '.join(LISTED + UNLISTED)}")
 
 
-@dataclass(frozen=True)
-class _Scales:
-    """Magnitudes of a rig and its planned voltages."""
-
-    voltage: float
-    peak: float
-    torque: float
-    viscous: float
-    braking: float
-    inertia: float
-    link_mass: float
-    link_spring: float
-    length: float
-    resistance: float
-    dt: float
-    tip_noise: float
-    tip_peak: float
-
-    @classmethod
-    def of(cls, rig: RigTable, plans: tuple[Planned, ...]) -> _Scales:
-        link, hub, motor = rig["link"], rig["hub"], rig["motor"]
-        L, r = link["length_m"], hub["radius_m"]
-        mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * L
-        bending = link["youngs_modulus_Pa"] * link["width_m"] * link["thickness_m"] ** 3 / 12
-        rms = float(np.median([np.sqrt(np.mean(p.voltage_V**2)) for p in plans if p.feedback is None]))
-        peak = max(float(np.max(np.abs(p.voltage_V))) for p in plans)
-        per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
-        inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
-        return cls(
-            voltage=rms,
-            peak=peak,
-            torque=per_volt * rms,
-            viscous=hub["viscous_friction_Nms"],
-            braking=per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"],
-            inertia=inertia + rig["payload"]["mass_kg"] * (r + L) ** 2,
-            link_mass=mass,
-            link_spring=3 * bending / L,
-            length=L,
-            resistance=motor["resistance_ohm"],
-            dt=rig["sampling"]["dt_s"],
-            tip_noise=rig["sensors"]["tip_noise_m"],
-            tip_peak=(r + L) * 0.35,
-        )
+def _scales(rig: RigTable, plans: tuple[Planned, ...]) -> SimpleNamespace:
+    """Magnitudes of a rig and its planned voltages, SI units."""
+    link, hub, motor = rig["link"], rig["hub"], rig["motor"]
+    L, r = link["length_m"], hub["radius_m"]
+    mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * L
+    bending = link["youngs_modulus_Pa"] * link["width_m"] * link["thickness_m"] ** 3 / 12
+    rms = float(np.median([np.sqrt(np.mean(p.voltage_V**2)) for p in plans if p.feedback is None]))
+    per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
+    inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
+    return SimpleNamespace(
+        voltage=rms,
+        peak=max(float(np.max(np.abs(p.voltage_V))) for p in plans),
+        torque=per_volt * rms,
+        viscous=hub["viscous_friction_Nms"],
+        braking=per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"],
+        inertia=inertia + rig["payload"]["mass_kg"] * (r + L) ** 2,
+        link_mass=mass,
+        link_spring=3 * bending / L,
+        length=L,
+        resistance=motor["resistance_ohm"],
+        dt=rig["sampling"]["dt_s"],
+        tip_noise=rig["sensors"]["tip_noise_m"],
+        tip_peak=(r + L) * 0.35,
+    )
