@@ -7,6 +7,7 @@ import importlib.util
 import numpy as np
 import pytest
 
+from tests.validation.test_blind_truth import RIG
 from validation.blind.exudyn_truth import SUPPORTED, ExudynTruth
 from validation.blind.protocol import run_blind
 from validation.blind.truth import LISTED, Feedback, Truth
@@ -14,27 +15,6 @@ from workflow.engine.errors import InputError
 
 THERE = importlib.util.find_spec("exudyn") is not None
 needs_exudyn = pytest.mark.skipif(not THERE, reason="the extra 'blind' is not installed")
-
-RIG = {
-    "link": {
-        "length_m": 0.8,
-        "width_m": 0.02,
-        "thickness_m": 0.003,
-        "density_kg_m3": 2700.0,
-        "youngs_modulus_Pa": 7e10,
-        "kelvin_voigt_s": 0.001,
-    },
-    "hub": {"inertia_kg_m2": 0.02, "radius_m": 0.05, "viscous_friction_Nms": 0.01},
-    "motor": {
-        "torque_constant_Nm_A": 0.025,
-        "back_emf_Vs_rad": 0.025,
-        "resistance_ohm": 2.5,
-        "gear_ratio": 25.0,
-    },
-    "payload": {"mass_kg": 0.01},
-    "sensors": {"hub_angle_noise_rad": 0.001, "tip_noise_m": 0.001},
-    "sampling": {"dt_s": 0.005},
-}
 
 
 @pytest.mark.skipif(THERE, reason="the extra 'blind' is installed")
