@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import butter, filtfilt
 
-from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
+from benchmarks.own_plant import MODEL_ERROR, SHARE, Real, given, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
 
@@ -29,8 +29,6 @@ POSITION_GAIN, VELOCITY_GAIN, LIMIT_V = 160.18, 243.45, 10.0
 PUBLISHED = {"mass_kg": 95.1089, "viscous_Ns_m": 203.5034, "coulomb_N": 20.3935, "offset_N": -3.1648}
 # The reference repeats exactly after this many samples; records start where it moves at constant speed.
 PERIOD, FIRST = 6240, 200
-# Share of the output's RMS that a rigid axis with friction may miss of a real one.
-MODEL_ERROR = 0.1
 _RUN_IN, _SUBSTEPS = 400, 4
 
 
@@ -213,8 +211,6 @@ def case(
     simulated: Literal["forces", "loop"] = "forces",
     *,
     refined: bool = False,
-    model_error: float = MODEL_ERROR,
-    correlation_samples: float = 1.0,
 ) -> PlantCase:
     """The record as a case.
 
@@ -222,7 +218,6 @@ def case(
         "fast", strokes up to 0.083 m/s to fit, those up to 0.125 m/s, a motion no fit has seen, to judge.
     simulated : "forces", measured motion in, force out; "loop", reference in, force of the closed loop out.
     refined : shapes of viscous friction (by direction, by speed) are listed as well.
-    model_error : share of the force's RMS.
     """
     data = record(folder)
     if held_out == "passes":
@@ -243,8 +238,7 @@ def case(
         ("force_N",),
         np.array([noise]),
         effects(simulated == "loop", refined),
-        model_error=model_error * float(np.std(data[:, 4])) / noise,
-        correlation_samples=correlation_samples,
+        model_error=MODEL_ERROR * float(np.std(data[:, 4])) / noise,
     )
 
     def experiment(role: Role, piece: slice) -> PlantExperiment:

@@ -1,19 +1,30 @@
-"""What the simulations of the real machines share: effects by name, and the path of a delayed command."""
+"""What the simulations of the real machines share: weights, effects by name, a delayed command."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.linalg import expm
 
-from diagnosis import EffectParameter
+from diagnosis import EffectParameter, PlantCase
 
 Real = npt.NDArray[np.float64]
 
 # Coulomb friction as a share of the static one.
 SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear")
+# Share of the outputs' RMS that the simulation of a real machine may miss.
+MODEL_ERROR = 0.1
+
+
+def weighed(case: PlantCase, correlation_samples: float, model_error: float = MODEL_ERROR) -> PlantCase:
+    """The case with another correlation length [samples] and model error [share of the outputs' RMS]."""
+    allowed = case.plant.model_error * (model_error / MODEL_ERROR)
+    plant = replace(case.plant, model_error=allowed, correlation_samples=correlation_samples)
+    return replace(case, plant=plant)
 
 
 def given(effects: Mapping[str, Mapping[str, float]]) -> Callable[..., float]:
@@ -38,3 +49,10 @@ def late_value(command: Real, k: int, delay_samples: float, dead_zone: float) ->
 def lagged(pull: float, held: float, step_s: float, lag_s: float) -> float:
     """Exact step of a first-order lag towards a held value."""
     return held if lag_s <= 0.0 else held + (pull - held) * np.exp(-step_s / lag_s)
+
+
+def held_input(A: Real, B: Real, step_s: float) -> tuple[Real, Real]:
+    """A (n, n) and B (n, m) of one step under a held input, exact."""
+    n, m = B.shape
+    moved = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * step_s)
+    return np.ascontiguousarray(moved[:n, :n]), np.ascontiguousarray(moved[:n, n:])

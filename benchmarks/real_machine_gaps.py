@@ -10,22 +10,22 @@ model)/noise on held-out records. "closed" is relative to the model as stated wi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import emps_axis, ruler_robot, serial_link_stage
 from benchmarks.harness import Print, data_folder, main
+from benchmarks.own_plant import weighed
 from diagnosis import Diagnosis, PlantCase, diagnose, pooled_rms
 from diagnosis.fit.model_error import correlation_length
 
 
-def settled(make: Callable[[float], PlantCase], passes: float = 1.0) -> tuple[Diagnosis, float]:
+def settled(case: PlantCase, passes: float = 1.0) -> tuple[Diagnosis, float]:
     """Diagnosis with the correlation length that its own residuals show."""
     length = 100.0
     for _ in range(5):
-        found = diagnose(make(length))
+        found = diagnose(weighed(case, length))
         shown = correlation_of(found, passes)
         if abs(np.log(shown / length)) < 0.1:
             break
@@ -77,16 +77,11 @@ def emps(out: Print, folder: Path) -> None:
             for refined in (False, True):
                 if simulated == "loop" and refined:
                     continue
-                listed = "direction and speed dependence of viscous friction listed too" if refined else ""
+                listed = "; direction and speed dependence of viscous friction listed too" if refined else ""
                 out("")
-                out(f"{_SIMULATED[simulated]}; {_HELD_OUT[held_out]}{'; ' + listed if listed else ''}")
-
-                def make(
-                    length: float, held_out: str = held_out, simulated: str = simulated, r: bool = refined
-                ) -> PlantCase:
-                    return emps_axis.case(folder, held_out, simulated, refined=r, correlation_samples=length)
-
-                found, length = settled(make, 2.0 if held_out == "passes" else 3.5)
+                out(f"{_SIMULATED[simulated]}; {_HELD_OUT[held_out]}{listed}")
+                case = emps_axis.case(folder, held_out, simulated, refined=refined)
+                found, length = settled(case, 2.0 if held_out == "passes" else 3.5)
                 tell(out, found, length)
                 if not refined:
                     against_published(out, found)
@@ -125,9 +120,10 @@ def against_published(out: Print, found: Diagnosis) -> None:
 def robustness(out: Print, folder: Path) -> None:
     out("")
     out("The answer under other weighings (forces, passes): model error allowed, correlation length, names")
+    case = emps_axis.case(folder, "passes")
     for error in (0.05, 0.1, 0.2):
         for length in (50.0, 200.0, 800.0):
-            found = diagnose(emps_axis.case(folder, "passes", model_error=error, correlation_samples=length))
+            found = diagnose(weighed(case, length, error))
             sure = found.sets[tuple(sorted(found.combination))] if found.combination else np.nan
             out(f"  {error:.2f} {length:5.0f}  {found.verdict}: {_names(found.combination)} ({sure:.3f})")
 
@@ -164,9 +160,7 @@ def quanser(out: Print, folder: Path) -> None:
         )
     windows = {1: (150, 1400), 2: (1450, 2650)}
     for stage, window in windows.items():
-        found, length = settled(
-            lambda length, s=stage: serial_link_stage.case(folder, s, correlation_samples=length)
-        )
+        found, length = settled(serial_link_stage.case(folder, stage))
         out("")
         out(f"Stage {stage}")
         tell(out, found, length)
@@ -199,9 +193,7 @@ def slfr(out: Print, folder: Path) -> None:
             error = ruler_robot.simulate(fit, {}, data[:, :1])[:, 0] - data[:, 1]
             out(f"    fitted at {a}, repeat 2 at {b}: RMS error {np.sqrt(np.mean(error**2)):.3f} counts")
     for fitted in ((50, 75), (50,)):
-        found, length = settled(
-            lambda length, f=fitted: ruler_robot.case(folder, f, correlation_samples=length)
-        )
+        found, length = settled(ruler_robot.case(folder, fitted))
         out("")
         out(f"Fitted at {' and '.join(map(str, fitted))}, judged at both (second repeats)")
         tell(out, found, length)

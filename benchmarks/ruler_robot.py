@@ -15,17 +15,16 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
-from scipy.linalg import expm
 from scipy.optimize import least_squares
 
-from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
+from benchmarks.own_plant import MODEL_ERROR, SHARE, Real, given, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
+from diagnosis.machine.machine_protocol import Role
 
 DT_S, SUBSTEPS = 0.002, 1
 # A spring that pushes away makes the arm unstable: such a fit has to end somewhere finite.
 RUNAWAY_COUNTS = 1e4
 COUNTS_PER_RAD = 1024 / (2 * np.pi)
-MODEL_ERROR = 0.1
 # Mode frequencies and first damping from the free decays with the hub held; the rest only starts the fit.
 GUESS = {
     "gain_1_s2": 300.0,
@@ -66,12 +65,11 @@ def simulate(
     value = given(effects)
     static = value("stribeck_friction", "static_counts")
     coulomb = value("coulomb_friction", "drive_counts")
-    A, B = state_space(parameters)
-    held = expm(np.block([[A, B], [np.zeros((1, 7))]]) * (DT_S / SUBSTEPS))
+    A, B = held_input(*state_space(parameters), DT_S / SUBSTEPS)
     theta = _run(
         np.ascontiguousarray(inputs[:, 0]),
-        np.ascontiguousarray(held[:6, :6]),
-        np.ascontiguousarray(held[:6, 6]),
+        A,
+        B[:, 0].copy(),
         coulomb + static * value("stribeck_friction", "coulomb_share"),
         coulomb + static,
         value("stribeck_friction", "velocity_counts_s", 1.0),
@@ -170,9 +168,6 @@ def case(
     folder: Path,
     fitted: tuple[int, ...] = (50, 75),
     judged: tuple[int, ...] = (50, 75),
-    *,
-    model_error: float = MODEL_ERROR,
-    correlation_samples: float = 1.0,
 ) -> PlantCase:
     """Stated: linear fit of the third repeat at amplitude 50. Fitted: first repeats. Judged: second repeats.
 
@@ -190,15 +185,15 @@ def case(
         ("theta_counts",),
         np.array([noise]),
         effects(),
-        model_error=model_error * level / noise,
-        correlation_samples=correlation_samples,
+        model_error=MODEL_ERROR * level / noise,
+    )
+    roles: tuple[tuple[Role, int, tuple[int, ...]], ...] = (
+        ("estimation", 1, fitted),
+        ("held_out", 2, judged),
     )
     experiments = [
-        PlantExperiment(f"amplitude {a}, repeat 1", "estimation", repeats[a][0][:, :1], repeats[a][0][:, 1:])
-        for a in fitted
-    ]
-    experiments += [
-        PlantExperiment(f"amplitude {a}, repeat 2", "held_out", repeats[a][1][:, :1], repeats[a][1][:, 1:])
-        for a in judged
+        PlantExperiment(f"amplitude {a}, repeat {r}", role, *np.split(repeats[a][r - 1], 2, axis=1))
+        for role, r, amplitudes in roles
+        for a in amplitudes
     ]
     return PlantCase("SLFR, swept sines", plant, tuple(experiments))

@@ -13,15 +13,13 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
-from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
+from benchmarks.own_plant import MODEL_ERROR, SHARE, Real, given, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 
 DT_S, PERIOD, SUBSTEPS = 0.002, 5000, 2
 LIMIT_A, FILTER_RAD_S = 0.94, 150.0
-MODEL_ERROR = 0.1
 MANUFACTURER = {
     1: {
         "hub_inertia_kg_m2": 0.0635,
@@ -84,14 +82,13 @@ def simulation(gains: Real):
         moved = dict(parameters)
         moved["load_inertia_kg_m2"] *= 1 + value("load_inertia", "relative_increase")
         moved["spring_Nm_rad"] /= 1 + value("link_softness", "relative_increase")
-        A, B = state_space(moved)
-        held = expm(np.block([[A, B], [np.zeros((2, 6))]]) * (DT_S / SUBSTEPS))
+        A, B = held_input(*state_space(moved), DT_S / SUBSTEPS)
         out = _run(
             np.ascontiguousarray(inputs[:, 0]),
             value("other_stage", "share") * inputs[:, 1],
             inputs[0, 2],
-            np.ascontiguousarray(held[:4, :4]),
-            np.ascontiguousarray(held[:4, 4:]),
+            A,
+            B,
             gains,
             steady,
             max(coulomb + static, steady),
@@ -201,9 +198,7 @@ def standing(folder: Path, stage: int) -> Real:
     return np.asarray(current[still])
 
 
-def case(
-    folder: Path, stage: int, *, model_error: float = MODEL_ERROR, correlation_samples: float = 1.0
-) -> PlantCase:
+def case(folder: Path, stage: int) -> PlantCase:
     """First pass to fit, second to judge.
 
     "other_stage" acts on the load: for stage 1 the spring torque of stage 2, for stage 2 the angular
@@ -232,8 +227,7 @@ def case(
         ("theta_rad", "alpha_rad"),
         noise,
         effects(),
-        model_error=model_error * level,
-        correlation_samples=correlation_samples,
+        model_error=MODEL_ERROR * level,
     )
     return PlantCase(
         f"Quanser serial flexible link, stage {stage}",

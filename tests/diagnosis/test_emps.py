@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import emps_axis
+from benchmarks.own_plant import weighed
 from benchmarks.real_machine_gaps import fitted_values, settled
 from diagnosis import diagnose
 
@@ -13,9 +14,7 @@ PUBLISHED = emps_axis.PUBLISHED
 
 
 def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flexlink_data):
-    found, length = settled(
-        lambda length: emps_axis.case(flexlink_data, "passes", correlation_samples=length), passes=2.0
-    )
+    found, length = settled(emps_axis.case(flexlink_data, "passes"), passes=2.0)
     assert found.verdict == "effect"
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     assert found.probabilities["coulomb_friction"] > 0.9
@@ -35,26 +34,26 @@ def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flex
 
 
 def test_the_same_two_explain_a_faster_motion_that_no_fit_has_seen(flexlink_data):
-    found = diagnose(emps_axis.case(flexlink_data, "fast", correlation_samples=100.0))
+    found = diagnose(weighed(emps_axis.case(flexlink_data, "fast"), 100.0))
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     assert found.gap_closed > 0.9
 
 
 def test_a_larger_allowance_for_the_model_does_not_lose_the_offset(flexlink_data):
     # Weighed by the error that is allowed the offset promises little, by the one that is left much.
-    found = diagnose(emps_axis.case(flexlink_data, "passes", model_error=0.2, correlation_samples=200.0))
+    found = diagnose(weighed(emps_axis.case(flexlink_data, "passes"), 200.0, 0.2))
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
 
 
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):
     # Not in the published model: half the sum of forces at plus and minus one speed grows with the speed.
-    found = diagnose(emps_axis.case(flexlink_data, "passes", refined=True, correlation_samples=100.0))
+    found = diagnose(weighed(emps_axis.case(flexlink_data, "passes", refined=True), 100.0))
     assert {"coulomb_friction", "viscous_asymmetry"} <= set(found.combination)
 
 
 @pytest.mark.slow
 def test_the_simulated_loop_names_the_same_two(flexlink_data):
-    found = diagnose(emps_axis.case(flexlink_data, "passes", "loop", correlation_samples=400.0))
+    found = diagnose(weighed(emps_axis.case(flexlink_data, "passes", "loop"), 400.0))
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     for key, value in fitted_values(found).items():
         # The loop weighs frequencies otherwise; what the model lacks then moves values by up to 4 %.
