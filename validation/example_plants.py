@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import control
 import numpy as np
@@ -22,7 +22,6 @@ from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
-from ident.data.arrays import lock
 
 Scenario = Literal["A", "B", "C"]
 
@@ -53,18 +52,13 @@ _SPREAD: dict[Scenario, dict[str, float]] = {
 _ISOTROPIC: dict[Scenario, float] = {"A": 0.01, "B": 0.002, "C": 0.002}
 
 
-@dataclass(frozen=True, eq=False)
-class ResponseRecord:
+class ResponseRecord(NamedTuple):
     """Plain uncertain response on given frequencies: (F,), (F,), (F, 2, 2), level."""
 
     omega_rad_s: Real
     centre: Complex
     covariance: Real
     level: float
-
-    def __post_init__(self) -> None:
-        lock(self, "omega_rad_s", "covariance")
-        lock(self, "centre", dtype=np.complex128)
 
 
 @dataclass(frozen=True)
