@@ -52,7 +52,7 @@ app = typer.Typer(
 
 Jobs = Annotated[
     int | None,
-    typer.Option(help="Processes on this machine [default: one per processor]"),
+    typer.Option(min=1, help="Processes on this machine [default: one per processor]"),
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is taken up.")

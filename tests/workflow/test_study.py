@@ -417,9 +417,7 @@ def test_resuming_with_another_base_is_refused(refused, small_study, tmp_path):
 
 def test_jobs_and_scheduler_are_checked(refused, tmp_path):
     study = write_study(tmp_path)
-    assert "--jobs must be at least 1" in refused(
-        "study", "--config", study, "--out", tmp_path / "o", "--jobs", 0
-    )
+    assert "'--jobs'" in refused("study", "--config", study, "--out", tmp_path / "o", "--jobs", 0)
     line = refused(
         "study", "--config", study, "--out", tmp_path / "o", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9"
     )

@@ -334,8 +334,7 @@ class RunConfig(Section):
     @property
     def performance_index(self) -> int | None:
         """Position of the first performance channel, the one the damping requirement is about."""
-        found = [index for index in range(len(self.channels)) if self.purpose_of(index) == "performance"]
-        return found[0] if found else None
+        return next((k for k in range(len(self.channels)) if self.purpose_of(k) == "performance"), None)
 
     @property
     def input_files(self) -> list[Path]:

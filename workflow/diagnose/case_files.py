@@ -186,7 +186,11 @@ def _experiment(
         record = Record.from_file(
             path, [names["voltage_V"].column], [hub.column, tip.column], time=time, dt_s=settings.dt_s
         )
-    _check_sampling(path, record, rig)
+    stated = rig.sampling.dt_s
+    if not abs(record.dt_s - stated) <= _SAMPLING_TOLERANCE * stated:
+        raise InputError(
+            f"{path}: sampled every {record.dt_s:.6g} s, but the rig file states sampling.dt_s = {stated:.6g}"
+        )
     if entry.samples is not None and entry.samples != record.n_samples:
         raise InputError(
             f"{file}: experiments[{index}].samples: {entry.samples} stated, {path} has {record.n_samples}"
@@ -203,12 +207,4 @@ def _experiment(
             output=output,
             kind=entry.kind,
             closed_loop=entry.closed_loop,
-        )
-
-
-def _check_sampling(path: Path, record: Record, rig: Rig) -> None:
-    stated = rig.sampling.dt_s
-    if not abs(record.dt_s - stated) <= _SAMPLING_TOLERANCE * stated:
-        raise InputError(
-            f"{path}: sampled every {record.dt_s:.6g} s, but the rig file states sampling.dt_s = {stated:.6g}"
         )

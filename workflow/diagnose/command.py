@@ -90,8 +90,6 @@ def diagnose_cases(
     one name, or `out` cannot be used.
     """
     progress = progress or Progress()
-    if jobs is not None and jobs < 1:
-        raise InputError(f"--jobs must be at least 1, got {jobs}")
     loaded, unreadable = _load(places, rig)
     code = code_digest("diagnosis", drawing=True)
     work = [Work(one, controller, code, engine or Engine()) for one in loaded]

@@ -61,8 +61,6 @@ def run_study(
     (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
     """
     progress = progress or Progress()
-    if jobs is not None and jobs < 1:
-        raise InputError(f"--jobs must be at least 1, got {jobs}")
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
     study, text, base_path = load_study(config_path)
