@@ -23,8 +23,7 @@ from ident.search.order_selection import OrderSelection, OrderStep
 from ident.search.pole_search import PoleSearch
 from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import SearchTrace
-from ident.uncertainty.embedding import EmbeddingOptions
-from ident.uncertainty.frf_embedding import embed_response
+from ident.uncertainty.embedding import EmbeddingOptions, embed_response
 
 # The covariances explain the residual if chi-square is no less probable than this.
 _LEVEL = 0.99
@@ -170,15 +169,7 @@ def identify_frf(
         integrators=options.integrators,
         input_delay_samples=options.input_delay_samples,
     )
-    posterior = embed_response(
-        data,
-        poles,
-        fixed,
-        integrators=options.integrators,
-        input_delay_samples=options.input_delay_samples,
-        options=embedding,
-        shared_gain_std=shared_gain_std,
-    )
+    posterior = embed_response(data, model, fixed, embedding, shared_gain_std=shared_gain_std)
     band_rad_s = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
     return FrfIdentification(
         model=model,

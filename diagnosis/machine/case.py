@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from diagnosis.machine.flexible_arm import FlexibleArm
-from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record, readonly
+from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
+from ident.data.arrays import lock
 from plant.rig import Rig
 
 
@@ -40,8 +41,7 @@ class Experiment:
     closed_loop: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "voltage_V", readonly(self.voltage_V))
-        object.__setattr__(self, "output", readonly(self.output))
+        lock(self, "voltage_V", "output")
         if self.voltage_V.ndim != 1:
             raise ValueError(f"experiment {self.name}: voltage_V must be (T,); got {self.voltage_V.shape}")
         check_record(self, ("hub_angle_rad", "tip_m"))

@@ -162,10 +162,3 @@ def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> N
     for column, output in zip(y.T, output_names, strict=False):
         if np.ptp(column) == 0:
             raise ValueError(f"{what}: {output} is {column[0]:.6g} throughout: is the sensor dead?")
-
-
-def readonly(values: Any) -> Real:
-    """A copy that nobody changes."""
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array

@@ -29,8 +29,8 @@ from diagnosis.machine.machine_protocol import (
     Role,
     Weighing,
     check_record,
-    readonly,
 )
+from ident.data.arrays import lock
 from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
 
 Simulate = Callable[[Mapping[str, float], Mapping[str, Mapping[str, float]], Real], Real]
@@ -190,15 +190,15 @@ class Plant:
     correlation_samples: float = 1.0
 
     def __post_init__(self) -> None:
-        noise = readonly(self.noise)
-        object.__setattr__(self, "noise", noise)
+        lock(self, "noise")
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "output_names", tuple(self.output_names))
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "tolerances", MappingProxyType(dict(self.tolerances)))
-        if noise.shape != (len(self.output_names),) or not np.all(noise > 0):
+        count = len(self.output_names)
+        if self.noise.shape != (count,) or not np.all(self.noise > 0):
             raise ValueError(
-                f"plant: needs one noise level above zero per output ({len(self.output_names)}); got {noise}"
+                f"plant: needs one noise level above zero per output ({count}); got {self.noise}"
             )
         if not self.model_error >= 0:
             raise ValueError(f"plant: model_error must not be negative; got {self.model_error}")
@@ -255,8 +255,7 @@ class PlantExperiment:
     output: Real
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "input", readonly(self.input))
-        object.__setattr__(self, "output", readonly(self.output))
+        lock(self, "input", "output")
         check_record(self)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from diagnosis.machine.case import Case
-from diagnosis.machine.machine_protocol import Real, readonly
+from diagnosis.machine.machine_protocol import Real
+from ident.data.arrays import lock
 from plant.excitation import Grid, doublet, log_chirp, multisine, multisine_lines, prbs
 
 Integer = npt.NDArray[np.int64]
@@ -65,7 +66,7 @@ class Excitation:
     voltage_V: Real
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "voltage_V", readonly(self.voltage_V))
+        lock(self, "voltage_V")
 
     @property
     def amplitude_V(self) -> float:

@@ -61,10 +61,7 @@ def fit_on_fresh_data(
     fitted to the record, with estimate_offset a constant; neither touches the response to the input. Raises
     ValueError for another sampling time, more than one channel, or a constant output.
     """
-    if record.input.shape[1] != 1 or record.output.shape[1] != 1:
-        raise ValueError(f"{record.label}: need one input and one output; use record.siso(input, output)")
-    if not abs(record.dt_s - model.dt_s) <= 1e-9 * model.dt_s:
-        raise ValueError(f"{record.label}: dt_s = {record.dt_s}, the model has {model.dt_s}")
+    record.refuse_several(model.dt_s)
     y = record.output[:, 0]
     spread = float(np.linalg.norm(y - y.mean()))
     if spread == 0:

@@ -91,8 +91,7 @@ def _spectra(records: Sequence[Record], periodic: bool) -> _Spectra:
         raise ValueError("need at least one record")
     first = records[0]
     for record in records:
-        if record.input.shape[1] != 1 or record.output.shape[1] != 1:
-            raise ValueError(f"{record.label}: need one input and one output; use record.siso(input, output)")
+        record.refuse_several()
         if record.n_samples != first.n_samples or record.dt_s != first.dt_s:
             raise ValueError(
                 f"{record.label}: {record.n_samples} samples at {record.dt_s} s, but {first.label} has "

@@ -113,6 +113,16 @@ class Record:
         """Sampling instants (T,), starting at 0."""
         return np.arange(self.n_samples, dtype=np.float64) * self.dt_s
 
+    def refuse_several(self, dt_s: float | None = None) -> None:
+        """Raise ValueError unless there are one input and one output, sampled at dt_s where that is given."""
+        if self.input.shape[1] != 1 or self.output.shape[1] != 1:
+            raise ValueError(
+                f"{self.label}: need one input and one output, got {list(self.input_names)} and "
+                f"{list(self.output_names)}; choose with Record.siso"
+            )
+        if dt_s is not None and not abs(self.dt_s - dt_s) <= 1e-9 * dt_s:
+            raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")
+
     def siso(self, input_name: str | None = None, output_name: str | None = None) -> Record:
         """The record with one input and one output; a name may be left out where there is only one column."""
         i = self._column("input", self.input_names, input_name)

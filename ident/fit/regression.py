@@ -22,12 +22,7 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
         As `prepare_inputs`, and if a record has more than one input or output.
     """
     for record in records:
-        if record.input.shape[1] != 1 or record.output.shape[1] != 1:
-            raise ValueError(
-                f"{record.label}: identification takes one input and one output, got "
-                f"{list(record.input_names)} "
-                f"and {list(record.output_names)}; choose with Record.siso"
-            )
+        record.refuse_several()
     return prepare_inputs(records, structure)
 
 

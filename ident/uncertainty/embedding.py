@@ -18,14 +18,16 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.basis.posterior import ResponsePosterior
+from ident.basis.posterior import EmbeddingReport, ResponsePosterior
 from ident.basis.structure import Structure
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
+from ident.fit.frf_regression import FrfRegression
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
+    RegressionBlock,
     averaged_posterior,
     embedding_report,
     exponential_factor,
@@ -50,6 +52,8 @@ from ident.uncertainty.undetected_mode import (
 
 # Kernel of 150 taps (design 4.5), as far as the records can carry it.
 _DEFAULT_FIR_LENGTH = 150
+# The same for a measured frequency response, as far as the frequencies can carry it.
+_FRF_FIR_LENGTH = 60
 # Modes that the order selection missed and the embedding adds: coloured noise hides them from a search that
 # takes it for white, and whitening brings them out.
 _MOST_ADDED = 5
@@ -168,26 +172,80 @@ def _embed(
         )
     else:
         mean, factor = joint_factor(reduced, kernel)
+    report = embedding_report(
+        "classical embedding" if classical_recipe else "tangent embedding",
+        reduced,
+        kernel,
+        ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
+        probability_missed_mode=missed.probability if missed else 0.0,
+        missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
+        n_added_modes=(solved.rows.poles.order - rows.poles.order) // 4,
+    )
+    return _posterior(model, poles, rows.structure.feedthrough, rows.fir_length, mean, factor, report)
+
+
+def embed_response(
+    data: FrfRegression,
+    model: GobfModel,
+    fixed: Poles,
+    options: EmbeddingOptions | None = None,
+    *,
+    shared_gain_std: float = 0.0,
+) -> ResponsePosterior:
+    """Tangent posterior around a model whose poles were chosen from this response; `fixed` (first among its
+    poles) are not doubled.
+
+    The rows are whitened frequencies instead of samples, the rest is the same. The covariances of the
+    measurement are taken as they are if the rest of the fit is no larger than they explain, and multiplied by
+    the estimated noise variance (in their units, Birge's ratio) if it is: the posterior never claims more
+    than the measurement. shared_gain_std is the relative standard deviation of a real factor common to all
+    frequencies; the fit is proportional to the measurement, so it adds exactly one direction, that of the
+    mean itself. Raises ValueError if the frequencies do not outnumber the unknowns, or shared_gain_std is
+    negative.
+    """
+    if not 0 <= shared_gain_std < np.inf:
+        raise ValueError(f"shared_gain_std must not be negative; got {shared_gain_std}")
+    options = options or EmbeddingOptions()
+    basis = model.poles.doubled(fixed.counts)
+    regressors = data.columns(basis)
+    spare = data.n_rows - regressors.shape[1]
+    length = options.fir_length or max(1, min(_FRF_FIR_LENGTH, spare // 3))
+    taps = data.common[:, np.newaxis] * data.z[:, np.newaxis] ** -np.arange(1.0, length + 1)
+    measured = data.weight.ravel() > 0
+    nothing = np.zeros((data.n_rows, 0))
+    block = RegressionBlock(nothing, regressors[measured], data.whiten(taps)[measured], data.y[measured])
+    reduced = reduce_regression([block])
+    grid = kernel_grid(reduced, tc_factor)
+    kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
+    mean, factor = joint_factor(reduced, kernel)
+    widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
+    factor = np.column_stack([widening * factor, shared_gain_std * mean])
+    report = embedding_report("tangent embedding of a measured response", reduced, kernel)
+    return _posterior(model, basis, data.feedthrough, length, mean, factor, report)
+
+
+def _posterior(
+    model: GobfModel,
+    poles: Poles,
+    feedthrough: bool,
+    fir_length: int,
+    mean: RealArray,
+    factor: RealArray,
+    report: EmbeddingReport,
+) -> ResponsePosterior:
+    """Around the model: what is not asked here is taken from it."""
     return ResponsePosterior(
         poles=poles,
         mean=mean,
         covariance_factor=factor,
         dt_s=model.dt_s,
-        fir_length=rows.fir_length,
-        has_feedthrough=rows.structure.feedthrough,
+        fir_length=fir_length,
+        has_feedthrough=feedthrough,
         integrators=model.integrators,
         input_delay_samples=model.input_delay_samples,
         input_name=model.input_name,
         output_name=model.output_name,
-        report=embedding_report(
-            "classical embedding" if classical_recipe else "tangent embedding",
-            reduced,
-            kernel,
-            ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
-            probability_missed_mode=missed.probability if missed else 0.0,
-            missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
-            n_added_modes=(solved.rows.poles.order - rows.poles.order) // 4,
-        ),
+        report=report,
     )
 
 
@@ -197,12 +255,7 @@ def _rows(
     if not records:
         raise ValueError("need at least one record")
     for record in records:
-        if record.input.shape[1] != 1 or record.output.shape[1] != 1:
-            raise ValueError(
-                f"record {record.name!r}: need one input and one output; use record.siso(input, output)"
-            )
-        if not abs(record.dt_s - model.dt_s) <= 1e-9 * model.dt_s:
-            raise ValueError(f"record {record.name!r} has dt_s = {record.dt_s}, the model {model.dt_s}")
+        record.refuse_several(model.dt_s)
     structure = Structure(
         integrators=model.integrators,
         input_delay_samples=model.input_delay_samples,
