@@ -141,7 +141,10 @@ def certify(
     nothing = Findings("controller", {}, None, (np.inf, 0.0), np.inf, (), controller)
     items += [requirement.check(nothing) for requirement in specification.on_controller()]
     if joint is not None:
-        items.append(_stable_share_item(joint, plants, joint_stable_share))
+        name = plants[0].name if len(plants) == 1 else "all plants together"
+        caption = f"share of {joint.draws} sampled responses that are stable"
+        found_share, enough = joint.stable_share, bool(joint.stable_share >= joint_stable_share)
+        items.append(SpecificationItem(caption, name, joint_stable_share, found_share, "", enough))
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
     proofs = [v.all_frequencies for v in verdicts]
     robust = robust and all(proof.proved or not proof.possible for proof in proofs)
@@ -240,17 +243,3 @@ def _check_plant(
         controller,
     )
     return verdict, [requirement.check(found) for requirement in specification.requirements(plant)]
-
-
-def _stable_share_item(
-    joint: JointCoverage, plants: Sequence[UncertainPlant], required: float
-) -> SpecificationItem:
-    name = plants[0].name if len(plants) == 1 else "all plants together"
-    return SpecificationItem(
-        f"share of {joint.draws} sampled responses that are stable",
-        name,
-        required,
-        joint.stable_share,
-        "",
-        bool(joint.stable_share >= required),
-    )

@@ -18,7 +18,7 @@ from control_design.analysis.joint_coverage import unstable_draws
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
-from control_design.synthesis.synthesis import Progress, synthesise
+from control_design.synthesis.synthesis import Progress, part_of, synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 
@@ -80,11 +80,7 @@ def synthesise_jointly(
     guards: list[Guard] = []
     best: JointDesign | None = None
     for number in range(rounds + 1):
-        base, share = number / (rounds + 1), 1.0 / (rounds + 1)
-
-        def part(fraction: float, message: str, base: float = base, share: float = share) -> None:
-            tell(base + share * fraction, message)
-
+        part = part_of(tell, number, rounds + 1)
         result = synthesise(plants, specification, options, rng=rng, progress=part, guards=guards)
         if result.outcome is Outcome.NOT_CONVERGED:
             best = best or JointDesign(result, tuple(guards), draws, (), False)

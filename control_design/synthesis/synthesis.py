@@ -84,7 +84,7 @@ def synthesise(
                     with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
                     for _ in range(_EMBEDDINGS)
                 ]
-            part = _part(tell, number, len(ladder), cascade.order)
+            part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
             result = OrderSearch(workshop, pool, cascade, own, part, given).run()
             reports += result.reports
     assert cascade is not None
@@ -115,9 +115,9 @@ def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[Sectio
     return rungs
 
 
-def _part(tell: Progress, number: int, count: int, order: int) -> Progress:
-    """Progress of one order as part of the whole."""
-    return lambda fraction, message: tell((number + fraction) / count, f"order {order}: {message}")
+def part_of(tell: Progress, number: int, count: int, head: str = "") -> Progress:
+    """Progress of one of `count` equal parts of a whole."""
+    return lambda fraction, message: tell((number + fraction) / count, head + message)
 
 
 def _nothing_stable(
