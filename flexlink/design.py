@@ -64,10 +64,8 @@ class UncertainPlant(Shown, control_design.UncertainPlant):
         *,
         name: str = "plant",
         uncertainty: Any = None,
-        integrators: int | None = None,
-        performance: control_design.Channel | None = None,
-        level: float = 0.95,
         nominal: control.StateSpace | None = None,
+        **more: Any,
     ) -> None:
         given = plant if nominal is None else nominal
         if uncertainty is None and isinstance(given, Uncertainty):
@@ -76,9 +74,7 @@ class UncertainPlant(Shown, control_design.UncertainPlant):
             name=name,
             nominal=given if isinstance(given, control.StateSpace) else given.to_control(),
             uncertainty=uncertainty,
-            integrators=integrators,
-            performance=performance,
-            level=level,
+            **more,
         )
 
 

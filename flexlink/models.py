@@ -17,7 +17,6 @@ from ident.basis import posterior
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
-from ident.data.units import TimeColumn
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
@@ -84,17 +83,14 @@ class Record(Shown, ident.Record):
         y: Any = None,
         dt_s: float | None = None,
         *,
-        reference: Any = None,
         name: str = "record",
+        reference: Any = None,
         input: Any = None,  # noqa: A002 (the attribute's name)
         output: Any = None,
         input_names: Sequence[str] = (),
         output_names: Sequence[str] = (),
         reference_names: Sequence[str] = (),
-        input_units: Sequence[str] = (),
-        output_units: Sequence[str] = (),
-        source: str = "",
-        time_column: TimeColumn | None = None,
+        **more: Any,
     ) -> None:
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
@@ -112,10 +108,7 @@ class Record(Shown, ident.Record):
             output_names=tuple(output_names),
             reference=reference,
             reference_names=tuple(reference_names),
-            input_units=tuple(input_units),
-            output_units=tuple(output_units),
-            source=source,
-            time_column=time_column,
+            **more,
         )
 
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from diagnosis.next_experiment.next_experiment import NextExperiment
 from workflow.figures import gap_style, style
-from workflow.figures.bands import outline
+from workflow.figures.bands import Real, outline
 from workflow.figures.registry import drawing
-
-Real = npt.NDArray[np.float64]
 
 
 @drawing("gap_next")

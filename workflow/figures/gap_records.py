@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from diagnosis.diagnosis import Diagnosis
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
-from workflow.figures.bands import outline
+from workflow.figures.bands import Real, outline
 from workflow.figures.registry import drawing
-
-Real = npt.NDArray[np.float64]
 
 _SEGMENT = 512
 _TRACE_BINS = 250  # a panel is some 400 pixels wide

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from workflow.engine import storage
-from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import ReportResult
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
@@ -24,11 +21,6 @@ def write_page(stage: StageInput) -> ReportResult:
     return ReportResult(storage.sha256_of_file(path))
 
 
-def page(run: RunDirectory) -> tuple[Path, ...]:
-    """The file outside stages/ that belongs to this stage."""
-    return (run.report_path,)
-
-
 REPORT = Stage(
     "report",
     tuple(stage.name for stage in STAGES),
@@ -36,5 +28,5 @@ REPORT = Stage(
     expected_s=7.0,
     # Words that appear on the page and nowhere before.
     uses={"run": True, "notes": True, "specification": True},
-    also_writes=page,
+    also_writes=lambda run: (run.report_path,),
 )

@@ -151,26 +151,13 @@ def _finite(value: float | None) -> bool:
 
 
 TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
+_NAMED: tuple[Callable[..., Any], ...] = (
+    number, si, percent, share, signed, fixed, interval, extent, frequency, hertz, decibels, in_decibels,
+    unit, listing, count, sentence, yes_no, setting,
+)  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "number": number,
+    **{function.__name__: function for function in _NAMED},
     "fmt": format,
-    "si": si,
-    "percent": percent,
-    "share": share,
-    "signed": signed,
-    "fixed": fixed,
-    "interval": interval,
-    "extent": extent,
-    "frequency": frequency,
-    "hertz": hertz,
     "ln": math.log,
     "degrees": math.degrees,
-    "decibels": decibels,
-    "in_decibels": in_decibels,
-    "unit": unit,
-    "listing": listing,
-    "count": count,
-    "sentence": sentence,
-    "yes_no": yes_no,
-    "setting": setting,
 }
