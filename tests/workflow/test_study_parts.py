@@ -219,13 +219,7 @@ def _view(rows: list[PointRow], plots: int = 1) -> StudyView:
 
 
 def test_picture_tells_certified_from_uncertified():
-    rows = [
-        _row(1, 1.0, 0.9),
-        _row(2, 1.0, 0.5),
-        _row(3, 2.0, 0.9, good=False),
-        _row(4, None, 0.9),
-        _row(5, 1.0, None),
-    ]
+    rows = [_row(1, 1.0, 0.9), _row(2, 1.0, 0.5), _row(3, 2.0, 0.9, good=False), *[_row(4, None, 0.9)] * 2]
     figure = draw_pareto(_view(rows))
     axes = figure.axes[0]
     by_label = {line.get_label(): line for line in axes.lines}
