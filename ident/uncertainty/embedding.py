@@ -38,7 +38,7 @@ from ident.uncertainty.embedding_algebra import (
     tc_factor,
     total_log_evidence,
 )
-from ident.uncertainty.embedding_rows import EmbeddingRows
+from ident.uncertainty.embedding_rows import Beside, EmbeddingRows
 from ident.uncertainty.residual_noise import gls_residuals
 from ident.uncertainty.undetected_mode import (
     PairMixture,
@@ -103,7 +103,12 @@ class EmbeddingOptions(BaseModel):
 
 
 def tangent(
-    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
+    records: Sequence[Record],
+    model: GobfModel,
+    options: EmbeddingOptions | None = None,
+    *,
+    beside: Sequence[Beside] = (),
+    known_to_one: bool = False,
 ) -> ResponsePosterior:
     """Posterior of the response around a model whose poles were chosen from these records.
 
@@ -115,9 +120,20 @@ def tangent(
     would have kept them (after whitening, or in a model whose order was given); then, once each, pairs of one
     further mode that has a probability worth counting (`ident.uncertainty.undetected_mode`). A mode that is
     not seen in these records at all stays outside the ellipses at its peak: no data speak of it.
+
+    beside: columns beside the basis functions, one per record; their coefficients are estimated too, freely
+    or (known_to_one) as independent unknowns of zero mean and unit variance.
     """
     options = options or EmbeddingOptions()
-    return _embed(records, model, model.poles.doubled(), options, classical_recipe=False)
+    return _embed(
+        records,
+        model,
+        model.poles.doubled(),
+        options,
+        classical_recipe=False,
+        beside=beside,
+        known_to_one=known_to_one,
+    )
 
 
 def classical(
@@ -147,8 +163,12 @@ def _embed(
     options: EmbeddingOptions,
     *,
     classical_recipe: bool,
+    beside: Sequence[Beside] = (),
+    known_to_one: bool = False,
 ) -> ResponsePosterior:
-    rows = _rows(records, model, poles, options)
+    rows = replace(_rows(records, model, poles, options), beside=tuple(beside))
+    if known_to_one:
+        rows = replace(rows, known_std=_noise_std(rows))
     solve = _solve_classical if classical_recipe else _solve
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
     first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
@@ -157,7 +177,8 @@ def _embed(
         for _ in range(_NOISE_ROUNDS):
             residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
             whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
-            solved = solve(solved.rows.with_whitening(whitening), options)
+            behind = solved.rows.with_whitening(whitening)
+            solved = solve(replace(behind, known_std=_noise_std(behind)) if known_to_one else behind, options)
     poles = solved.rows.poles
     reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
     if missed is not None and missed.poles.size:
@@ -166,12 +187,15 @@ def _embed(
             with_pairs(kernel, missed),
         )
         poles = Poles(poles.real, np.concatenate([poles.pairs, missed.poles]))
+    # The columns beside the basis functions are no part of the response.
+    after = solved.rows.poles.order + int(rows.structure.feedthrough)
+    mean, factor = (
+        np.delete(part, slice(after, after + rows.n_beside), axis=0) for part in joint_factor(reduced, kernel)
+    )
+    if missed is not None and missed.poles.size:
         mean, factor = (
-            _pairs_after_poles(part, solved.rows.poles.order, missed.poles)
-            for part in joint_factor(reduced, kernel)
+            _pairs_after_poles(part, solved.rows.poles.order, missed.poles) for part in (mean, factor)
         )
-    else:
-        mean, factor = joint_factor(reduced, kernel)
     report = embedding_report(
         "classical embedding" if classical_recipe else "tangent embedding",
         reduced,
@@ -247,6 +271,12 @@ def _posterior(
         output_name=model.output_name,
         report=report,
     )
+
+
+def _noise_std(rows: EmbeddingRows) -> float:
+    """Standard deviation of what regressors and kernel leave, their coefficients free."""
+    reduced = reduce_regression(replace(rows, known_std=None).blocks())
+    return float(np.sqrt(reduced.rest / max(reduced.degrees_of_freedom - reduced.fir_length, 1)))
 
 
 def _rows(

@@ -35,11 +35,24 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
+class Beside:
+    """What the output of one record depends on besides the basis functions driven by its input.
+
+    first (T,p1): in place of the first p1 regressors, where a change of the response does more than they say;
+    columns (T,q): with coefficients that all records share.
+    """
+
+    first: RealArray
+    columns: RealArray
+
+
+@dataclass(frozen=True, eq=False)
 class EmbeddingRows:
     """How to make the matrices; made anew for each pass, so that only one record's are in memory.
 
     poles are those of the regressors (doubled for the tangent method), fir_length that of the kernel,
-    whitening the coefficients of A(q), [1] for white noise.
+    whitening the coefficients of A(q), [1] for white noise. beside: one per record, or none; known_std, where
+    their columns have coefficients known to one: standard deviation of the (whitened) noise, as far as known.
     """
 
     records: tuple[Record, ...]
@@ -47,6 +60,13 @@ class EmbeddingRows:
     poles: Poles
     fir_length: int
     whitening: RealArray
+    beside: tuple[Beside, ...] = ()
+    known_std: float | None = None
+
+    @property
+    def n_beside(self) -> int:
+        """Columns beside the basis functions."""
+        return self.beside[0].columns.shape[1] if self.beside else 0
 
     def with_whitening(self, whitening: RealArray) -> EmbeddingRows:
         """The same with another noise filter."""
@@ -58,8 +78,8 @@ class EmbeddingRows:
         return replace(self, poles=poles)
 
     def __iter__(self) -> Iterator[Rows]:
-        for record in self.records:
-            yield self._rows(record)
+        for k, record in enumerate(self.records):
+            yield self._rows(record, self.beside[k] if self.beside else None)
 
     def blocks(self) -> Iterator[RegressionBlock]:
         """Rows with kernel columns; those that are dropped are left out, for they count as data here."""
@@ -70,6 +90,12 @@ class EmbeddingRows:
                 kernel[:n] = rows.first @ _shifted(rows.head, self.fir_length)
             used = slice(0 if np.any(rows.first) else n, None)
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel[used], rows.output[used])
+        if self.known_std is not None:
+            # What is known of the shared coefficients: as many measurements of them, each off by one.
+            q = self.n_beside
+            known = np.zeros((q, self.poles.order + int(self.structure.feedthrough) + q))
+            known[:, -q:] = self.known_std * np.eye(q)
+            yield RegressionBlock(np.zeros((q, 0)), known, np.zeros((q, self.fir_length)), np.zeros(q))
 
     def pair_blocks(self) -> Iterator[Rows]:
         """Rows with the signal that drives one more pair after all the poles in place of the input."""
@@ -77,7 +103,7 @@ class EmbeddingRows:
             signal, head = (all_pass_signal(self.poles, part) for part in (rows.input, rows.head))
             yield replace(rows, input=signal, head=head)
 
-    def _rows(self, record: Record) -> Rows:
+    def _rows(self, record: Record, beside: Beside | None) -> Rows:
         """Matrices of one record, every column whitened.
 
         Columns driven by the input from rest commute with A(q), so for them the input is filtered; only the
@@ -91,6 +117,10 @@ class EmbeddingRows:
         regressors = self._driven(u)
         if first.size:
             regressors[: len(first)] = first @ self._driven(head)
+        if beside is not None:
+            more = whitened(np.column_stack([beside.first, beside.columns]), whitening)
+            p = beside.first.shape[1]
+            regressors = np.column_stack([more[:, :p], regressors[:, p:], more[:, p:]])
         known = nuisance_columns(
             self.poles, record.n_samples, structure.n_polynomials, structure.estimate_initial_state
         )

@@ -133,6 +133,20 @@ class UncertaintyOptions(EmbeddingOptions):
         "between records of different condition; classical: the published recipe, for comparison",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
+    promise: Literal["this amplitude", "without friction"] = Field(
+        "this amplitude",
+        description="what response the ellipses are about: this amplitude: the best linear one at the size "
+        "of these records, dry friction included; without friction: that of the linear arm behind its Coulomb "
+        "friction, whose level is identified from the control channel (its output is the shaft's position)",
+    )
+
+    @model_validator(mode="after")
+    def _friction_by_tangent(self) -> Self:
+        if self.promise == "without friction" and self.method != "tangent":
+            raise ValueError(
+                f"promise = 'without friction' goes with method = 'tangent', not {self.method!r}"
+            )
+        return self
 
 
 def _ordered(band: tuple[float, float]) -> tuple[float, float]:
@@ -179,7 +193,14 @@ class Channel(Section):
             raise ValueError("give increments or a band, not both: each is a filter of its own")
         if self.bounds_band_rad_s is not None and self.band_rad_s is None:
             raise ValueError("bounds_band_rad_s goes with band_rad_s, the band of the fit")
+        if self.without_friction and (self.increments or self.band_rad_s):
+            raise ValueError("promise = 'without friction' takes records as measured: no increments, no band")
         return self
+
+    @property
+    def without_friction(self) -> bool:
+        """The response wanted is that behind the dry friction."""
+        return self.uncertainty.promise == "without friction"
 
     @property
     def label(self) -> str:
@@ -283,6 +304,17 @@ class RunConfig(Section):
             raise ValueError("closed_loop.machine = 'simulated' needs [source] kind = 'simulated'")
         if self.closed_loop.effects and self.machine != "simulated":
             raise ValueError("closed_loop.effects act on the simulated arm only")
+        if self.without_friction:
+            if self.closed_loop_data.method == "two_stage":
+                raise ValueError("promise = 'without friction' needs closed_loop_data.method = 'direct'")
+            if (
+                self.control_channel.identification.integrators > 1
+                or self.control_channel.identification.feedthrough
+            ):
+                raise ValueError(
+                    "promise = 'without friction': the output of the control channel is the position of the "
+                    "shaft, so it has at most one integrator and no direct term"
+                )
         if self.closed_loop_data.method == "two_stage" and not self._has_references:
             raise ValueError(
                 "closed_loop_data.method = 'two_stage' needs references in [source] for every record"
@@ -316,6 +348,11 @@ class RunConfig(Section):
     def machine(self) -> Literal["simulated", "identified"]:
         """What the closed loop is checked on."""
         return self.closed_loop.machine or ("simulated" if self.source.kind == "simulated" else "identified")
+
+    @property
+    def without_friction(self) -> bool:
+        """Dry friction is identified: some channel's response is wanted without it."""
+        return any(channel.without_friction for channel in self.channels)
 
     @property
     def control_channel(self) -> Channel:

@@ -11,6 +11,7 @@ from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
 from ident.finding import Finding
+from ident.friction import FrictionFit, fit_friction
 from ident.identify import identify
 from ident.stabilisation import stabilisation
 from workflow.config.run_config import Channel, Role
@@ -22,18 +23,21 @@ Report = Callable[[float, str], None]
 _OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
 
 
-def as_fitted(record: Record, channel: Channel) -> Record:
-    """The channel's columns as the pole search sees them: as measured, as increments, or inside the band."""
+def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
+    """The channel's columns as the pole search sees them: as measured, as increments, or inside the band; with
+    friction given, as if there were none."""
     record = record.siso(channel.input, channel.output)
+    if friction is not None:
+        return friction.taken_off(record)
     if channel.increments:
         return increments(record)
     return record if channel.band_rad_s is None else band_limited(record, *channel.band_rad_s)
 
 
-def as_bounded(record: Record, channel: Channel) -> Record:
+def as_bounded(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
     """The channel's columns as the ellipses see them; the same unless a wider band is given for them."""
     if channel.bounds_band_rad_s is None:
-        return as_fitted(record, channel)
+        return as_fitted(record, channel, friction)
     return band_limited(record.siso(channel.input, channel.output), *channel.bounds_band_rad_s)
 
 
@@ -42,6 +46,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     config, records = stage.config, stage.results.records
     measured = [item.record for item in records.of_role("estimation")]
     unseen = [item for item in records.records if item.role != "estimation"]
+    friction = friction_of(stage, measured) if config.without_friction else None
     channels = []
     for k, channel in enumerate(config.channels):
 
@@ -49,8 +54,9 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
             stage.progress.update("identify", (k + fraction) / len(config.channels), f"{label}: {message}")
 
         with naming(f"channel {channel.label!r}"):
-            bounded, finding = [as_bounded(record, channel) for record in measured], None
-            used = [as_fitted(record, channel) for record in measured]
+            known = friction if channel.without_friction else None
+            bounded, finding = [as_bounded(record, channel, known) for record in measured], None
+            used = [as_fitted(record, channel, known) for record in measured]
             if config.closed_loop_data.method == "two_stage":
                 opened = two_stage(bounded, channel.identification, channel.uncertainty)
                 used = bounded = list(opened.records)
@@ -61,7 +67,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 channel.label,
                 used,
                 # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
-                [(as_fitted(item.record, channel), item.role) for item in unseen],
+                [(as_fitted(item.record, channel, known), item.role) for item in unseen],
                 channel.identification,
                 report,
                 two_stage=finding,
@@ -75,7 +81,18 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                     bounds_band_rad_s=channel.bounds_band_rad_s,
                 )
             )
-    return IdentifyResult(tuple(channels))
+    return IdentifyResult(tuple(channels), friction)
+
+
+def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:
+    """Coulomb friction of the shaft whose position the control channel measures."""
+    channel = stage.config.control_channel
+    with naming(f"channel {channel.label!r}"):
+        return fit_friction(
+            [record.siso(channel.input, channel.output) for record in measured],
+            channel.identification,
+            progress=lambda done, what: stage.progress.update("identify", 0.0, what),
+        )
 
 
 def identified_channel(

@@ -27,6 +27,7 @@ from ident.checks.residual_tests import ResidualTest
 from ident.checks.validation import FreshFit, ScatterRow
 from ident.data.record import Record
 from ident.finding import Finding
+from ident.friction import FrictionFit
 from ident.identification import Identification
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -179,7 +180,10 @@ class IdentifiedChannel:
 
 @dataclass(frozen=True, eq=False)
 class IdentifyResult:
+    """friction: of the shaft, where a channel's response is wanted without it."""
+
     channels: tuple[IdentifiedChannel, ...]
+    friction: FrictionFit | None = None
 
 
 # Ellipses

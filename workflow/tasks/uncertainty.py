@@ -18,6 +18,7 @@ from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatte
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
+from ident.friction import FrictionFit, other_output_without_friction, without_friction
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, group_posteriors, record_posteriors
 from ident.uncertainty.embedding import classical, tangent
@@ -56,7 +57,20 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
     ):
         stage.progress.update("uncertainty", k / len(stage.config.channels), channel.label)
         with naming(f"channel {channel.label!r}"):
-            posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
+            friction = stage.results.identify.friction if channel.without_friction else None
+            if friction is None:
+                posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
+            else:
+                measured = [
+                    item.record.siso(channel.input, channel.output)
+                    for item in stage.results.records.of_role("estimation")
+                ]
+                if k == stage.config.control_index:
+                    posterior = without_friction(measured, friction, channel.uncertainty)
+                else:
+                    posterior = other_output_without_friction(
+                        measured, friction, result.model, channel.uncertainty
+                    )
             omega = display_grid(result.model, result.bounded)
             channels.append(
                 uncertain_channel(
@@ -66,7 +80,7 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                     result,
                     omega,
                     nominal_grid(omega, result.data_band_rad_s),
-                    repeat_scatter=scatter_of(channel, result, records, bands_of(omega)),
+                    repeat_scatter=scatter_of(channel, result, records, bands_of(omega), friction),
                 )
             )
     return UncertaintyResult(tuple(channels))
@@ -262,13 +276,14 @@ def scatter_of(
     result: IdentifiedChannel,
     records: Sequence[RunRecord],
     bands: Sequence[tuple[float, float]],
+    friction: FrictionFit | None,
 ) -> tuple[ScatterRow, ...] | None:
     """Predicted ellipses of single records against the scatter of repeats, or None without repeats."""
     bounded = {record.name: record for record in result.bounded}
     groups: dict[str, list[Record]] = {}
     for item in records:
         if item.condition is not None and item.role != "validation":
-            record = bounded.get(item.record.name) or as_bounded(item.record, channel)
+            record = bounded.get(item.record.name) or as_bounded(item.record, channel, friction)
             groups.setdefault(item.condition, []).append(record)
     repeated = [group for group in groups.values() if len(group) >= 2]
     if not repeated:
