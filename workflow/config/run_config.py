@@ -136,8 +136,8 @@ class UncertaintyOptions(EmbeddingOptions):
     promise: Literal["this amplitude", "without friction"] = Field(
         "this amplitude",
         description="what response the ellipses are about: this amplitude: the best linear one at the size "
-        "of these records, dry friction included; without friction: that of the linear arm behind its Coulomb "
-        "friction, whose level is identified from the control channel (its output is the shaft's position)",
+        "of these records, dry friction included; without friction: that of the linear arm behind its "
+        "Coulomb friction, identified from the control channel (its output is the shaft's position)",
     )
 
     @model_validator(mode="after")

@@ -24,8 +24,8 @@ _OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
 
 
 def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
-    """The channel's columns as the pole search sees them: as measured, as increments, or inside the band; with
-    friction given, as if there were none."""
+    """The channel's columns as the pole search sees them: as measured, as increments, or inside the band; as
+    if there were no friction, where it is given."""
     record = record.siso(channel.input, channel.output)
     if friction is not None:
         return friction.taken_off(record)
