@@ -28,10 +28,7 @@ from workflow.tasks.simulated_rig import rig_of, simulate_record
 FRICTIONS_NM = (0.0, 0.005, 0.02, 0.1)
 EDGES_RAD_S = 0.63 * 10 ** (0.5 * np.arange(7))
 OMEGA_RAD_S = np.geomspace(0.63, 627.0, 91)
-BANDS = [
-    (low <= OMEGA_RAD_S) & (high > OMEGA_RAD_S)
-    for low, high in itertools.pairwise(EDGES_RAD_S)
-]
+BANDS = [(low <= OMEGA_RAD_S) & (high > OMEGA_RAD_S) for low, high in itertools.pairwise(EDGES_RAD_S)]
 
 
 def with_friction(config: RunConfig, torque_Nm: float, counts: int) -> SimulatedSource:

@@ -126,6 +126,21 @@ def test_every_excitation_gives_its_samples_and_its_size(table):
         assert 0.95 * table["amplitude_V"] < np.max(np.abs(signal)) <= table["amplitude_V"]
 
 
+@pytest.mark.parametrize(
+    ("channel", "complaint"),
+    [
+        ("uncertainty = {{ {0}, method = 'records' }}", "goes with method = 'tangent'"),
+        ("uncertainty = {{ {0} }}\nincrements = true", "records as measured"),
+        ("uncertainty = {{ {0} }}\nband_rad_s = [1.0, 20.0]", "records as measured"),
+        ("uncertainty = {{ {0} }}\nidentification = {{ integrators = 2 }}", "at most one integrator"),
+    ],
+)
+def test_a_promise_that_cannot_be_kept_is_refused(tmp_path, channel, complaint):
+    asked = channel.format("promise = 'without friction'")
+    with pytest.raises(InputError, match=complaint):
+        minimal(tmp_path, MINIMAL.replace("[[channels]]", f"[[channels]]\n{asked}"))
+
+
 def test_packaged_default_is_the_example():
     assert (ROOT / "workflow" / "data" / "default_arm.toml").read_text() == (
         ROOT / "examples" / "default_arm.toml"

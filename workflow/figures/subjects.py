@@ -21,6 +21,7 @@ from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
+from ident.friction import FrictionFit
 from workflow.config.run_config import Channel, RunConfig
 from workflow.figures.bands import Complex, Real
 from workflow.figures.style import ratio_unit
@@ -148,13 +149,14 @@ class RunView:
     def _channel(self, index: int) -> ChannelView:
         channel, found = self.config.channels[index], self.results.identify.channels[index]
         by_name = {item.name: item.record for item in self.results.records.records}
+        friction = self.results.identify.friction if channel.without_friction else None
         slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
         with_loop = index == self.config.control_index and self.results.design.has_controller
         return ChannelView(
             found,
             self.results.uncertainty.channels[index],
             channel.identification,
-            tuple(_as_fitted(by_name[fit.name], channel) for fit in found.fresh),
+            tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in found.fresh),
             (self.unit(found.model.input_name), self.unit(found.model.output_name)),
             f"{index + 1}-{slug}".strip("-"),
             closed_loop_poles(self.controller, self.plant) if with_loop else None,
@@ -310,9 +312,9 @@ _NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samp
 _ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))
 
 
-def _as_fitted(record: Record, channel: Channel) -> Record:
+def _as_fitted(record: Record, channel: Channel, friction: FrictionFit | None) -> Record:
     """The record as the fit sees it, increments and filtered signals named so."""
-    fitted = as_fitted(record, channel)
+    fitted = as_fitted(record, channel, friction)
     name = fitted.output_names[0]
     if channel.increments:
         name = f"Δ {name}"

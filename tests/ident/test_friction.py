@@ -1,0 +1,157 @@
+"""Coulomb friction identified with the arm, on records of simulators that share no code with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
+from ident.data.arrays import ComplexArray, RealArray
+from ident.friction import FrictionFit, fit_friction, other_output_without_friction, without_friction
+from ident.friction.arm import SteppedArm
+from ident.friction.fit import linearised
+from ident.uncertainty.embedding import tangent
+from plant import parse_effect, simulate
+from plant.modal import linear_arm
+from plant.presets import paper_link
+from validation.blind.truth import Truth
+
+RIG = paper_link()
+VOLTS_PER_NM = 1 / RIG.motor.torque_per_volt_Nm_V
+OPTIONS = IdentOptions(integrators=1, n_real=1, n_pairs=2, omega_min_rad_s=30.0, decay_min_per_s=1.0)
+LOW_RAD_S = np.geomspace(0.7, 60.0, 60)
+
+
+def recorded(torque_Nm: float, seed: int, output: int = 0, *, independent: bool = False) -> list[Record]:
+    """Binary voltage and a multisine on the nonlinear arm; hub angle (0) or tip position (1).
+
+    independent: a truth with large rotations, made without any code of ours; its arm is linear to a few parts
+    in ten thousand only, more than these ellipses are wide.
+    """
+    rng = np.random.default_rng(seed)
+    effects = [{"name": "coulomb_friction", "torque_Nm": torque_Nm}] if torque_Nm else []
+    binary = 6.0 * np.repeat(np.sign(rng.standard_normal(400)), 4)
+    phases = rng.uniform(0, 2 * np.pi, 299)
+    sines = np.cos(2 * np.pi * np.arange(1, 300) * np.arange(2000)[:, None] / 1000 + phases).sum(axis=1)
+    records = []
+    for name, voltage in (("binary", binary), ("sines", 7.0 * sines / sines.std())):
+        if independent:
+            truth = Truth(RIG.model_dump(), effects)
+            measured = truth.record(voltage).measured(truth.noise * rng.standard_normal((voltage.size, 2)))
+        else:
+            measured = simulate(RIG, voltage, [parse_effect(effect) for effect in effects], rng=rng).output
+        signals = voltage[:, None], measured[:, [output]]
+        records.append(Record(name, *signals, RIG.sampling.dt_s, ("voltage_V",), ("y",)))
+    return records
+
+
+def true_response(omega_rad_s: RealArray) -> ComplexArray:
+    """Held voltage to hub angle and tip (2, F) of the linear arm."""
+    arm, dt_s = linear_arm(RIG), RIG.sampling.dt_s
+    s, vectors = np.linalg.eig(arm.A)
+    shares = (arm.C @ vectors) * np.linalg.solve(vectors, arm.B[:, :1])[:, 0]
+    held = np.array([dt_s if abs(pole) < 1e-9 else np.expm1(pole * dt_s) / pole for pole in s])
+    z = np.exp(1j * omega_rad_s * dt_s)
+    return np.asarray(((held / (z[:, None] - np.exp(s * dt_s))) @ shares.T).T)
+
+
+@pytest.fixture(scope="module", params=[0.02, 0.1])
+def rubbing(request: pytest.FixtureRequest) -> tuple[float, list[Record], FrictionFit]:
+    records = recorded(request.param, 5)
+    return request.param, records, fit_friction(records, OPTIONS)
+
+
+@pytest.mark.parametrize("torque_Nm", [0.02, 0.1])
+def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
+    found = fit_friction(recorded(torque_Nm, 5, independent=True), OPTIONS)
+    off = found.level - torque_Nm * VOLTS_PER_NM
+    assert found.significant
+    assert abs(off) < 0.02 * torque_Nm * VOLTS_PER_NM
+    assert abs(off) < 4 * found.level_std
+    assert found.level_std < 0.02 * found.level
+
+
+def test_ellipses_hold_the_arm_behind_its_friction(rubbing: tuple[float, list[Record], FrictionFit]) -> None:
+    """As recorded, hardly any ellipse of these records does."""
+    torque_Nm, records, found = rubbing
+    truth, _ = true_response(LOW_RAD_S)
+    ellipses = without_friction(records, found).at(LOW_RAD_S)
+    as_recorded = tangent(records, identify(records, OPTIONS).model).at(LOW_RAD_S)
+    assert np.mean(ellipses.contains(truth)) > 0.8
+    assert np.mean(as_recorded.contains(truth)) < 0.5
+    error = [np.median(np.abs(found_.centre - truth) / np.abs(truth)) for found_ in (ellipses, as_recorded)]
+    assert error[0] < 0.003 if torque_Nm < 0.1 else error[0] < 0.008
+    assert error[0] < 0.1 * error[1]
+
+
+def test_friction_of_the_shaft_is_taken_off_the_tip_too(
+    rubbing: tuple[float, list[Record], FrictionFit],
+) -> None:
+    torque_Nm, _, found = rubbing
+    tip = recorded(torque_Nm, 5, output=1)
+    model = identify([found.taken_off(record) for record in tip], OPTIONS).model
+    _, truth = true_response(LOW_RAD_S)
+    assert np.mean(other_output_without_friction(tip, found, model).at(LOW_RAD_S).contains(truth)) > 0.7
+    # What is not known of the friction widens the ellipses.
+    known = tangent([found.taken_off(record) for record in tip], model).at(LOW_RAD_S)
+    assert np.median(known.enclosing_radius()[:20]) < 0.8 * np.median(
+        other_output_without_friction(tip, found, model).at(LOW_RAD_S).enclosing_radius()[:20]
+    )
+
+
+def test_no_friction_is_not_significant() -> None:
+    found = fit_friction(recorded(0.0, 5), OPTIONS)
+    assert not found.significant
+    assert found.level < 4 * found.level_std < 0.01 * 6.0
+
+
+def arm_of(delay: int, integrators: int) -> tuple[SteppedArm, GobfModel, RealArray]:
+    poles = Poles(np.array([0.96]), np.array([0.944 + 0.229j]))
+    structure = Structure(integrators=integrators, input_delay_samples=delay)
+    arm = SteppedArm.of(poles, structure, 0.005)
+    rng = np.random.default_rng(3)
+    doubled = GobfModel(
+        poles.doubled(), rng.normal(size=6), 0.005, integrators=integrators, input_delay_samples=delay
+    )
+    return arm, doubled, rng.normal(size=400)
+
+
+@pytest.mark.parametrize(("delay", "integrators"), [(0, 1), (2, 1), (1, 0)])
+def test_stepped_between_the_samples_without_friction_is_the_discrete_model(
+    delay: int, integrators: int
+) -> None:
+    arm, model, u = arm_of(delay, integrators)
+    position, friction = arm.run(model.coefficients, u, 0.0, 1e-5)
+    exact = model.simulate(u)
+    assert np.max(np.abs(position - exact)) < 1e-8 * np.max(np.abs(exact))
+    assert np.all(friction == 0)
+
+
+def test_derivatives_are_those_of_the_simulation() -> None:
+    """Against the simulation with another coefficient, and with another level."""
+    u = np.repeat(np.sign(np.random.default_rng(1).standard_normal(150)), 4) * 5.0
+    record = recorded(0.02, 1)[0]
+    found = fit_friction([record], OPTIONS)
+    local = linearised(found.arm, found.coefficients, found.level, found.presliding, u)
+    for j in (0, 3):
+        step = np.zeros(found.coefficients.size)
+        step[j] = 1e-4 * np.abs(found.coefficients).max()
+        ends = [
+            found.arm.run(found.coefficients + sign * step, u, found.level, found.presliding)[0]
+            for sign in (1, -1)
+        ]
+        direct = (ends[0] - ends[1]) / (2 * step[j])
+        assert np.linalg.norm(local.by_coefficients[:, j] - direct) < 0.02 * np.linalg.norm(direct)
+    ends = [found.arm.run(found.coefficients, u, found.level * f, found.presliding)[0] for f in (1.01, 0.99)]
+    direct = (ends[0] - ends[1]) / (0.02 * found.level)
+    assert np.linalg.norm(local.by_level - direct) < 0.02 * np.linalg.norm(direct)
+
+
+def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:
+    record = recorded(0.0, 1)[0]
+    with pytest.raises(ValueError, match="the shaft does not move"):
+        fit_friction([replace(record, output=np.zeros_like(record.output))], OPTIONS)
+    with pytest.raises(ValueError, match="at most one integrator and no direct term"):
+        fit_friction([record], OPTIONS.model_copy(update={"integrators": 2}))
