@@ -162,7 +162,9 @@ def test_a_certified_run_says_so_and_why(undrawn, tmp_path):
 def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(), gain=4.0)
     assert "Not certified" in page.text
-    assert re.search(r"modulus margin, worst case: 0\.\d+ against 0\.5 at [\d.]+ rad/s: NOT met", page.text)
+    assert re.search(
+        r"modulus margin, worst case: 0\.\d+ against 0\.5 at [\d.]+ rad/s \([\d.]+ Hz\): NOT met", page.text
+    )
     assert "blocks it" in page.text
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
