@@ -15,7 +15,7 @@ records start at rest.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
@@ -36,7 +36,9 @@ PRESLIDING = 1e-5
 # The start takes the sign of the measured speed, smoothed below this share of the Nyquist frequency; speeds
 # below a fiftieth of the usual one count as part of the turn.
 _SMOOTHING, _SLOW = 0.15, 0.02
-_START_ROUNDS, _MOST_SEARCHES, _LOCAL_STEPS = 4, 8, 4
+_START_ROUNDS, _MOST_SEARCHES, _LOCAL_STEPS = 4, 8, 8
+# A Gauss-Newton step, and its parts where the whole does not lower the residual.
+_LENGTHS = (1.0, 0.5, 0.25, 0.1)
 # A residual sum of squares that falls by less than this many noise variances is at its end.
 _WORTH = 0.5
 # Sizes of the changes that derivatives are taken from, relative to the motion and to the level.
@@ -197,34 +199,41 @@ def _descended(
     """Gauss-Newton steps on the poles of the model, as long as the residual falls."""
     arm = SteppedArm.of(model.poles, options.structure(), model.dt_s)
     coefficients = _on_doubled(arm.poles, model)
-    best: FrictionFit | None = None
+    n = sum(record.n_samples for record in records)
     for _ in range(_LOCAL_STEPS):
         local = [linearised(arm, coefficients, level, presliding, record.input[:, 0]) for record in records]
         blocks = [np.column_stack([part.by_coefficients, part.by_level]) for part in local]
         change, triangle, rss, rest = _least_squares(
             blocks, [record.output[:, 0] - part.position for record, part in zip(records, local, strict=True)]
         )
-        if best is not None and not rss < _rss(best, records) - _WORTH * best.noise_std**2:
-            break
-        n = sum(record.n_samples for record in records)
-        noise_std = float(np.sqrt(rss / n))
         scale = np.linalg.norm(triangle, axis=0)
         # The covariance is that of the noise, not of a residual that another step would still lower.
         factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
-        best = FrictionFit(
+        found = FrictionFit(
             level=level,
             level_std=float(np.linalg.norm(factor[-1])),
             model=model,
             arm=arm,
             coefficients=coefficients,
             covariance_factor=factor,
-            noise_std=noise_std,
+            noise_std=float(np.sqrt(rss / n)),
             presliding=presliding,
         )
-        coefficients = coefficients + change[:-1]
-        level = float(np.clip(level + change[-1], max(0.6 * level, least), None))
-    assert best is not None
-    return best
+        for length in _LENGTHS:
+            coefficients = found.coefficients + length * change[:-1]
+            level = float(np.clip(found.level + length * change[-1], max(0.6 * found.level, least), None))
+            there = replace(found, coefficients=coefficients, level=level)
+            if _simulated_rss(there, records) < rss - _WORTH * found.noise_std**2:
+                break
+        else:
+            break
+    return found
+
+
+def _simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
+    """Sum of squares of the residuals, each record's less its mean."""
+    residuals = [record.output[:, 0] - found.motion(record)[0] for record in records]
+    return float(sum(residual.size * np.var(residual) for residual in residuals))
 
 
 def _least_squares(
