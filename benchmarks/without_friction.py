@@ -80,10 +80,13 @@ def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> 
             begin = time.process_time()
             at_hub, at_tip = ([r.siso(c.input, c.output) for r in records] for c in (hub, tip))
             friction = fit_friction(at_hub, hub.identification)
-            model = identify([friction.taken_off(record) for record in at_tip], tip.identification).model
+            models = [
+                identify([friction.taken_off(record) for record in at], channel.identification).model
+                for at, channel in ((at_hub, hub), (at_tip, tip))
+            ]
             posteriors = (
-                without_friction(at_hub, friction, hub.uncertainty),
-                other_output_without_friction(at_tip, friction, model, tip.uncertainty),
+                without_friction(at_hub, friction, models[0], hub.uncertainty),
+                other_output_without_friction(at_tip, friction, models[1], tip.uncertainty),
             )
             cpu.append(time.process_time() - begin)
             to_Nm = motor.torque_per_volt_Nm_V

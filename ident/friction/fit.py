@@ -25,7 +25,7 @@ from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.basis.structure import filter_input
+from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import SteppedArm, less_friction
@@ -137,12 +137,13 @@ def fit_friction(
         if not np.ptp(record.output[:, 0]) > 0:
             raise ValueError(f"{record.label}: the shaft does not move, so that its friction cannot be seen")
     report(0.0, "friction: start")
+    structure = options.structure()
     level, model = _start(records, options)
     least = 1e-6 * max(float(np.std(record.input)) for record in records)
     best: FrictionFit | None = None
     for search in range(_MOST_SEARCHES):
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
-        found = _descended(records, model, options, max(level, least), presliding, least)
+        found = _descended(records, model, structure, max(level, least), presliding, least)
         if best is not None and not _rss(found, records) < _rss(best, records) - _WORTH * found.noise_std**2:
             break
         best, level = found, found.level
@@ -151,6 +152,11 @@ def fit_friction(
     assert best is not None
     report(1.0, "friction identified")
     return best
+
+
+def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:
+    """The same fit on the poles of another model of the arm, near those it was made with."""
+    return _descended(records, model, found.arm.structure, found.level, found.presliding, 0.1 * found.level)
 
 
 def _rss(found: FrictionFit, records: Sequence[Record]) -> float:
@@ -191,13 +197,13 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
 def _descended(
     records: Sequence[Record],
     model: GobfModel,
-    options: IdentOptions,
+    structure: Structure,
     level: float,
     presliding: float,
     least: float,
 ) -> FrictionFit:
     """Gauss-Newton steps on the poles of the model, as long as the residual falls."""
-    arm = SteppedArm.of(model.poles, options.structure(), model.dt_s)
+    arm = SteppedArm.of(model.poles, structure, model.dt_s)
     coefficients = _on_doubled(arm.poles, model)
     n = sum(record.n_samples for record in records)
     for _ in range(_LOCAL_STEPS):

@@ -16,19 +16,25 @@ from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
 from ident.data.record import Record
 from ident.friction.arm import less_friction
-from ident.friction.fit import FrictionFit, linearised
+from ident.friction.fit import FrictionFit, linearised, moved_to
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from ident.uncertainty.embedding_rows import Beside
 
 
 def without_friction(
-    records: Sequence[Record], found: FrictionFit, options: EmbeddingOptions | None = None
+    records: Sequence[Record],
+    found: FrictionFit,
+    model: GobfModel | None = None,
+    options: EmbeddingOptions | None = None,
 ) -> ResponsePosterior:
     """Posterior of the response from input to the shaft's position, as if there were no dry friction.
 
-    records: those of the fit, as measured. The level of the friction is estimated anew with the response, so
-    that what either does not know widens the other. Raises ValueError as `tangent`.
+    records: those of the fit, as measured. model: of the arm, fitted with the friction taken off, that the
+    posterior is to be made around; none: that of the fit. The level of the friction is estimated anew with
+    the response, so that what either does not know widens the other. Raises ValueError as `tangent`.
     """
+    if model is not None:
+        found = moved_to(found, records, model)
     moved, beside = [], []
     for record in records:
         local = linearised(found.arm, found.coefficients, found.level, found.presliding, record.input[:, 0])
@@ -37,7 +43,7 @@ def without_friction(
         less = less_friction(record, local.friction, found.arm.structure.input_delay_samples)
         moved.append(replace(less, output=target[:, None]))
         beside.append(Beside(local.by_coefficients, local.by_level[:, None]))
-    return tangent(moved, _on_poles_of(found), options, beside=beside)
+    return tangent(moved, found.model, options, beside=beside)
 
 
 def other_output_without_friction(
@@ -60,17 +66,3 @@ def other_output_without_friction(
         driven = np.column_stack([undelayed.simulate(column) for column in columns.T])
         beside.append(Beside(np.zeros((record.n_samples, 0)), driven))
     return tangent(less, model, options, beside=beside, known_to_one=True)
-
-
-def _on_poles_of(found: FrictionFit) -> GobfModel:
-    """The fitted model on the poles that were stepped: a pole at zero has no motion in continuous time."""
-    model = found.model
-    return GobfModel(
-        found.arm.poles,
-        model.coefficients,
-        model.dt_s,
-        integrators=model.integrators,
-        input_delay_samples=model.input_delay_samples,
-        input_name=model.input_name,
-        output_name=model.output_name,
-    )

@@ -12,12 +12,13 @@ from scipy.signal import lfilter
 from control_design.analysis.certificate import certify
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
+from ident.finding import FindingKind
 from ident.identify import identify
 from plant import linear_arm, parse_effect, simulate
 from plant.presets import paper_link
 from tests.workflow.command import FAST_ARM
 from workflow.config.design_options import ReferenceFilterSettings
-from workflow.config.run_config import Channel, FileRecord, FileSource, load_config
+from workflow.config.run_config import Channel, FileRecord, FileSource, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
@@ -29,7 +30,7 @@ from workflow.tasks.records import read_record, with_common_sampling_time
 from workflow.tasks.results import RunRecord, RunResults
 from workflow.tasks.simulated_rig import EncodedArm, rig_of
 from workflow.tasks.stage import StageInput
-from workflow.tasks.stages import design_filter
+from workflow.tasks.stages import STAGES, design_filter
 from workflow.tasks.uncertainty import posterior_of
 
 
@@ -301,3 +302,22 @@ def test_slice_and_mirror(tmp_path, flexlink_data):
     # data/README: correlation -0.996 in u and -0.998 in y before the sign is turned.
     assert np.corrcoef(first.input[:, 0], second.input[:, 0])[0, 1] == pytest.approx(0.996, abs=1e-3)
     assert np.corrcoef(first.output[:, 0], second.output[:, 0])[0, 1] == pytest.approx(0.998, abs=1e-3)
+
+
+def test_the_default_arm_is_identified_behind_its_friction(tmp_path):
+    """The level of the configuration, intervals for both channels, and no warning that the binary input is
+    clipped; all read back from the run's files.
+    """
+    config, text = built_in_config()
+    run = RunDirectory.begin(tmp_path, config_text=text, config=config.to_document(), seed=2006, inputs={})
+    for stage in STAGES[:3]:
+        run.save_stage(stage.name, stage.run(StageInput(config, RunResults(run), Progress())), "test")
+    results = RunResults(run)
+    friction = results.identify.friction
+    torque_Nm = friction.level * rig_of(config.source).motor.torque_per_volt_Nm_V
+    assert abs(torque_Nm / 0.02 - 1) < 0.03
+    assert abs(torque_Nm / 0.02 - 1) < 4 * friction.level_std / friction.level
+    for found, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
+        assert not [w for w in found.identification.warnings if w.kind is FindingKind.CLIPPED]
+        assert spread.intervals is not None
+        assert spread.bands[0].median_radius_percent < 0.1

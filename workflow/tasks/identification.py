@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from ident.basis.options import IdentOptions
+from ident.checks.input_checks import clipped
 from ident.checks.validation import fit_on_fresh_data
 from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
-from ident.finding import Finding
+from ident.finding import Finding, FindingKind
 from ident.friction import FrictionFit, fit_friction
 from ident.identify import identify
 from ident.stabilisation import stabilisation
@@ -72,6 +73,8 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 report,
                 two_stage=finding,
             )
+            if known is not None:
+                found = _clipped_as_measured(found, [r.siso(channel.input, channel.output) for r in measured])
             channels.append(
                 replace(
                     found,
@@ -82,6 +85,14 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 )
             )
     return IdentifyResult(tuple(channels), friction)
+
+
+def _clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
+    """What stands at its limit is seen in what was measured, not in what taking the friction off has left."""
+    search = found.identification.search
+    others = tuple(warning for warning in search.warnings if warning.kind is not FindingKind.CLIPPED)
+    search = replace(search, warnings=(*others, *clipped(measured)))
+    return replace(found, identification=replace(found.identification, search=search))
 
 
 def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:

@@ -66,7 +66,7 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                     for item in stage.results.records.of_role("estimation")
                 ]
                 if k == stage.config.control_index:
-                    posterior = without_friction(measured, friction, channel.uncertainty)
+                    posterior = without_friction(measured, friction, result.model, channel.uncertainty)
                 else:
                     posterior = other_output_without_friction(
                         measured, friction, result.model, channel.uncertainty
