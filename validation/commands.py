@@ -43,10 +43,6 @@ def blind(
         int | None,
         typer.Option(help="Processes on this machine [default: one per processor]", show_default=False),
     ] = None,
-    simulator: Annotated[
-        str,
-        typer.Option(help="What makes the records: ritz (built in) or exudyn (extra 'blind')."),
-    ] = "ritz",
     only: Annotated[
         str | None,
         typer.Option(help="One sort of cases: none, faint, clear, pair or unlisted [default: a mix]."),
@@ -64,9 +60,7 @@ def blind(
     from workflow.console import TerminalProgress, print_summary
 
     with TerminalProgress() as progress:
-        summary = run_blind(
-            cases, seed, out, jobs=jobs, simulator=simulator, only=only, resume=resume, progress=progress
-        )
+        summary = run_blind(cases, seed, out, jobs=jobs, only=only, resume=resume, progress=progress)
     if as_json:
         print_json(summary.numbers)
     else:

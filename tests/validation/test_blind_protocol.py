@@ -221,8 +221,6 @@ def test_records_exchanged_after_sealing_are_noticed(finished_run):
 def test_bad_requests_are_one_line(tmp_path):
     with pytest.raises(InputError, match="--cases must be at least 1"):
         run_blind(0, 1, tmp_path / "a")
-    with pytest.raises(InputError, match="--simulator must be one of ritz, exudyn"):
-        run_blind(1, 1, tmp_path / "a", simulator="matlab")
     with pytest.raises(InputError, match="--only must be one of none, faint, clear, pair, unlisted"):
         run_blind(1, 1, tmp_path / "a", only="difficult")
     with pytest.raises(InputError, match="no blind run to resume"):

@@ -201,7 +201,7 @@ def test_text_and_picture_stand_without_any_right_answer():
         "baselines": {"parameters only": found},
         "failed": {"a": "exit code 1: out of memory"},
         "commitment": "0" * 64,
-        "settings": {"cases": 1, "seed": 0, "simulator": "ritz"},
+        "settings": {"cases": 1, "seed": 0},
     }
     words = text(found, document)
     assert "out of memory" in words

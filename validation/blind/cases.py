@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from validation.blind.exudyn_truth import SUPPORTED, ExudynTruth
 from validation.blind.inputs import Planned, plan_experiments
 from validation.blind.rigs import Rig, draw_rig, draw_tolerances, rounded, stated
 from validation.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, sizable
@@ -16,8 +15,6 @@ from validation.blind.truth import LISTED, UNLISTED, Clean, Real, Truth
 
 Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
 SORTS: tuple[Sort, ...] = ("none", "faint", "clear", "pair", "unlisted")
-Simulator = Literal["ritz", "exudyn"]
-SIMULATORS: tuple[Simulator, ...] = ("ritz", "exudyn")
 # Shares of a set of cases. The sets this resembles say nothing about the next one's mix; nor does this.
 SHARES: dict[Sort, float] = {"none": 0.25, "clear": 0.25, "faint": 0.17, "pair": 0.17, "unlisted": 0.16}
 # Wanted largest gap over the noise.
@@ -85,18 +82,12 @@ def schedule(
     return [plan[i] for i in rng.permutation(n_cases)]
 
 
-def make_case(
-    sort: Sort, exact: bool, first_effect: str, rng: np.random.Generator, simulator: Simulator = "ritz"
-) -> BlindCase:
+def make_case(sort: Sort, exact: bool, first_effect: str, rng: np.random.Generator) -> BlindCase:
     """Draw rigs, partners and sizes until the gap is as wanted.
 
-    Sizes are tuned with the built-in simulator either way; `simulator` makes the records. Raises ValueError
-    if forty draws do not suffice.
+    Raises ValueError if forty draws do not suffice.
     """
-    listed = UNLISTED if sort == "unlisted" else LISTED
-    pool = tuple(name for name in listed if simulator == "ritz" or name in SUPPORTED)
-    if first_effect and first_effect not in pool:
-        first_effect = str(rng.choice(pool))
+    pool = UNLISTED if sort == "unlisted" else LISTED
     for attempt in range(_TRIES):
         rig = draw_rig(rng)
         tolerances = {} if exact else draw_tolerances(rng)
@@ -107,7 +98,7 @@ def make_case(
             effects = _effects(sort, name, pool, rig, plans, tolerances, rng)
             if effects is None:
                 continue
-            records = _run(rig, effects, plans, rng, simulator)
+            records = _run(rig, effects, plans, rng)
             if not _seen_where_fitted(records):
                 continue
         except ValueError as error:
@@ -225,14 +216,9 @@ class _Nominal:
 
 
 def _run(
-    rig: Rig,
-    effects: list[Table],
-    plans: tuple[Planned, ...],
-    rng: np.random.Generator,
-    simulator: Simulator,
+    rig: Rig, effects: list[Table], plans: tuple[Planned, ...], rng: np.random.Generator
 ) -> tuple[Record, ...]:
-    machine = (Truth if simulator == "ritz" else ExudynTruth)(rig, effects)
-    nominal = Truth(rig)
+    machine, nominal = Truth(rig, effects), Truth(rig)
     records = []
     for plan in plans:
         noise = rng.standard_normal((plan.voltage_V.size, 2)) * machine.noise

@@ -19,7 +19,7 @@ import numpy as np
 import tomlkit
 import typer
 
-from validation.blind.cases import SIMULATORS, BlindCase, Simulator, Sort, make_case, schedule
+from validation.blind.cases import BlindCase, Sort, make_case, schedule
 from validation.blind.rigs import rig_toml
 from workflow.engine.storage import write_text
 
@@ -73,9 +73,9 @@ def answer_toml(answer: Mapping[str, Any]) -> str:
     return str(tomlkit.dumps(shown))
 
 
-def _one(seed: int, out: Path, open_cases: bool, simulator: Simulator, job: tuple[int, Plan]) -> Answer:
+def _one(seed: int, out: Path, open_cases: bool, job: tuple[int, Plan]) -> Answer:
     index, plan = job
-    case = make_case(*plan, np.random.default_rng([seed, 1, index]), simulator)
+    case = make_case(*plan, np.random.default_rng([seed, 1, index]))
     folder = out / case_name(index)
     write_case(case, folder)
     answer = {"case": folder.name, **case.answer}
@@ -92,7 +92,6 @@ def generate(
     *,
     jobs: int = 1,
     open_cases: bool = False,
-    simulator: Simulator = "ritz",
     only: Sort | None = None,
     finished: Mapping[str, Answer] | None = None,
     keep: Callable[[Answer], None] | None = None,
@@ -104,7 +103,7 @@ def generate(
     """
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
-    work = partial(_one, seed, out, open_cases, simulator)
+    work = partial(_one, seed, out, open_cases)
     plans = schedule(n_cases, np.random.default_rng([seed, 0, n_cases]), only)
     tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
 
@@ -127,14 +126,13 @@ def main(
     seed: Annotated[int, typer.Option(min=0)],
     out: Annotated[Path, typer.Option(help="Directory, new or empty.")],
     jobs: Annotated[int, typer.Option(min=1)] = 1,
-    simulator: Annotated[str, typer.Option(help=f"One of {', '.join(SIMULATORS)}.")] = "ritz",
     open_cases: Annotated[
         bool, typer.Option("--open", help="Write answers and exact rigs beside the records.")
     ] = False,
 ) -> None:
-    if simulator not in SIMULATORS or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
-        raise typer.BadParameter(f"need one of {', '.join(SIMULATORS)} and an empty directory")
-    generate(cases, seed, out, jobs=jobs, simulator=simulator, open_cases=open_cases)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise typer.BadParameter("need an empty directory")
+    generate(cases, seed, out, jobs=jobs, open_cases=open_cases)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The whole blind run: cases, seal, diagnosis in processes that cannot see it, opening, scores.
 
-blind.json            number of cases, seed, simulator; a resumed run is held to them
+blind.json            number of cases, seed; a resumed run is held to them
 cases/<case>/         what a diagnosis sees
 seal/                 labels, for the owner only; commitment.json is their salted hash
 predictions/<case>.json, predictions.json (hash of each, written before the seal is opened)
@@ -17,8 +17,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from validation.blind.cases import SIMULATORS, SORTS, Simulator, Sort
-from validation.blind.exudyn_truth import load_exudyn
+from validation.blind.cases import SORTS, Sort
 from validation.blind.generate import Answer, folder_hash, generate
 from validation.blind.report import confusion_figure, summary, text
 from validation.blind.scores import scores
@@ -66,7 +65,6 @@ def run_blind(
     out: Path,
     *,
     jobs: int | None = None,
-    simulator: str = "ritz",
     only: str | None = None,
     resume: bool = False,
     progress: Progress | None = None,
@@ -78,11 +76,6 @@ def run_blind(
     diagnose: case folder -> document; runs in processes that are kept out of the run's directory.
     """
     progress = progress or Progress()
-    chosen = next((name for name in SIMULATORS if name == simulator), None)
-    if chosen is None:
-        raise InputError(f"--simulator must be one of {', '.join(SIMULATORS)}; got {simulator!r}")
-    if chosen == "exudyn":
-        load_exudyn()
     sort = next((name for name in SORTS if name == only), None)
     if only is not None and sort is None:
         raise InputError(f"--only must be one of {', '.join(SORTS)}; got {only!r}")
@@ -91,10 +84,10 @@ def run_blind(
     if n_cases < 1 or seed < 0:
         raise InputError(f"--cases must be at least 1 and --seed at least 0; got {n_cases} and {seed}")
     width = jobs or os.cpu_count() or 1
-    settings = {"format": _FORMAT, "cases": n_cases, "seed": seed, "simulator": simulator}
+    settings = {"format": _FORMAT, "cases": n_cases, "seed": seed}
     _begin(BlindDirectory(out), settings if sort is None else {**settings, "only": sort}, resume)
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
-    _sealed_cases(out, n_cases, seed, width, chosen, sort, progress)
+    _sealed_cases(out, n_cases, seed, width, sort, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
     _predict(out, names, width, diagnose, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
@@ -136,7 +129,6 @@ def _sealed_cases(
     n_cases: int,
     seed: int,
     jobs: int,
-    simulator: Simulator,
     only: Sort | None,
     progress: Progress,
 ) -> None:
@@ -160,7 +152,6 @@ def _sealed_cases(
             seed,
             out / "cases",
             jobs=jobs,
-            simulator=simulator,
             only=only,
             finished=finished,
             keep=keep,
