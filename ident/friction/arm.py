@@ -12,7 +12,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, kernel_array
 from ident.data.record import Record
-from ident.friction.kernel import step_through
+from ident.friction.kernel import STRIDES, step_through
 
 # Steps of a sample: the friction turns round within a few hundred microseconds where the pre-sliding is ten
 # microradians, and at 32 steps of 5 ms the position is right to a hundredth of a milliradian.
@@ -100,7 +100,7 @@ class SteppedArm:
             weights,
             max(gain, np.finfo(np.float64).tiny),
             step_s,
-            _SUBSTEPS,
+            _SUBSTEPS // STRIDES,
             level,
             presliding,
             position,
