@@ -74,17 +74,9 @@ class SteppedArm:
         return cls(poles, structure, dt_s, rates, chain, weights)
 
     def run(
-        self,
-        coefficients: RealArray,
-        voltage: RealArray,
-        level: float,
-        presliding: float,
-        moved: RealArray | None = None,
+        self, coefficients: RealArray, voltage: RealArray, level: float, presliding: float
     ) -> tuple[RealArray, RealArray]:
-        """Position (T,) and mean friction per sample (T,), in units of the input (T,), from rest.
-
-        moved (T,): a further motion of the shaft from outside.
-        """
+        """Position (T,) and mean friction per sample (T,), in units of the input (T,), from rest."""
         weights = self.weights @ coefficients
         step_s = self.dt_s / _SUBSTEPS
         safe = np.where(self.rates == 0, 1.0, self.rates)
@@ -94,7 +86,6 @@ class SteppedArm:
         position, friction = np.empty(voltage.size), np.empty(voltage.size)
         step_through(
             kernel_array(filter_input(voltage, 0, self.structure.input_delay_samples)),
-            np.zeros(voltage.size) if moved is None else kernel_array(moved),
             self.rates,
             self.chain,
             weights,

@@ -107,7 +107,9 @@ def linearised(
     by, friction_by = np.empty_like(columns), np.empty((u.size, columns.shape[1] + 1))
     for j, column in enumerate(columns.T):
         size = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
-        ends = [arm.run(coefficients, u, level, presliding, moved=sign * size * column) for sign in (1, -1)]
+        change = np.zeros(coefficients.size)
+        change[j] = size
+        ends = [arm.run(coefficients + sign * change, u, level, presliding) for sign in (1, -1)]
         by[:, j], friction_by[:, j] = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
     size = _CHANGE_OF_LEVEL * level
     ends = [arm.run(coefficients, u, level + sign * size, presliding) for sign in (1, -1)]

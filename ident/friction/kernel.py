@@ -33,7 +33,6 @@ def _transition(rates: Any, chain: Any, step_s: float) -> tuple[Any, Any, Any]:
 @numba.njit(cache=True)
 def step_through(
     drive: Any,
-    moved: Any,
     rates: Any,
     chain: Any,
     weights: Any,
@@ -55,7 +54,7 @@ def step_through(
     Friction is an elastic element whose force is limited to `level`: it deflects by `presliding` before it
     slips. Its mean force over a step follows from the deflection in the middle of the step (implicit, so
     that a stiff element needs no shorter step). A stride over which the shaft slips on in one direction is
-    taken at once: the force is constant there. moved (T,) is a further motion of the shaft from outside.
+    taken at once: the force is constant there.
     """
     n = rates.size
     state, tried = np.zeros(n, dtype=np.complex128), np.empty(n, dtype=np.complex128)
@@ -64,13 +63,12 @@ def step_through(
     stiffness = level / presliding
     deflection, shaft = 0.0, 0.0
     for k in range(drive.size):
-        position[k] = shaft + moved[k]
-        outside = (moved[k + 1] - moved[k]) / (STRIDES * substeps) if k + 1 < drive.size else 0.0
+        position[k] = shaft
         total = 0.0
         for _ in range(STRIDES):
             if abs(deflection) == presliding:
                 force = level if deflection > 0 else -level
-                new, speed = 0.0, outside / step_s
+                new, speed = 0.0, 0.0
                 for j in range(n):
                     tried[j] = far_decay[j] * state[j] + far_onto[j] * (drive[k] - force)
                     pushed = tried[j - 1] if chain[j] else drive[k] - force + 0j
@@ -78,7 +76,7 @@ def step_through(
                         tried[j] += far_carried[j] * state[j - 1]
                     new += (weights[j] * tried[j]).real
                     speed += (weights[j] * (rates[j] * tried[j] + pushed)).real
-                if (new - shaft + substeps * outside) * deflection > 0 and speed * deflection > 0:
+                if (new - shaft) * deflection > 0 and speed * deflection > 0:
                     state, tried, shaft = tried, state, new
                     total += substeps * force
                     continue
@@ -89,12 +87,12 @@ def step_through(
                     if chain[j]:
                         state[j] += carried[j] * state[j - 1]
                     free += (weights[j] * state[j]).real
-                advance = free - shaft + outside
+                advance = free - shaft
                 force = stiffness * (deflection + 0.5 * advance) / (1 + 0.5 * stiffness * speed_gain)
                 force = min(max(force, -level), level)
                 total += force
                 new = free - speed_gain * force
-                deflection = min(max(deflection + new - shaft + outside, -presliding), presliding)
+                deflection = min(max(deflection + new - shaft, -presliding), presliding)
                 shaft = new
                 effort = drive[k] - force
                 for j in range(n):

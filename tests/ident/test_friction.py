@@ -143,7 +143,7 @@ def test_derivatives_are_those_of_the_simulation() -> None:
             for sign in (1, -1)
         ]
         direct = (ends[0] - ends[1]) / (2 * step[j])
-        assert np.linalg.norm(local.by_coefficients[:, j] - direct) < 0.02 * np.linalg.norm(direct)
+        assert np.linalg.norm(local.by_coefficients[:, j] - direct) < 0.01 * np.linalg.norm(direct)
     ends = [found.arm.run(found.coefficients, u, found.level * f, found.presliding)[0] for f in (1.01, 0.99)]
     direct = (ends[0] - ends[1]) / (0.02 * found.level)
     assert np.linalg.norm(local.by_level - direct) < 0.02 * np.linalg.norm(direct)
