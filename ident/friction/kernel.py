@@ -13,7 +13,7 @@ STRIDES = 2
 
 @numba.njit(cache=True)
 def _transition(rates: Any, chain: Any, step_s: float) -> tuple[Any, Any, Any]:
-    """What a step does to every state: its own decay, a unit of effort onto it, the state before it onto it."""
+    """What a step does to a state: its decay, a unit of effort onto it, the state before it onto it."""
     n = rates.size
     decay, onto = np.empty(n, dtype=np.complex128), np.empty(n, dtype=np.complex128)
     carried = np.zeros(n, dtype=np.complex128)
