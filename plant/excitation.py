@@ -99,7 +99,9 @@ def multisine_lines(
         if rng is None:
             raise ValueError("grid odd_random draws lines and needs rng")
         groups = np.arange(lines.size // 4) * 4
-        lines = np.delete(lines, groups + rng.integers(0, 4, groups.size))
+        left_out = rng.integers(0, 4, groups.size)
+        left_out[:1] = np.maximum(left_out[:1], 1)  # the lowest line stays: it alone shows the band's edge
+        lines = np.delete(lines, groups + left_out)
     if lines.size == 0:
         raise ValueError(f"no {grid} line in {band_Hz} Hz with a line spacing of {spacing:.4g} Hz")
     return lines
@@ -113,8 +115,9 @@ def multisine(
     *,
     periods: int = 1,
     draws: int = 1,
+    lead_in_samples: int = 0,
 ) -> Real:
-    """Equal-amplitude multisine (period_samples * periods,) with uniform random phases.
+    """Equal-amplitude multisine (lead_in_samples + period_samples * periods,) with uniform random phases.
 
     Parameters
     ----------
@@ -125,6 +128,9 @@ def multisine(
     draws
         Number of phase draws, of which the one with the lowest crest factor is kept; 1 leaves the phases
         uniform.
+    lead_in_samples
+        Samples before the whole periods, of the same periodic signal: a machine that starts at rest is in
+        steady state behind them.
     """
     harmonics = np.asarray(lines, dtype=np.int64)
     if harmonics.ndim != 1 or harmonics.size == 0 or len(set(harmonics.tolist())) != harmonics.size:
@@ -134,8 +140,10 @@ def multisine(
             f"lines must lie in 1..{(period_samples - 1) // 2}; got {harmonics.min()}..{harmonics.max()}"
         )
     _check_positive(rms_V=rms_V)
-    if not (periods >= 1 and draws >= 1):
-        raise ValueError(f"periods and draws must be at least 1; got {periods} and {draws}")
+    if not (periods >= 1 and draws >= 1 and lead_in_samples >= 0):
+        raise ValueError(
+            f"need periods >= 1, draws >= 1, lead_in_samples >= 0; got {periods}, {draws}, {lead_in_samples}"
+        )
     best = np.zeros(0)
     for _ in range(draws):
         spectrum = np.zeros(period_samples // 2 + 1, dtype=np.complex128)
@@ -144,7 +152,7 @@ def multisine(
         if best.size == 0 or crest_factor(period) < crest_factor(best):
             best = period
     best *= rms_V / np.sqrt(np.mean(best**2))
-    return np.tile(best, periods)
+    return best[np.arange(-lead_in_samples, periods * period_samples) % period_samples]
 
 
 def crest_factor(signal: Real) -> float:

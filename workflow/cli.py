@@ -114,12 +114,57 @@ def simulate(
     need(config)
     from workflow.commands.simulate import simulate_to_csv
 
-    files = simulate_to_csv(config, out)
-    if as_json:
-        print_json({"files": [str(path) for path in files]})
-    else:
-        for path in files:
-            typer.echo(str(path))
+    _show_files(simulate_to_csv(config, out), as_json)
+
+
+@app.command(short_help="Plan an experiment: voltages as CSV, plan, page.")
+def excite(
+    out: Annotated[Path, typer.Option(help="Directory for the files; new or empty.")],
+    band: Annotated[tuple[float, float], typer.Option(help="Frequencies to excite [Hz], low and high.")],
+    dt_s: Annotated[float, typer.Option(help="Sampling period [s].")],
+    duration: Annotated[float, typer.Option(help="Time allowed for all records together [s].")],
+    voltage: Annotated[float, typer.Option(help="Largest voltage allowed [V].")],
+    rms: Annotated[
+        list[float] | None,
+        typer.Option(help="Root mean square [V] (repeatable) [default: the highest allowed, and half of it]"),
+    ] = None,
+    angle: Annotated[
+        float | None, typer.Option(help="Largest hub angle allowed [degrees]; needs --rig or --gain.")
+    ] = None,
+    rig: Annotated[
+        str | None, typer.Option(help="Rig file or 'paper_link': predicts motion and response.")
+    ] = None,
+    gain: Annotated[
+        float | None, typer.Option(help="Rough speed of the hub per volt [rad/s per V], without a rig.")
+    ] = None,
+    noise_std: Annotated[
+        float | None, typer.Option(help="Sensor noise of the hub angle [rad]: predicts radii.")
+    ] = None,
+    realisations: Annotated[int, typer.Option(min=1, help="Records at each amplitude.")] = 4,
+    periods: Annotated[int, typer.Option(min=1, help="Whole periods of a record.")] = 2,
+    lead_in: Annotated[float, typer.Option(min=0, help="From rest to steady state [s].")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Root of the random phases and lines.")] = 2006,
+    as_json: Json = False,
+) -> None:
+    """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
+    from workflow.commands.excite import write_experiment
+    from workflow.tasks.experiment import Limits, rig_called
+
+    limits = Limits(
+        band_Hz=band,
+        dt_s=dt_s,
+        duration_s=duration,
+        peak_V=voltage,
+        rms_V=tuple(rms or ()),
+        angle_deg=angle,
+        gain_rad_per_Vs=gain,
+        rig=None if rig is None else rig_called(rig),
+        noise_std_rad=noise_std,
+    )
+    files = write_experiment(
+        limits, out, seed=seed, realisations=realisations, periods=periods, lead_in_s=lead_in
+    )
+    _show_files(files, as_json)
 
 
 @app.command(short_help="Identify one channel from log files; one-page report.")
@@ -401,6 +446,14 @@ def print_json(document: Mapping[str, Any]) -> None:
     from workflow.engine.codec import plain_text
 
     sys.stdout.write(plain_text(document))
+
+
+def _show_files(files: Sequence[Path], as_json: bool) -> None:
+    if as_json:
+        print_json({"files": [str(path) for path in files]})
+    else:
+        for path in files:
+            typer.echo(str(path))
 
 
 def _show(summary: RunSummary, as_json: bool) -> None:

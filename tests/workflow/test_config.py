@@ -14,6 +14,7 @@ from workflow.config.renamed_keys import RenamedKeyWarning
 from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
+from workflow.tasks.simulated_rig import simulate_record
 
 MINIMAL = """
 [run]
@@ -218,3 +219,34 @@ def test_earlier_names_of_keys_are_read_and_the_new_one_is_told(tmp_path):
     path.write_text(path.read_text() + "[achievable_performance]\ncompute = true\n")
     with pytest.raises(InputError, match="yardstick is the earlier name of achievable_performance"):
         load_config(path)
+
+
+def test_a_plan_is_its_records(tmp_path):
+    text = """[source]
+kind = "simulated"
+plan.rms_V = [2.0, 4.0]
+plan.realisations = 2
+plan.period_samples = 100
+plan.lead_in_samples = 20
+plan.from_Hz = 2.0
+plan.to_Hz = 90.0
+%s
+[[channels]]
+input = "voltage_V"
+output = "hub_angle_rad"
+[specification]
+"""
+    own = '[[source.records]]\nname = "own"\nexcitation = { kind = "prbs", amplitude_V = 1.0, samples = 50 }'
+    (tmp_path / "plan.toml").write_text(text % own)
+    config, _ = load_config(tmp_path / "plan.toml")
+    amplitudes = [f"{rms} V rms, realisation {k}" for rms in (2, 4) for k in (1, 2)]
+    assert config.record_names == [*amplitudes, "own"]
+    assert RunConfig.from_document(config.to_document(), source="document") == config
+    records = [simulate_record(config.source, entry, 7) for entry in config.source.records]
+    spectra = [np.fft.rfft(record.input[20:120, 0]) for record in records[:4]]
+    excited = [np.flatnonzero(np.abs(spectrum) > 1e-9 * np.abs(spectrum).max()) for spectrum in spectra]
+    assert all(np.array_equal(excited[0], lines) for lines in excited)
+    assert np.sqrt(np.mean(records[2].input[20:] ** 2)) == pytest.approx(4.0)
+    (tmp_path / "plan.toml").write_text((text % own).replace("plan.period_samples = 100\n", ""))
+    with pytest.raises(InputError, match=r"missing key source\.plan\.period_samples"):
+        load_config(tmp_path / "plan.toml")

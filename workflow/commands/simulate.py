@@ -32,17 +32,4 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
         safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)
         texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
     texts[truth.FILE_NAME] = truth.truth_of(config.source).model_dump_json(indent=1) + "\n"
-    existed, files = out.is_dir(), list[Path]()
-    try:
-        with naming(f"cannot write {out}"):
-            out.mkdir(parents=True, exist_ok=True)
-        for name, text in texts.items():
-            storage.write_text(out / name, text)
-            files.append(out / name)
-    except InputError:
-        for path in files:  # all of the experiments or none
-            path.unlink()
-        if not existed and out.is_dir():
-            out.rmdir()
-        raise
-    return files
+    return storage.write_new_directory(out, texts)

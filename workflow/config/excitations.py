@@ -41,13 +41,29 @@ class Multisine(_Table):
     to_Hz: float = Field(gt=0)
     grid: Literal["full", "odd", "odd_random"] = "full"
     phase_draws: int = Field(1, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
+    lead_in_samples: int = Field(
+        0, ge=0, le=1_000_000, description="of the same signal before the whole periods"
+    )
+    lines_seed: int | None = Field(
+        None, ge=0, description="odd_random: draws the lines, for records that share them"
+    )
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
         lines = excitation.multisine_lines(
-            self.period_samples, dt_s, (self.from_Hz, self.to_Hz), self.grid, rng
+            self.period_samples,
+            dt_s,
+            (self.from_Hz, self.to_Hz),
+            self.grid,
+            rng if self.lines_seed is None else np.random.default_rng(self.lines_seed),
         )
         return excitation.multisine(
-            lines, self.period_samples, self.rms_V, rng, periods=self.periods, draws=self.phase_draws
+            lines,
+            self.period_samples,
+            self.rms_V,
+            rng,
+            periods=self.periods,
+            draws=self.phase_draws,
+            lead_in_samples=self.lead_in_samples,
         )
 
 

@@ -17,12 +17,13 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis import SynthesisOptions
 from ident.basis.options import IdentOptions
 from ident.uncertainty.embedding import EmbeddingOptions
+from plant import ExperimentPlan
 from workflow.config.design_options import (
     AchievableOptions,
     CertificateOptions,
     ReferenceFilterSettings,
 )
-from workflow.config.excitations import Excitation
+from workflow.config.excitations import Excitation, Multisine
 from workflow.config.rig_settings import EffectTable, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated
 
@@ -60,7 +61,32 @@ class SimulatedSource(Section):
         (), description="what the nominal rig does not have, e.g. coulomb_friction"
     )
     encoder_step_rad: float = Field(0.0, ge=0, description="resolution of the hub encoder; 0 is none")
-    records: tuple[SimulatedRecord, ...] = Field(min_length=1)
+    plan: ExperimentPlan | None = Field(
+        None, exclude=True, description="estimation records, one per amplitude and realisation; read once"
+    )
+    records: tuple[SimulatedRecord, ...] = ()
+
+    @model_validator(mode="after")
+    def _with_planned_records(self) -> Self:
+        if self.plan is not None:
+            object.__setattr__(self, "records", (*_planned(self.plan), *self.records))
+            object.__setattr__(self, "plan", None)
+        if not self.records:
+            raise ValueError("there is nothing to simulate: give [source.plan] or [[source.records]]")
+        return self
+
+
+def _planned(plan: ExperimentPlan) -> tuple[SimulatedRecord, ...]:
+    """The records of a plan, named by amplitude and realisation."""
+    shared = plan.model_dump(exclude={"rms_V", "realisations"})
+    return tuple(
+        SimulatedRecord(
+            name=f"{rms_V:g} V rms, realisation {k}",
+            excitation=Multisine(kind="multisine", grid="odd_random", rms_V=rms_V, **shared),
+        )
+        for rms_V in plan.rms_V
+        for k in range(1, plan.realisations + 1)
+    )
 
 
 TimeUnit = Literal["s", "ms", "us", "ns", "min", "h"]

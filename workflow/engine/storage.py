@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from workflow.engine import codec
-from workflow.engine.errors import InputError, describe_os_error
+from workflow.engine.errors import InputError, describe_os_error, naming
 
 TEMPORARY_SUFFIX = ".part"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # earliest date a zip entry can carry; a constant makes the bytes reproducible
@@ -85,6 +85,24 @@ def refuse_in_the_way(read: Iterable[Path], written: Iterable[tuple[str, Path]])
 def write_text(path: Path, content: str) -> None:
     """Atomic UTF-8 text."""
     write_bytes(path, content.encode("utf-8"))
+
+
+def write_new_directory(out: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Files by name in a directory, made where it is absent: all of them or none. Raises InputError."""
+    existed, files = out.is_dir(), list[Path]()
+    try:
+        with naming(f"cannot write {out}"):
+            out.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            write_text(out / name, text)
+            files.append(out / name)
+    except InputError:
+        for path in files:
+            path.unlink()
+        if not existed and out.is_dir():
+            out.rmdir()
+        raise
+    return files
 
 
 def csv_text(columns: Mapping[str, AnyArray]) -> str:

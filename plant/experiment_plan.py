@@ -1,0 +1,160 @@
+"""A series of random-phase multisines that tells noise, distortion and response apart.
+
+Realisations of the phases at every rung of a ladder of amplitudes, all on the same lines: odd ones, of which
+one in every group of four is left out. What differs between the periods of a record is noise; between
+realisations it is noise and nonlinear distortion; the lines without excitation show of which kind the
+distortion is (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., ch. 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from plant.excitation import multisine, multisine_lines
+from plant.rig import one_line
+
+Real = npt.NDArray[np.float64]
+Integer = npt.NDArray[np.int64]
+
+# Periods as multiples of that of the lower band edge: odd, so that the edge is an excited line.
+_MULTIPLES = range(15, 0, -2)
+_LEVEL = 0.95
+
+
+class ExperimentPlan(BaseModel):
+    """Amplitudes x realisations, each a record from rest: a lead-in of the same signal, then whole periods.
+
+    The lead-in belongs to the record (a fit that starts at rest uses it) and to no spectrum. Phases are
+    independent between records, lines the same in all. Raises ValueError where the numbers do not fit.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    rms_V: tuple[float, ...] = Field(min_length=1, description="ladder of amplitudes")
+    realisations: int = Field(4, ge=1, le=1000, description="records at each amplitude, phases independent")
+    periods: int = Field(2, ge=1, le=1000, description="whole periods of a record, behind its lead-in")
+    period_samples: int = Field(ge=8, le=1_000_000)
+    lead_in_samples: int = Field(
+        ge=0, le=1_000_000, description="from rest to steady state, before the whole periods"
+    )
+    from_Hz: float = Field(gt=0)
+    to_Hz: float = Field(gt=0)
+    phase_draws: int = Field(50, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
+    lines_seed: int = Field(0, ge=0, description="draws which odd lines are left out")
+
+    @model_validator(mode="after")
+    def _ladder(self) -> Self:
+        if not all(0 < rms < np.inf for rms in self.rms_V) or len(set(self.rms_V)) != len(self.rms_V):
+            raise ValueError(f"rms_V must be different positive numbers; got {list(self.rms_V)}")
+        return self
+
+    @classmethod
+    def within(
+        cls,
+        *,
+        band_Hz: tuple[float, float],
+        dt_s: float,
+        duration_s: float,
+        lead_in_s: float,
+        **settings: object,
+    ) -> Self:
+        """The plan with the longest period that all its records together leave room for.
+
+        The period is that of the lower band edge times an odd number up to 15, so that the edge is one of the
+        odd lines. settings: other fields by name; rms_V left out is a ladder of 1 and 1/2, to be `scaled`.
+        Raises ValueError where the duration is too short for the band.
+        """
+        low, high = band_Hz
+        if not 0 < low < high < 0.5 / dt_s:
+            raise ValueError(
+                f"need a band 0 < low < high < {0.5 / dt_s:g} Hz (Nyquist); got {low:g}, {high:g}"
+            )
+        shortest = max(2 * round(0.5 / (low * dt_s)), 8)
+        values = {"rms_V": (1.0, 0.5), "lead_in_samples": round(lead_in_s / dt_s)} | settings
+        values |= {"from_Hz": 1 / (shortest * dt_s), "to_Hz": float(high)}
+        try:
+            plans = [cls.model_validate(values | {"period_samples": m * shortest}) for m in _MULTIPLES]
+        except ValidationError as error:
+            raise ValueError(one_line(error)) from error
+        short = plans[-1].duration_s(dt_s)
+        fitting = [plan for plan in plans if plan.duration_s(dt_s) <= duration_s * (1 + 1e-9)]
+        if not fitting:
+            raise ValueError(
+                f"a band from {low:g} Hz needs periods of {shortest * dt_s:g} s: {plans[-1].n_records} "
+                f"records of {plans[-1].periods} periods and lead-in last {short:g} s, {duration_s:g} s are "
+                "allowed"
+            )
+        return fitting[0]
+
+    @property
+    def n_records(self) -> int:
+        return len(self.rms_V) * self.realisations
+
+    @property
+    def n_samples(self) -> int:
+        """Of each record."""
+        return self.lead_in_samples + self.periods * self.period_samples
+
+    def duration_s(self, dt_s: float) -> float:
+        """Of all records together."""
+        return self.n_records * self.n_samples * dt_s
+
+    def lines(self, dt_s: float) -> Integer:
+        """Harmonics (H,) that every record excites. Raises ValueError where the band holds none."""
+        return multisine_lines(
+            self.period_samples,
+            dt_s,
+            (self.from_Hz, self.to_Hz),
+            "odd_random",
+            np.random.default_rng(self.lines_seed),
+        )
+
+    def record(self, rms_V: float, dt_s: float, rng: np.random.Generator) -> Real:
+        """Voltage (T,) of one realisation at this amplitude."""
+        return multisine(
+            self.lines(dt_s),
+            self.period_samples,
+            rms_V,
+            rng,
+            periods=self.periods,
+            draws=self.phase_draws,
+            lead_in_samples=self.lead_in_samples,
+        )
+
+    def records(self, dt_s: float, rng: np.random.Generator) -> Real:
+        """Voltages (A, M, T) of all amplitudes and realisations; the ladder changes nothing but the size."""
+        return np.stack(
+            [np.stack([self.record(rms, dt_s, rng) for _ in range(self.realisations)]) for rms in self.rms_V]
+        )
+
+    def scaled(
+        self, voltages_V: Real, *, peak_V: float, angle_rad: float, motion: Callable[[Real], Real] | None
+    ) -> Self:
+        """The ladder with its top as high as the peak of the voltages (A, M, T) and of the motion allow.
+
+        motion: hub angle (T,) from rest under a voltage (T,), linear in it.
+        """
+        share = min(peak_V / float(np.max(np.abs(voltages_V))), np.inf)
+        if motion is not None:
+            largest = max(float(np.max(np.abs(motion(v)))) for rung in voltages_V for v in rung)
+            share = min(share, angle_rad / largest)
+        # Three digits, rounded down: a plan is read by people, and stays within its limits.
+        exact = np.array(self.rms_V) * share
+        unit = 10.0 ** (np.floor(np.log10(exact)) - 2)
+        return self.model_copy(update={"rms_V": tuple((np.floor(exact / unit) * unit).round(12).tolist())})
+
+    def radius(self, rms_V: float, dt_s: float, noise_std: float) -> float:
+        """Expected 95 % radius of the response at one line from white sensor noise, output units per volt.
+
+        A line carries |U|^2 = N^2 rms^2 / (2 H) of H lines and a period of N samples, noise N std^2; averaged
+        over M realisations and P periods the variance is v = 2 H std^2 / (N M P rms^2), the radius
+        sqrt(-v ln 0.05). Distortion and a model that joins the lines are left out.
+        """
+        averaged = self.period_samples * self.realisations * self.periods
+        variance = 2 * self.lines(dt_s).size * noise_std**2 / (averaged * rms_V**2)
+        return float(np.sqrt(-variance * np.log(1 - _LEVEL)))

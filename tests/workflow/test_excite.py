@@ -1,0 +1,57 @@
+"""`flexlink excite`: what is written keeps the limits; what cannot be kept is refused in one line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from workflow.cli import main
+
+LIMITS = ["--band", "0.5", "40", "--dt-s", "0.005", "--duration", "60", "--voltage", "10"]
+
+
+def test_files_keep_the_limits_and_the_plan_says_what_is_in_them(tmp_path):
+    out = tmp_path / "plan"
+    options = ["--rig", "paper_link", "--angle", "30", "--noise-std", "0.001", "--realisations", "2"]
+    assert main(["excite", "--out", str(out), *LIMITS, *options]) == 0
+    plan = json.loads((out / "plan.json").read_text())
+    assert {path.name for path in out.glob("*.csv")} == {record["file"] for record in plan["records"]}
+    total = 0.0
+    for record in plan["records"]:
+        table = np.loadtxt(out / record["file"], delimiter=",", skiprows=1)
+        voltage = table[plan["plan"]["lead_in_samples"] :, 1]
+        total += table.shape[0] * 0.005
+        assert np.abs(voltage).max() == pytest.approx(record["peak_V"], rel=1e-6)
+        assert record["peak_V"] <= 10
+        assert record["peak_angle_deg"] <= 30
+        assert np.sqrt(np.mean(voltage**2)) == pytest.approx(record["rms_V"], rel=1e-6)
+        spectrum = np.abs(np.fft.rfft(voltage[: plan["plan"]["period_samples"]]))
+        spacing = 1 / (plan["plan"]["period_samples"] * 0.005)
+        excited = np.flatnonzero(spectrum > 1e-6 * spectrum.max()) * spacing
+        np.testing.assert_allclose(excited, plan["lines_Hz"])
+    assert total == pytest.approx(plan["duration_s"])
+    assert total <= 60
+    assert "Planned experiment" in (out / "plan.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--duration", "10"], ["needs periods of 2 s", "10 s are allowed"]),
+        (["--rms", "9"], ["9 V rms, realisation 1", "10 V are allowed"]),
+        (["--angle", "5"], ["give a rig or gain_rad_per_Vs"]),
+        (["--rms", "3", "--angle", "5", "--gain", "1"], ["expected to turn by", "5 are allowed"]),
+        (["--band", "0.5", "140"], ["Nyquist"]),
+        (["--voltage", "-1"], ["peak_V must be positive"]),
+        (["--rig", "absent.toml"], ["absent.toml"]),
+    ],
+)
+def test_impossible_limits_are_one_line(tmp_path, capsys, options, words):
+    assert main(["excite", "--out", str(tmp_path / "plan"), *LIMITS, *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    for word in words:
+        assert word in error
+    assert not (tmp_path / "plan").exists()

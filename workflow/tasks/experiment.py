@@ -1,0 +1,161 @@
+"""A planned experiment: voltages within limits, the motion to expect, how well the response will be known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from plant import ExperimentPlan, Rig, crest_factor, linear_arm, simulate
+from workflow.config.rig_settings import PRESETS
+from workflow.engine.errors import InputError, naming
+
+Real = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an experiment may do; angles are those of the hub, None where nobody stated one.
+
+    rms_V: the ladder, or none for half of the highest that the limits allow, and that. gain_rad_per_Vs: speed
+    per volt of an arm taken as an integrator, where there is no rig. noise_std_rad: of the hub's sensor.
+    """
+
+    band_Hz: tuple[float, float]
+    dt_s: float
+    duration_s: float
+    peak_V: float
+    rms_V: tuple[float, ...] = ()
+    angle_deg: float | None = None
+    gain_rad_per_Vs: float | None = None
+    rig: Rig | None = None
+    noise_std_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class PlannedRecord:
+    """One voltage file and what to expect of it; the angle is None without a rig or a gain."""
+
+    file: str
+    rms_V: float
+    realisation: int
+    peak_V: float
+    crest_factor: float
+    peak_angle_deg: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedExperiment:
+    """voltages_V (A, M, T) over amplitudes, realisations and samples."""
+
+    limits: Limits
+    plan: ExperimentPlan
+    seed: int
+    voltages_V: Real
+
+    @cached_property
+    def records(self) -> tuple[PlannedRecord, ...]:
+        motion, rows = motion_of(self.limits), list[PlannedRecord]()
+        for rms_V, rung in zip(self.plan.rms_V, self.voltages_V, strict=True):
+            for k, voltage in enumerate(rung, 1):
+                angle = None if motion is None else float(np.degrees(np.max(np.abs(motion(voltage)))))
+                peak = float(np.max(np.abs(voltage)))
+                name = f"{len(rows) + 1:02d}_{rms_V:g}_V_rms_realisation_{k}.csv"
+                rows.append(PlannedRecord(name, rms_V, k, peak, crest_factor(voltage), angle))
+        return tuple(rows)
+
+    @property
+    def duration_s(self) -> float:
+        return self.plan.duration_s(self.limits.dt_s)
+
+    @cached_property
+    def lines_Hz(self) -> Real:
+        """Excited lines (H,)."""
+        return self.plan.lines(self.limits.dt_s) / (self.plan.period_samples * self.limits.dt_s)
+
+    @cached_property
+    def detection_Hz(self) -> Real:
+        """Odd lines between the excited ones that were left out (K,)."""
+        lines = self.plan.lines(self.limits.dt_s)
+        missing = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, 2), lines)
+        return np.asarray(missing / (self.plan.period_samples * self.limits.dt_s))
+
+    @cached_property
+    def gain(self) -> Real | None:
+        """|hub angle / voltage| (H,) in rad/V, None without a rig or a gain."""
+        omega = 2 * np.pi * self.lines_Hz
+        if self.limits.rig is not None:
+            arm = linear_arm(self.limits.rig)
+            return np.asarray(np.abs(arm(1j * omega)[0, 0]))
+        return None if self.limits.gain_rad_per_Vs is None else self.limits.gain_rad_per_Vs / omega
+
+    @cached_property
+    def radii(self) -> tuple[float, ...] | None:
+        """Expected 95 % radius [rad/V] of the response at every line, per amplitude."""
+        noise = self.limits.noise_std_rad
+        if noise is None:
+            return None
+        return tuple(self.plan.radius(rms, self.limits.dt_s, noise) for rms in self.plan.rms_V)
+
+
+def rig_called(name: str) -> Rig:
+    """A preset by its name, or a rig file. Raises InputError."""
+    with naming(name):
+        return PRESETS[name]() if name in PRESETS else Rig.from_toml(Path(name))
+
+
+def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
+    """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
+    rig, gain = limits.rig, limits.gain_rad_per_Vs
+    if rig is not None:
+        return lambda voltage: simulate(rig, voltage, dt_s=limits.dt_s).hub_angle_true_rad
+    if gain is not None:
+        return lambda voltage: gain * limits.dt_s * np.cumsum(voltage)
+    return None
+
+
+def plan_experiment(limits: Limits, *, seed: int, **settings: object) -> PlannedExperiment:
+    """The longest periods and largest voltages that the limits allow; settings: fields of the plan by name.
+
+    Raises InputError (one line) where no experiment stays within them.
+    """
+    for name, value in vars(limits).items():
+        if isinstance(value, int | float) and not 0 < value < np.inf:
+            raise InputError(f"{name} must be positive and finite; got {value}")
+    motion = motion_of(limits)
+    if limits.angle_deg is not None and motion is None:
+        raise InputError("angle_deg is a limit of the motion: give a rig or gain_rad_per_Vs to predict it")
+    lead_in_s = settings.pop("lead_in_s", 1.0)
+    if limits.rms_V:
+        settings["rms_V"] = limits.rms_V
+    try:
+        plan = ExperimentPlan.within(
+            band_Hz=limits.band_Hz,
+            dt_s=limits.dt_s,
+            duration_s=limits.duration_s,
+            lead_in_s=float(str(lead_in_s)),
+            lines_seed=seed,
+            **settings,
+        )
+        voltages = plan.records(limits.dt_s, np.random.default_rng(seed))
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    if not limits.rms_V:
+        angle_rad = np.inf if limits.angle_deg is None else float(np.radians(limits.angle_deg))
+        plan = plan.scaled(voltages, peak_V=limits.peak_V, angle_rad=angle_rad, motion=motion)
+        voltages = plan.records(limits.dt_s, np.random.default_rng(seed))
+    found = PlannedExperiment(limits, plan, seed, voltages)
+    for record in found.records:
+        about = f"{record.rms_V:g} V rms, realisation {record.realisation}"
+        if record.peak_V > limits.peak_V * (1 + 1e-9):
+            raise InputError(f"{about}: peak of {record.peak_V:.4g} V, {limits.peak_V:g} V are allowed")
+        if limits.angle_deg is not None and not (record.peak_angle_deg or 0.0) <= limits.angle_deg:
+            raise InputError(
+                f"{about}: the hub is expected to turn by {record.peak_angle_deg:.4g} degrees, "
+                f"{limits.angle_deg:g} are allowed"
+            )
+    return found
