@@ -18,6 +18,9 @@ Progress = Callable[[float, str], None]
 
 # Exchanges of a pole for another at most.
 _EXCHANGES = 4
+# Two optima with equal numbers of poles whose -2 log likelihoods differ by less fit equally well: what
+# friction leaves in the records decides between them.
+_LIKELIER = 2.0
 
 
 def silent(fraction: float, message: str) -> None:
@@ -111,8 +114,17 @@ class OrderSelection:
             trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
             if self.options.n_pairs is None and not self._better(trial, best):
                 break
-            best = trial
+            best = self._split(best, trial) if 0 < count == most_pairs - 1 else trial
         return best
+
+    def _split(self, smaller: Refined, best: Refined) -> Refined:
+        """`best`, or the smaller model with one pair as two where that is clearly likelier and `best` leaves
+        something to explain."""
+        if self.options.n_pairs is None or self.search.is_trusted(best):
+            return best
+        found = self.search.split_pair(smaller.poles)
+        samples = self.search.colour(best).effective_samples
+        return self._noted(found) if samples * np.log(best.rss / found.rss) > _LIKELIER else best
 
     def _grow_real(self, best: Refined) -> Refined:
         while self._counts(best)[0] < self.options.max_real and self._visible(best):

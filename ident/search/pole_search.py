@@ -80,7 +80,7 @@ class PoleSearch(Generic[Problem]):
         """Best poles of a joint global search over n_real real poles and n_pairs pairs.
 
         The search has settled if the first starts, points of the cube far from each other, all end in one
-        place that can be trusted (`_is_trusted`). Agreement by itself is not enough: a broad wrong minimum
+        place that can be trusted (`is_trusted`). Agreement by itself is not enough: a broad wrong minimum
         can catch several starts, but leaves dynamics in the residual. Else `_PATIENCE` times as many starts
         are tried: more of them find more than more evaluations do.
         """
@@ -100,7 +100,7 @@ class PoleSearch(Generic[Problem]):
         best = self._best_descent(starts(points[:few]), title)
         ends = self.minima[known : known + len(points[:few])]
         agreed = len(ends) == _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
-        if agreed and self._is_trusted(best):
+        if agreed and self.is_trusted(best):
             self._settled = best
             return best
         if len(points) > few:
@@ -109,7 +109,7 @@ class PoleSearch(Generic[Problem]):
                 best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
         return best
 
-    def _is_trusted(self, best: Refined) -> bool:
+    def is_trusted(self, best: Refined) -> bool:
         """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real poles.
 
         Two real poles that meet stay together in a descent, although apart they may fit better.
@@ -150,6 +150,18 @@ class PoleSearch(Generic[Problem]):
         return self._best_descent(
             [poles.appended(space.poles(point)) for point in points], "one more real pole"
         )
+
+    def split_pair(self, poles: Poles) -> Refined:
+        """Best descent from the given poles with one searched pair as two, a half-width apart.
+
+        `add_pair` cannot see a mode that close to another: the tangent space has what it would add first.
+        """
+        starts = []
+        for i in range(self.fixed.pairs.size, poles.pairs.size):
+            log = cmath.log(poles.pairs[i])
+            angles = np.clip(log.imag + np.array([0.5, -0.5]) * log.real, *self.bounds.array[2:4])
+            starts.append(poles.without_pair(i).appended(Poles(pairs=np.exp(log.real + 1j * angles))))
+        return self._best_descent(starts, "pair as two")
 
     def rescan(self, best: Refined) -> Refined:
         """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round

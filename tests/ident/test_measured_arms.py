@@ -57,13 +57,14 @@ def test_robot_arm_fitted_on_the_first_half_predicts_the_second(robot_arm, n_pai
 
 
 # One sweep goes down and one up within the first half: nothing is repeated between them. Measured 96.0/95.1
-# and 97.0/95.3.
-@pytest.mark.parametrize("n_pairs", [2, 3])
-def test_robot_arm_fitted_on_the_sweep_down_predicts_the_sweep_up_and_back(robot_arm, n_pairs):
+# and 97.0/95.3. With four pairs from the sweep up 97.6, where one pair is split in two (J .000952), and 95.2
+# at the minimum to which adding pairs one by one leads (J .001010).
+@pytest.mark.parametrize(("n_pairs", "least"), [(2, (94.5, 94.5)), (3, (94.5, 94.5)), (4, (95.8, 97.4))])
+def test_robot_arm_fitted_on_the_sweep_down_predicts_the_sweep_up_and_back(robot_arm, n_pairs, least):
     down, up = robot_arm.slice(0, 256), robot_arm.slice(256, 512)
-    for part, fresh in ((down, up), (up, down)):
+    for part, fresh, reach in ((down, up, least[0]), (up, down, least[1])):
         model = identify([part], robot_arm_options(n_pairs)).model
-        assert fit_on_fresh_data(model, fresh, estimate_offset=False).fit_percent > 94.5
+        assert fit_on_fresh_data(model, fresh, estimate_offset=False).fit_percent > reach
 
 
 def test_robot_arm_known_at_every_second_line_is_known_between_them(robot_arm):
