@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.landau_score import ITEMS, LOADS, TS_S, Law, all_values, margins, points, score, values
-from benchmarks.landau_search import batch_margins, law_of, search
+from benchmarks.landau_transmission import batch_margins, law_of, search
 
 _NEAR = np.array(
     [0.4768552, -1.317387, 1.1759111, -0.3086128, -0.0343734, -0.5180146]
