@@ -25,15 +25,10 @@ from scipy.signal import lfilter
 from benchmarks.harness import Print, data_folder, main
 from ident import GobfModel, IdentOptions, Record, identify
 from ident.basis.functions import free_response
-from ident.basis.poles import Poles
 from ident.checks.validation import fit_on_fresh_data
-from ident.fit.least_squares import fit
-from ident.fit.regression import prepare
 from ident.frequency_fit import identify_frf
-from ident.search.pole_search import PoleSearch
 from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.autoregression import fit_autoregression
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from validation.comparators.comparators import PolynomialModel, armax, arx, oe
 from validation.paper.methods import poles_of
 
@@ -41,7 +36,6 @@ HALF = 512
 ORDERS = (4, 6, 8, 10)
 REACH = {4: 96.4, 6: 96.9, 8: 97.2, 10: 97.4}
 THROUGH = 94.0
-DESCENTS = 60
 
 Model = GobfModel | PolynomialModel
 
@@ -129,14 +123,6 @@ def whitened(record: Record, order: int) -> GobfModel:
     return model
 
 
-def posterior_mean_fit(record: Record, order: int) -> float:
-    """Own-state fit on the second half of the tangent posterior's mean around the model of the first."""
-    first = record.slice(0, HALF)
-    posterior = tangent([first], gobf(first, order), EmbeddingOptions(coloured_noise=True))
-    half = record.slice(HALF, 2 * HALF)
-    return fit_on_fresh_data(posterior, half, estimate_offset=False).fit_percent
-
-
 PEERS: dict[str, Callable[[Record, int], Model]] = {
     "ARX n, n + 1": lambda record, n: arx(record, n, n + 1, delay_samples=0),
     "OE n + 1, n": lambda record, n: oe(record, n + 1, n, delay_samples=0),
@@ -149,38 +135,6 @@ def numbers(item: Score, model: Model) -> str:
     """One line of the tables."""
     cells = "".join(f"{'unstable' if np.isnan(v) else f'{v:.2f}':>10}" for v in item.values())
     return f"{cells}   {largest_pole(model):.5f}"
-
-
-def minima(record: Record, say: Print) -> None:
-    """Ends of many descents at order 8 on the first half, by cost, with what they predict on the second."""
-    first = record.slice(0, HALF)
-    data = prepare([first], structure(8).structure())
-    search = PoleSearch(data, structure(8))
-    rng = np.random.default_rng(0)
-    found: list[tuple[float, Poles]] = []
-    for _ in range(DESCENTS):
-        omega = np.concatenate([[0.366, 0.796], np.exp(rng.uniform(np.log(0.05), np.log(3.1), 2))])
-        zeta = 10 ** np.concatenate([rng.uniform(-2.5, -2, 2), rng.uniform(-3, -0.3, 2)])
-        poles = Poles((), np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
-        end = search.descend(poles, "start")
-        found.append((end.rss, end.poles))
-    found.sort(key=lambda end: end[0])
-    say(f"\nOrder 8: ends of {DESCENTS} descents on the first half (seed 0), the best five")
-    say("sum of squares   own state   through   poles (rad/sample, damping)")
-    last, shown = 0.0, 0
-    for rss, poles in found:
-        if rss < last * 1.003:
-            continue
-        last, shown = rss, shown + 1
-        linear = fit(data, poles)
-        model = GobfModel(poles, linear.coefficients[0], 1.0, float(linear.feedthrough[0]))
-        item = score(model, record)
-        names = ", ".join(
-            f"{w:.3f} {z:.4f}" for w, z in zip(poles.omega_rad_s(1.0), poles.zeta(), strict=True)
-        )
-        say(f"{rss:>14.6f} {item['own state']:>11.2f} {item['through']:>9.2f}   {names}")
-        if shown == 5:
-            break
 
 
 def sweeps(record: Record, say: Print) -> None:
@@ -248,16 +202,12 @@ def run(say: Print) -> None:
         f"No model at all, the first half with its sign turned: {mirrored:.2f} (input: "
         f"{percent(u[HALF:], u[HALF:] + u[:HALF]):.2f}). That much is in the split, whatever the model."
     )
-    minima(record, say)
     say("\nPeers in the same run, same half; OE and ARMAX take it to start from rest, ARX does not")
     say(f"{'method':<30}{'order':>6}{head}   largest |pole|")
     for name, method in PEERS.items():
         for order in (*ORDERS, 12) if name.startswith("ARX") else ORDERS:
             fitted = method(first, order)
             say(f"{name:<30}{order:>6}{numbers(score(fitted, record), fitted)}")
-    for order in ORDERS:
-        mean = posterior_mean_fit(record, order)
-        say(f"{'tangent posterior mean around':<30}{order:>6}{'':>10}{mean:>10.2f}")
     say("ARX as noted with the data, free run on the second half: 73.9, 92.5, 94.9, 93.9 at 4, 6, 8, 12.")
     say("Published: no error figure (SLICOT: MOESP/N4SID of order 4 'good enough', 6 'slightly better';")
     say("ControlSystemIdentification.jl: order 4 on half the data, low coherence near the notches).")
