@@ -3,8 +3,9 @@ machine."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol
 
 import control
 import numpy as np
@@ -115,7 +116,7 @@ def simulate(
     measurement_step: float = 0.0,
     command_step: float = 0.0,
 ) -> ClosedLoopTrajectory:
-    """Run u = K (r - y) on a machine from rest.
+    """Run u = K (r - y), with the controller's feed-forward if it has one, on a machine from rest.
 
     At t_k: measure y_k, add output_disturbance, quantise with measurement_step, compute the limited command,
     quantise it with command_step, queue it for t_{k + delay}; then the machine holds the queued command (plus
@@ -156,7 +157,7 @@ def simulate(
         y[measured_index] += shift[k]
         if measurement_step > 0:
             y[measured_index] = np.round(y[measured_index] / measurement_step) * measurement_step
-        u = stepper.step(float(wanted[k] - y[measured_index]))
+        u = stepper.step(float(wanted[k] - y[measured_index]), float(wanted[k]))
         limited[k] = stepper.limited
         if command_step > 0:
             u = float(np.round(u / command_step) * command_step)
@@ -227,17 +228,39 @@ def measure_sensitivity(
     machine: SampledMachine,
     rng: np.random.Generator,
     *,
+    measured_index: int = 0,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
+    **excitation: Any,
+) -> MeasuredSensitivity:
+    """S measured on a machine: excitation as of `sensitivity_of`, the other keywords as of `simulate`."""
+
+    def run(reference: Real) -> ClosedLoopTrajectory:
+        return simulate(
+            controller,
+            machine,
+            reference,
+            measured_index=measured_index,
+            measurement_step=measurement_step,
+            command_step=command_step,
+        )
+
+    return sensitivity_of(run, rng, dt_s=controller.dt_s, **excitation)
+
+
+def sensitivity_of(
+    loop: Callable[[Real], ClosedLoopTrajectory],
+    rng: np.random.Generator,
+    *,
+    dt_s: float,
     rms: float,
     band_rad_s: tuple[float, float],
     period_samples: int,
     periods: int = 2,
     draws: int = 1,
     lead_in_periods: int = 1,
-    measured_index: int = 0,
-    measurement_step: float = 0.0,
-    command_step: float = 0.0,
 ) -> MeasuredSensitivity:
-    """Measure S on a machine: random-phase multisines as reference, ratio of error to reference.
+    """S of a loop that runs a reference (T,) from rest: random-phase multisines, ratio of error to reference.
 
     Every draw has phases of its own; its first `lead_in_periods` periods are left out, so that the loop has
     come to its periodic motion. On a nonlinear machine the mean over draws is the best linear approximation
@@ -253,7 +276,7 @@ def measure_sensitivity(
     if not (rms > 0 and np.isfinite(rms)):
         raise ValueError(f"rms must be positive; got {rms}")
     lines = np.arange(1, (period_samples - 1) // 2 + 1)
-    omega = np.asarray(2 * np.pi * lines / (period_samples * controller.dt_s), dtype=np.float64)
+    omega = np.asarray(2 * np.pi * lines / (period_samples * dt_s), dtype=np.float64)
     inside = (omega >= band_rad_s[0]) & (omega <= band_rad_s[1])
     lines, omega = lines[inside], omega[inside]
     if lines.size == 0:
@@ -264,14 +287,7 @@ def measure_sensitivity(
         spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
         period = np.fft.irfft(spectrum, period_samples)
         period *= rms / np.sqrt(np.mean(period**2))
-        run = simulate(
-            controller,
-            machine,
-            np.tile(period, lead_in_periods + periods),
-            measured_index=measured_index,
-            measurement_step=measurement_step,
-            command_step=command_step,
-        )
+        run = loop(np.tile(period, lead_in_periods + periods))
         error = (run.reference - run.measured)[lead_in_periods * period_samples :]
         by_period = np.fft.rfft(error.reshape(periods, period_samples), axis=1)[:, lines]
         found.append(by_period / np.fft.rfft(period)[lines])

@@ -17,6 +17,14 @@ _INPUT_LIMIT = """\
     if (command > INPUT_LIMIT) command = INPUT_LIMIT;
     if (command < -INPUT_LIMIT) command = -INPUT_LIMIT;
 """
+_FEEDFORWARD = """\
+    $number ahead = reference - state->behind;
+    $number turned = ahead / WIDTH;
+    if (turned > 1) turned = 1;
+    if (turned < -1) turned = -1;
+    wanted += LEVEL * turned;
+    state->behind += SHARE * ahead;
+"""
 _RATE_LIMIT = """\
     if (command > state->last + LARGEST_CHANGE) command = state->last + LARGEST_CHANGE;
     if (command < state->last - LARGEST_CHANGE) command = state->last - LARGEST_CHANGE;
@@ -58,7 +66,7 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     str
         `<prefix>_step(&state, error)` returns the limited command for the error at this sample; the
         state keeps whether a limit was active. One call every `dt_s`; order n costs (n + 1)^2
-        multiplications.
+        multiplications. With a friction feed-forward it is `<prefix>_step(&state, error, reference)`.
 
     Raises
     ------
@@ -83,9 +91,14 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     def vector(values: Real) -> str:
         return "{" + ", ".join(literal(value) for value in (values if values.size else [0.0])) + "}"
 
-    constants, limits = "", ""
+    constants, limits, given = "", "", controller.feedforward
+    if given is not None:
+        named = {"LEVEL": given.level, "WIDTH": given.width, "SHARE": given.share(controller.dt_s)}
+        constants = "".join(
+            f"static const {number} {name} = {literal(value)};\n" for name, value in named.items()
+        )
     if controller.input_limit is not None:
-        constants = f"static const {number} INPUT_LIMIT = {literal(controller.input_limit)};\n"
+        constants += f"static const {number} INPUT_LIMIT = {literal(controller.input_limit)};\n"
         limits = _INPUT_LIMIT
     if controller.rate_limit is not None:
         change = literal(controller.rate_limit * controller.dt_s)
@@ -100,13 +113,26 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         M=vector(controller.anti_windup_gain[:, 0]),
         constants=constants,
         limits=limits,
+        feedforward="" if given is None else Template(_FEEDFORWARD).substitute(number=number),
+        at_rest="" if given is None else "    state->behind = 0;\n",
         **_names(controller, prefix, number),
     )
 
 
 def _names(controller: Controller, prefix: str, number: Number) -> dict[str, Any]:
-    # C has no arrays of length zero.
-    return {"name": prefix, "number": number, "order": controller.order, "size": max(controller.order, 1)}
+    given = controller.feedforward is not None
+    return {
+        "name": prefix,
+        "number": number,
+        "order": controller.order,
+        # C has no arrays of length zero.
+        "size": max(controller.order, 1),
+        "reference": f", {number} reference" if given else "",
+        "friction": " + friction feed-forward" if given else "",
+        "behind": f"    {number} behind;  /* what the loop follows, late; rests at 0 at first */\n"
+        if given
+        else "",
+    }
 
 
 @cache

@@ -3,16 +3,18 @@ delay."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import control
 import numpy as np
 import scipy.io
 import scipy.linalg
 
+from control_design.controllers.feedforward import FrictionFeedforward
 from control_design.controllers.law import Law
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import delayed
@@ -27,7 +29,7 @@ class Controller(Law):
     largest change per second of the command, or None. anti_windup_gain M (n, 1): back-calculation in observer
     form; the controller state then follows A - M C while the command is limited, so M must make that stable;
     None = `observer_gain(A, B, C, D)`. computational_delay_samples: the command computed from the measurement
-    at t_k is applied from t_{k + delay} on.
+    at t_k is applied from t_{k + delay} on. feedforward: joins u before it is limited, or None.
     """
 
     kind = "controller"
@@ -38,6 +40,7 @@ class Controller(Law):
     rate_limit: float | None = None
     anti_windup_gain: Real | None = None
     name: str = "controller"
+    feedforward: FrictionFeedforward | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,6 +85,16 @@ class Controller(Law):
         """Linear part as `control.StateSpace`; with include_delay the delay's states come after K's."""
         return delayed(super().to_control(), self.computational_delay_samples if include_delay else 0)
 
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Inverse of `to_dict`, as of `Law`; a file may lack the feed-forward."""
+        given = data.get("feedforward")
+        try:
+            made = None if given is None else FrictionFeedforward(**given)
+        except TypeError as error:
+            raise ValueError(f"feedforward needs level, width and lag_s; got {given}") from error
+        return super().from_dict({**data, "feedforward": made})
+
     def stepper(self) -> ControllerStepper:
         """A fresh machine-side instance at rest."""
         return ControllerStepper(self)
@@ -89,6 +102,9 @@ class Controller(Law):
     def save_mat(self, file: str | PathLike[str] | BinaryIO) -> None:
         """MATLAB 5 file (path or stream) with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        given = values.pop("feedforward")
+        if given is not None:
+            values["feedforward"] = vars(given)
         plain = {name: float("inf") if value is None else value for name, value in values.items()}
         scipy.io.savemat(Path(file) if isinstance(file, (str, PathLike)) else file, plain)  # type: ignore[arg-type]
 
@@ -120,17 +136,27 @@ class ControllerStepper:
         self._limit = np.inf if controller.input_limit is None else controller.input_limit
         rate = np.inf if controller.rate_limit is None else controller.rate_limit
         self._change = rate * controller.dt_s
+        self._feedforward = controller.feedforward
+        self._share = 0.0 if self._feedforward is None else self._feedforward.share(controller.dt_s)
         self.reset()
 
     def reset(self) -> None:
         """Back to rest: zero state, previous command zero."""
         self._x = np.zeros(self._controller.order)
         self._last = 0.0
+        self._behind = 0.0
         self.limited = False
 
-    def step(self, error: float) -> float:
-        """Command for the error at this sample; `limited` tells whether a limit was active."""
+    def step(self, error: float, reference: float = 0.0) -> float:
+        """Command for the error at this sample; `limited` tells whether a limit was active.
+
+        reference: the set point, which the feed-forward (if any) looks at; it rested at zero before.
+        """
         wanted = float(self._c @ self._x) + self._d * error
+        if self._feedforward is not None:
+            ahead = reference - self._behind
+            wanted += self._feedforward.at(ahead)
+            self._behind += self._share * ahead
         command = min(max(wanted, self._last - self._change), self._last + self._change)
         command = min(max(command, -self._limit), self._limit)
         self.limited = command != wanted

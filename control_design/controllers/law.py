@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Self
 
 import control
@@ -61,9 +61,9 @@ class Law:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; `from_dict` restores it exactly (floats are written with all their digits)."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
         plain = {
-            key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in values.items()
+            key: value.tolist() if isinstance(value, np.ndarray) else value
+            for key, value in asdict(self).items()
         }
         return {"format": self.format_name(), "law": self.equations, **plain}
 

@@ -12,6 +12,7 @@ import scipy.linalg
 
 from control_design import Controller
 from control_design.controllers.c_code import c_header, c_source
+from control_design.controllers.feedforward import FrictionFeedforward
 
 _DT = 0.005
 _COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
@@ -40,9 +41,9 @@ def _compiled(controller: Controller, folder, number: str = "double"):
     code = ctypes.CDLL(str(library))
     real = ctypes.c_double if number == "double" else ctypes.c_float
     code.arm_step.restype = real
-    code.arm_step.argtypes = [ctypes.c_void_p, real]
-    state = ctypes.create_string_buffer(8 * (controller.order + 4))
-    return lambda error: code.arm_step(state, error), lambda: code.arm_reset(
+    code.arm_step.argtypes = [ctypes.c_void_p, real] + [real] * (controller.feedforward is not None)
+    state = ctypes.create_string_buffer(8 * (controller.order + 5))
+    return lambda *error: code.arm_step(state, *error), lambda: code.arm_reset(
         ctypes.c_void_p(ctypes.addressof(state))
     )
 
@@ -76,6 +77,28 @@ def test_a_closed_loop_run_with_saturation_agrees_to_1e_12(tmp_path, order, limi
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
     reset()
     np.testing.assert_array_equal(_closed_loop(step), found)
+
+
+@needs_compiler
+def test_friction_feedforward_agrees_to_1e_12_and_ends_with_the_reference(tmp_path):
+    """A move, a rest and a move back: full level of either sign, and nothing at rest."""
+    given = FrictionFeedforward(0.04, 1e-5, 0.1)
+    controller = _controller(3, input_limit=0.5, feedforward=given)
+    step, reset = _compiled(controller, tmp_path)
+    reset()
+    ours = controller.stepper()
+    reference = 0.3 * np.concatenate(
+        [np.linspace(0, 1, 200), np.ones(600), np.linspace(1, 0, 200), np.zeros(600)]
+    )
+    error = 0.1 * np.random.default_rng(4).standard_normal(reference.size)
+    expected, found = (
+        np.array([law(e, r) for e, r in zip(error, reference, strict=True)]) for law in (ours.step, step)
+    )
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
+    assert np.sum(np.abs(expected) == 0.5) > 20, "the run must saturate to mean anything"
+    signal = given.signal(reference, _DT)
+    assert (signal[100], signal[900]) == (0.04, -0.04)
+    assert max(abs(signal[790]), abs(signal[-1])) < 1e-6 * given.level
 
 
 @needs_compiler

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from control_design import Controller
+from control_design.controllers.feedforward import FrictionFeedforward
 
 _DT = 0.01
 
@@ -77,6 +78,7 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
         _random(np.random.default_rng(3), input_limit=5.0, rate_limit=100.0, name="hub"),
         _pi(),
         Controller.proportional(2.0, _DT),
+        Controller.proportional(2.0, _DT, feedforward=FrictionFeedforward(0.04, 1e-5, 0.17)),
     ):
         text = controller.to_json()
         copies = [Controller.from_json(text)]
@@ -86,13 +88,21 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
         for copy in copies:
             for name in ("A", "B", "C", "D", "anti_windup_gain"):
                 np.testing.assert_array_equal(getattr(copy, name), getattr(controller, name))
-            for name in ("dt_s", "input_limit", "rate_limit", "computational_delay_samples", "name"):
+            for name in (
+                "dt_s",
+                "input_limit",
+                "rate_limit",
+                "computational_delay_samples",
+                "name",
+                "feedforward",
+            ):
                 assert getattr(copy, name) == getattr(controller, name)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ('{"format": "flexlink-controller-1", "feedforward": {"level": 1}}', "needs level, width and lag_s"),
         ("{", "line 1, column 2"),
         ("[]", "must be an object"),
         ("{}", "expected 'flexlink-controller-1'"),

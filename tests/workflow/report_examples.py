@@ -39,6 +39,7 @@ from workflow.tasks.results import (
     ClosedLoopResult,
     ConditionRun,
     DesignResult,
+    FrictionCheck,
     IdentifiedChannel,
     IdentifyResult,
     LoopCheck,
@@ -49,6 +50,7 @@ from workflow.tasks.results import (
     RunRecord,
     SampledResponses,
     SensitivityCheck,
+    SlowSine,
     UncertaintyResult,
 )
 from workflow.text.templates import said
@@ -394,6 +396,32 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
         achieved_runs=achieved,
         sensitivity=sensitivity,
         conditions=conditions,
+        friction=None if sensitivity is None else friction_check(sensitivity),
+    )
+
+
+def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
+    """Three sizes, made up; the smallest is measured outside its interval."""
+    sizes, peak = np.array([0.2, 0.02, 0.002]), sensitivity.nominal_peak
+    error = 0.01 * np.sin(np.linspace(0, 6, 500))
+    return FrictionCheck(
+        level=0.04,
+        level_interval=(0.039, 0.041),
+        presliding=1e-5,
+        sizes=sizes,
+        low=peak * np.array([0.99, 0.95, 0.9]),
+        high=peak * np.array([1.01, 0.98, 0.95]),
+        measured=peak * np.array([1.0, 0.97, 0.96]),
+        nominal_peak=peak,
+        certified_peak=sensitivity.certified_peak,
+        tolerance_percent=5.0,
+        certified_from=0.002,
+        linear_from=0.01,
+        sticking_step=0.0013,
+        sticking_interval=(0.0012, 0.0014),
+        error_at_rest=0.006,
+        error_interval=(0.0058, 0.0062),
+        tracking=SlowSine(0.05, 0.1, 0.001, error, 0.2 * error),
     )
 
 

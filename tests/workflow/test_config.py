@@ -142,6 +142,14 @@ def test_a_promise_that_cannot_be_kept_is_refused(tmp_path, channel, complaint):
         minimal(tmp_path, MINIMAL.replace("[[channels]]", f"[[channels]]\n{asked}"))
 
 
+def test_friction_is_fed_forward_only_where_it_is_identified(tmp_path):
+    asked = "[closed_loop]\nfriction_feedforward = true\n"
+    with pytest.raises(InputError, match="friction_feedforward = true needs an identified friction"):
+        minimal(tmp_path, MINIMAL + asked)
+    promised = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = { promise = 'without friction' }")
+    assert minimal(tmp_path, promised + asked).closed_loop.friction_feedforward
+
+
 def test_packaged_default_is_the_example():
     assert (ROOT / "workflow" / "data" / "default_arm.toml").read_text() == (
         ROOT / "examples" / "default_arm.toml"

@@ -268,6 +268,11 @@ class ClosedLoopOptions(Section):
     measurement_step: float = Field(0.0, ge=0, description="step of the measured output, e.g. an encoder's")
     duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
+    friction_feedforward: bool = Field(
+        False,
+        description="the controller adds the identified Coulomb friction with the sign of the reference's "
+        "speed; needs promise = 'without friction'",
+    )
     sensitivity: bool = Field(True, description="on the simulated arm: measure S, predicted beside measured")
     conditions: bool = Field(
         True,
@@ -330,6 +335,11 @@ class RunConfig(Section):
             raise ValueError("closed_loop.machine = 'simulated' needs [source] kind = 'simulated'")
         if self.closed_loop.effects and self.machine != "simulated":
             raise ValueError("closed_loop.effects act on the simulated arm only")
+        if self.closed_loop.friction_feedforward and not self.without_friction:
+            raise ValueError(
+                "closed_loop.friction_feedforward = true needs an identified friction: promise = "
+                "'without friction' in [channels.uncertainty] of a channel"
+            )
         if self.without_friction:
             if self.closed_loop_data.method == "two_stage":
                 raise ValueError("promise = 'without friction' needs closed_loop_data.method = 'direct'")

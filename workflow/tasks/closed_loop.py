@@ -15,6 +15,7 @@ from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.engine.errors import naming
+from workflow.tasks.friction_check import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
 from workflow.tasks.reference_filter import model_answer
@@ -53,6 +54,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
     if synthesis is None or results.certify.certificate is None:
         return ClosedLoopResult(skipped=results.certify.reason)
     controller, options = synthesis.controller, config.closed_loop
+    law = results.reference_filter.law(controller)
     with naming("closed loop"):
         radius = float(np.max(np.abs(closed_loop_poles(controller, stage.plant))))
         if not radius < 1:
@@ -65,16 +67,16 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
         mean = (posterior, posterior.mean[None]), None if tip is None else (tip, tip.mean[None])
         predicted = run_on_draws(controller, *mean, trial)
         stage.progress.update("closed_loop", 0.1, "machine")
-        sensitivity, conditions = None, []
+        sensitivity, conditions, friction = None, [], None
         if config.machine == "simulated":
-            achieved = run_on_arm(stage, controller, trial)
+            achieved = run_on_arm(stage, law, trial)
             if options.sensitivity:
                 stage.progress.update("closed_loop", 0.8, "sensitivity")
                 sensitivity = sensitivity_on_arm(stage, controller, trial.half)
             if options.conditions:
                 stage.progress.update("closed_loop", 0.9, "conditions")
                 bench = ConditionBench(
-                    controller=controller,
+                    controller=law,
                     reference_filter=reference_filter,
                     posterior=posterior,
                     source=_simulated(stage),
@@ -92,6 +94,9 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             if tip is not None:
                 shown = tip, tip.sample(stage.rng("closed_loop", "performance"), options.draws)
             achieved = run_on_draws(controller, (posterior, own), shown, trial, **_steps(options))
+        if options.sensitivity and results.identify.friction is not None:
+            stage.progress.update("closed_loop", 0.95, "friction")
+            friction = check_friction(stage, controller, trial.step, trial.half, sensitivity)
     model = None
     if reference_filter is not None and config.reference_filter is not None:
         model = model_answer(config.reference_filter.reference_model, trial.reference, controller.dt_s)
@@ -115,6 +120,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             achieved_runs=achieved,
             sensitivity=sensitivity,
             conditions=tuple(conditions),
+            friction=friction,
         )
     )
 

@@ -105,9 +105,9 @@ class ConditionBench:
         output_disturbance: Real | None = None,
         clip: float | None = None,
     ) -> ClosedLoopTrajectory:
-        """The loop on the posterior mean."""
+        """The loop on the posterior mean, which has no friction for a feed-forward to meet."""
         return simulate_draw(
-            law or self.controller,
+            replace(law or self.controller, feedforward=None),
             self.posterior,
             self.posterior.mean,
             self._filtered(reference),

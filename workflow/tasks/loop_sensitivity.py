@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.closed_loop import measure_sensitivity
+from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from workflow.config.run_config import SimulatedSource
@@ -22,7 +22,7 @@ Real = npt.NDArray[np.float64]
 
 _DRAWS = 3
 _PERIODS_SMALL = 4  # sensor noise weighs ten times as much there, too
-_SMALL = 0.1  # of the large excitation: friction weighs ten times as much
+SMALL = 0.1  # of the large excitation: friction weighs ten times as much
 _INPUT_SHARE = 0.7  # of the input's rms in the records of the fit that the loop's command may take
 _CREST = 4.0  # peak over rms that a multisine's command stays below
 _LINES_BELOW_PEAK = 20
@@ -53,13 +53,13 @@ class SensitivityPlan:
     nominal_peak: float
     nominal_omega_rad_s: float
 
-    def excitation(self, *, small: bool = False) -> dict[str, Any]:
-        """Keywords of `measure_sensitivity`; `small` takes a tenth of the size."""
+    def excitation(self, share: float = 1.0) -> dict[str, Any]:
+        """Keywords of `sensitivity_of` for this share of the large size."""
         return {
-            "rms": self.rms * (_SMALL if small else 1.0),
+            "rms": self.rms * share,
             "band_rad_s": self.band_rad_s,
             "period_samples": self.period_samples,
-            "periods": _PERIODS_SMALL if small else 1,
+            "periods": _PERIODS_SMALL if share <= SMALL else 1,
             "draws": _DRAWS,
             "lead_in_periods": self.lead_in_periods,
         }
@@ -100,31 +100,19 @@ def plan_sensitivity(
 
 def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samples: int) -> SensitivityCheck:
     """The peak of S on the simulated arm, large and small, beside prediction and certified bound."""
-    config, certificate, source = stage.config, stage.results.certify.certificate, stage.config.source
+    certificate = stage.results.certify.certificate
     assert certificate is not None
-    assert isinstance(source, SimulatedSource)
-    options = config.closed_loop
-    input_rms = rms_of([record.input for record in stage.results.records.fitted(config.control_channel)])
-    plan = plan_sensitivity(controller, stage.plant, input_rms, transient_samples)
+    options, plan = stage.config.closed_loop, sensitivity_plan(stage, controller, transient_samples)
     certified = certificate.plants[0].worst_peak_sensitivity
-    arms: list[tuple[str, tuple[dict[str, Any], ...], bool]] = [
-        ("arm as identified", (), False),
-        ("arm as identified, a tenth of the size", (), True),
+    arms: list[tuple[str, tuple[dict[str, Any], ...], float]] = [
+        ("arm as identified", (), 1.0),
+        ("arm as identified, a tenth of the size", (), SMALL),
     ]
     if options.effects:
-        arms.append(("arm of the closed-loop check", options.effects, False))
+        arms.append(("arm of the closed-loop check", options.effects, 1.0))
     rows = []
-    for number, (name, effects, small) in enumerate(arms):
-        arm = EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", str(number)))
-        found = measure_sensitivity(
-            controller,
-            ClippedMachine(arm, FINITE),
-            stage.rng("closed_loop", "sensitivity", str(number)),
-            **plan.excitation(small=small),
-            measured_index=OUTPUT_NAMES.index(config.control_channel.output),
-            measurement_step=options.measurement_step,
-            command_step=options.quantisation,
-        )
+    for number, (name, effects, share) in enumerate(arms):
+        found = measured_on_arm(stage, controller, plan.excitation(share), str(number), effects)
         peak, std, omega = found.peak
         rows.append(
             MeasuredPeak(
@@ -144,4 +132,35 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
         )
     return SensitivityCheck(
         plan.nominal_peak, plan.nominal_omega_rad_s, certified, plan.band_rad_s, tuple(rows)
+    )
+
+
+def sensitivity_plan(stage: StageInput, controller: Controller, transient_samples: int) -> SensitivityPlan:
+    """For the plant and the records of the fit of a run."""
+    used = stage.results.records.fitted(stage.config.control_channel)
+    return plan_sensitivity(
+        controller, stage.plant, rms_of([record.input for record in used]), transient_samples
+    )
+
+
+def measured_on_arm(
+    stage: StageInput,
+    controller: Controller,
+    excitation: Mapping[str, Any],
+    name: str,
+    effects: Sequence[Mapping[str, Any]] = (),
+) -> MeasuredSensitivity:
+    """S on the simulated arm with further effects; the name tells its phases and its noise from others'."""
+    source, options = stage.config.source, stage.config.closed_loop
+    assert isinstance(source, SimulatedSource)
+    return measure_sensitivity(
+        controller,
+        ClippedMachine(
+            EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", name)), FINITE
+        ),
+        stage.rng("closed_loop", "sensitivity", name),
+        **excitation,
+        measured_index=OUTPUT_NAMES.index(stage.config.control_channel.output),
+        measurement_step=options.measurement_step,
+        command_step=options.quantisation,
     )

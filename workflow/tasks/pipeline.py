@@ -147,8 +147,9 @@ def _keep_controller(results: RunResults) -> None:
     design, certify = results.design, results.certify
     written: list[Path] = []
     if design.synthesis is not None and certify.certificate is not None:
-        law, found = design.synthesis.controller, results.reference_filter.filter
-        written = write_controller(results.run.path, law, found, certified=certify.certified)
+        second = results.reference_filter
+        law = second.law(design.synthesis.controller)
+        written = write_controller(results.run.path, law, second.filter, certified=certify.certified)
     for name in CONTROLLER_FILES:
         if results.run.path / name not in written:
             (results.run.path / name).unlink(missing_ok=True)

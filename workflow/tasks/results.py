@@ -6,7 +6,7 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar
 
@@ -16,6 +16,8 @@ import numpy.typing as npt
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import StepMetrics
 from control_design.analysis.joint_coverage import JointCoverage
+from control_design.controllers.controller import Controller
+from control_design.controllers.feedforward import FrictionFeedforward
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
 from control_design.plants.plant_set import Channel as PlantChannel
@@ -354,10 +356,16 @@ class CertifyResult:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFilterResult:
-    """filter: None where none was asked for, or where none is possible (reason)."""
+    """filter: None where none was asked for, or where none is possible (reason); feedforward: of the
+    friction, where asked for."""
 
     filter: ReferenceFilter | None = None
     reason: str | None = None
+    feedforward: FrictionFeedforward | None = None
+
+    def law(self, controller: Controller) -> Controller:
+        """The controller as it runs, with its feed-forward."""
+        return replace(controller, feedforward=self.feedforward)
 
 
 # Closed loop
@@ -416,6 +424,64 @@ class SensitivityCheck:
 
 
 @dataclass(frozen=True, eq=False)
+class SlowSine:
+    """Errors (T,) of the loop on a slow sine, without and with friction feed-forward.
+
+    linear_rms: of the loop on the arm without friction. The errors are those measured on the machine, or
+    those of the identified arm with its friction where there is no machine.
+    """
+
+    amplitude: float
+    omega_rad_s: float
+    linear_rms: float
+    without: Real
+    given: Real
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Of the error, without and with feed-forward."""
+        return float(np.sqrt(np.mean(self.without**2))), float(np.sqrt(np.mean(self.given**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionCheck:
+    """The loop on the identified arm with its dry friction.
+
+    level: in units of the command, with its interval; presliding: the deflection before slipping, taken as
+    known. sizes (N,): rms of the reference, falling; low, high (N,): 95 % interval of the peak of |S| as it
+    would be measured, measured (N,): the peak on the machine, None without one. certified_from: size from
+    which on, up to the largest, `high` exceeds the certified peak by at most tolerance_percent; linear_from:
+    from which on the middle of the interval is that near to the peak of the linear prediction; None where not
+    even at the largest. sticking_step: largest step after which the arm does not leave its pre-sliding;
+    error_at_rest: largest error with which it may rest.
+    """
+
+    level: float
+    level_interval: Interval
+    presliding: float
+    sizes: Real
+    low: Real
+    high: Real
+    measured: Real | None
+    nominal_peak: float
+    certified_peak: float
+    tolerance_percent: float
+    certified_from: float | None
+    linear_from: float | None
+    sticking_step: float
+    sticking_interval: Interval
+    error_at_rest: float
+    error_interval: Interval
+    tracking: SlowSine
+
+    @property
+    def inside(self) -> int:
+        """How many of the measured peaks lie inside their intervals."""
+        assert self.measured is not None
+        return int(np.sum((self.low <= self.measured) & (self.measured <= self.high)))
+
+
+@dataclass(frozen=True, eq=False)
 class ConditionRun:
     """The loop under one other condition beside its prediction, (T,) each; percentages are of `size`, the
     move or the predicted swing."""
@@ -463,6 +529,7 @@ class LoopCheck:
     achieved_runs: LoopRuns
     sensitivity: SensitivityCheck | None = None
     conditions: tuple[ConditionRun, ...] = ()
+    friction: FrictionCheck | None = None
 
     @property
     def draws(self) -> int:

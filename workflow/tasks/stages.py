@@ -5,12 +5,14 @@ What each leaves behind is a type of `workflow.tasks.results`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 from workflow.engine.errors import naming
 from workflow.tasks.achievable_performance import UNKNOWN_TO_BRACKET, find_bracket
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import certify_asked, find_design
+from workflow.tasks.friction_check import friction_feedforward
 from workflow.tasks.identification import identify_channels
 from workflow.tasks.records import make_records
 from workflow.tasks.reference_filter import find_filter
@@ -57,14 +59,18 @@ def certify_controller(stage: StageInput) -> CertifyResult:
 
 
 def design_filter(stage: StageInput) -> ReferenceFilterResult:
-    """The filter with its worst-case errors; nothing where none is asked for or no controller is there."""
+    """The filter with its worst-case errors, and the friction's feed-forward; nothing where none is asked for
+    or no controller is there."""
     settings, synthesis = stage.config.reference_filter, stage.results.design.synthesis
-    if settings is None:
-        return ReferenceFilterResult()
     if synthesis is None or stage.results.certify.certificate is None:
-        return ReferenceFilterResult(reason="no reference filter: there is no controller")
+        return ReferenceFilterResult(
+            reason=None if settings is None else "no reference filter: there is no controller"
+        )
     with naming("reference filter"):
-        return find_filter(synthesis.controller, [stage.plant], settings)
+        found = find_filter(synthesis.controller, [stage.plant], settings)
+    if stage.config.closed_loop.friction_feedforward:
+        found = replace(found, feedforward=friction_feedforward(stage, synthesis.controller))
+    return found
 
 
 _PLANT = ("identify", "uncertainty")
@@ -115,7 +121,7 @@ STAGES: tuple[Stage, ...] = (
         (*_PLANT, "design", "certify"),
         design_filter,
         0.1,
-        uses={"reference_filter": True},
+        uses={"reference_filter": True, "closed_loop": {"friction_feedforward"}},
     ),
     Stage(
         "closed_loop",

@@ -1,0 +1,164 @@
+"""The loop on an arm with dry friction: linear limit, statics, and its feed-forward on an exact friction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from control_design import Controller, simulate
+from control_design.analysis.closed_loop import measure_sensitivity
+from control_design.controllers.feedforward import FrictionFeedforward
+from ident import GobfModel, IdentOptions, Poles, Record, Structure
+from ident.friction import FrictionFit, fit_friction
+from ident.friction.arm import SteppedArm
+from plant import SampledArm, parse_effect
+from plant.presets import paper_link
+from workflow.tasks.friction_check import holds_from
+from workflow.tasks.friction_loop import FrictionLoop, drawn, interval_of
+
+DT_S = 0.005
+POLES = Poles(np.array([0.97]), np.array([0.93 + 0.24j]))
+
+
+def fit(level: float = 0.04, level_std: float = 0.0) -> FrictionFit:
+    """An integrating arm with a motor's pole and a mode, delayed by a sample; known but for its level."""
+    model = GobfModel(POLES, np.array([0.01, 0.002, -0.001]), DT_S, integrators=1, input_delay_samples=1)
+    arm = SteppedArm.of(POLES, Structure(integrators=1, input_delay_samples=1), DT_S)
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 400))
+    doubled = GobfModel(POLES.doubled(), np.zeros(6), DT_S)
+    rows = np.array(
+        [replace(doubled, coefficients=unit).frequency_response(np.angle(z) / DT_S) for unit in np.eye(6)]
+    ).T
+    wanted = GobfModel(POLES, model.coefficients, DT_S).frequency_response(np.angle(z) / DT_S)
+    stacked = np.vstack([rows.real, rows.imag]), np.append(wanted.real, wanted.imag)
+    coefficients = np.linalg.lstsq(*stacked, rcond=None)[0]
+    factor = np.zeros((7, 7))
+    factor[-1, -1] = level_std
+    return FrictionFit(level, level_std, model, arm, coefficients, factor, 1e-3, 1e-5)
+
+
+def controller(**fields) -> Controller:
+    """A lead around ten rad/s with a static gain of 5."""
+    return Controller([[0.8]], [[1.0]], [[-1.4]], [[12.0]], DT_S, **fields)
+
+
+EXCITATION = {"rms": 0.1, "band_rad_s": (1.0, 60.0), "period_samples": 2000, "lead_in_periods": 2}
+
+
+def test_without_friction_it_is_the_linear_loop():
+    """|S| on the lines is 1 / (1 + G K), to what the doubled poles span (a few parts in a million)."""
+    found = replace(fit(), noise_std=0.0)
+    rng = np.random.default_rng(1)
+    seen = FrictionLoop(controller(), found, found.coefficients, 0.0).sensitivity(rng, rng, **EXCITATION)
+    omega = seen.omega_rad_s
+    expected = 1 / (1 + found.model.frequency_response(omega) * controller().response(omega))
+    np.testing.assert_allclose(seen.response, expected, rtol=0, atol=2e-5)
+    assert seen.peak[0] > 1.05, "a loop whose S has no peak would show nothing"
+
+
+def test_arm_at_rest_holds_what_its_level_allows():
+    """Any step: at the end the command is held by the friction, and one size comes close to the bound."""
+    loop = FrictionLoop.of(controller(), fit())
+    assert loop.error_at_rest == pytest.approx(0.04 / 5, rel=1e-4)
+    left = [1 - loop.run(np.full(4000, size)).measured[-1] / size for size in (0.002, 0.005, 0.02, 0.3)]
+    errors = np.abs(np.array(left) * [0.002, 0.005, 0.02, 0.3])
+    assert np.all(errors <= loop.error_at_rest * (1 + 1e-3))
+    assert np.max(errors) > 0.5 * loop.error_at_rest
+
+
+def test_sticking_grows_with_the_level_and_needs_friction():
+    """A deflection of given width at twice the level is the same arm at twice the size but for its stiffness:
+    here, slow against it, the step doubles."""
+    one, two = (FrictionLoop.of(controller(), fit(level)).sticking_step(1500) for level in (0.04, 0.08))
+    assert two == pytest.approx(2 * one, rel=0.1)
+    # The command's largest answer to a unit of error is its first, 12.
+    assert 0.5 * 0.04 / 12 < one < 1.02 * 0.04 / 12
+    assert FrictionLoop.of(controller(), fit(0.0)).sticking_step(1500) == 0.0
+
+
+def test_draws_spread_as_the_level_is_known():
+    levels = [loop.level for loop in drawn(controller(), fit(0.04, 0.002), np.random.default_rng(2), 400)]
+    assert np.mean(levels) == pytest.approx(0.04, abs=4 * 0.002 / 20)
+    assert np.std(levels) == pytest.approx(0.002, rel=0.15)
+
+
+def test_interval_holds_one_more_value_as_often_as_it_says():
+    rng = np.random.default_rng(3)
+    held = 0
+    for _ in range(1000):
+        *seen, new = np.exp(0.1 * rng.standard_normal(9))
+        low, high = interval_of(seen)
+        held += low <= new <= high
+    # Binomial: standard deviation 6.9.
+    assert abs(held - 950) < 28
+
+
+def test_a_claim_holds_from_where_its_excess_passes_zero():
+    sizes = np.array([1.0, 0.1, 0.01])
+    assert holds_from(sizes, np.array([-1.0, 1.0, -1.0])) == pytest.approx(10**-0.5)
+    assert holds_from(sizes, np.array([-1.0, -1.0, 0.0])) == 0.01
+    assert holds_from(sizes, np.array([0.1, -1.0, -1.0])) is None
+
+
+class Slider:
+    """y+ = y + gain dt (u - friction), with the friction that Coulomb's law gives a body without mass."""
+
+    dt_s, gain = DT_S, 2.0
+
+    def __init__(self, level: float) -> None:
+        self.level = level
+
+    def reset(self) -> None:
+        self.y = 0.0
+
+    def measure(self):
+        return np.array([self.y])
+
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        self.y += self.gain * DT_S * (u - np.clip(u, -self.level, self.level))
+
+
+def test_feedforward_is_the_friction_of_a_pure_integrator():
+    """Its loop is a lag of first order, so that what the feed-forward follows is the output: friction and
+    feed-forward cancel wherever the lag exceeds the width, and elsewhere the slider stands."""
+    gain, level, width = 5.0, 0.3, 1e-4
+    lag_s = -DT_S / np.log(1 - gain * Slider.gain * DT_S)
+    plain = Controller.proportional(gain, DT_S, computational_delay_samples=0)
+    law = replace(plain, feedforward=FrictionFeedforward(level, width, lag_s))
+    time_s = np.arange(4000) * DT_S
+    reference = np.interp(time_s, [0, 2, 5, 8, 12, 20], [0, 0.5, 0.5, -0.3, 0.2, 0.2])
+    linear = simulate(plain, Slider(0.0), reference).measured
+    given = simulate(law, Slider(level), reference).measured
+    without = simulate(plain, Slider(level), reference).measured
+    assert np.max(np.abs(given - linear)) < width
+    assert np.max(np.abs(without - linear)) > 0.9 * level / gain
+
+
+def test_predicted_response_is_that_of_the_nonlinear_arm():
+    """Noise aside: arm and friction from records of the nonlinear arm, S where friction changes it by 5 %."""
+    arm = SampledArm(paper_link(), [parse_effect({"name": "coulomb_friction", "torque_Nm": 0.05})], None)
+    rng, records = np.random.default_rng(4), []
+    for name in ("one", "two"):
+        arm.reset()
+        voltage, angle = 6.0 * np.repeat(np.sign(rng.standard_normal(400)), 4), []
+        for u in voltage:
+            angle.append(arm.measure()[0])
+            arm.advance(u)
+        noisy = np.array(angle) + 1e-4 * rng.standard_normal(voltage.size)
+        records.append(Record(name, voltage[:, None], noisy[:, None], DT_S, ("voltage_V",), ("y",)))
+    options = IdentOptions(integrators=1, n_real=1, n_pairs=2, omega_min_rad_s=30.0, decay_min_per_s=1.0)
+    found = replace(fit_friction(records, options), noise_std=0.0)
+    law = Controller([[0.75]], [[1.0]], [[-3.5]], [[20.0]], DT_S)
+    excitation = EXCITATION | {"rms": 0.02}
+    truth = measure_sensitivity(law, arm, np.random.default_rng(5), **excitation).response
+    seen, linear = (
+        FrictionLoop(law, found, found.coefficients, level)
+        .sensitivity(np.random.default_rng(5), rng, **excitation)
+        .response
+        for level in (found.level, 0.0)
+    )
+    away, linear_away = (np.sqrt(np.mean(np.abs(one - truth) ** 2)) for one in (seen, linear))
+    assert linear_away > 0.05
+    assert away < 0.002
