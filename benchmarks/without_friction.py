@@ -22,7 +22,7 @@ from ident import Record, identify
 from ident.data.arrays import ComplexArray, RealArray
 from ident.friction import fit_friction, other_output_without_friction, without_friction
 from plant.modal import linear_arm
-from workflow.config.run_config import RunConfig, SimulatedSource, built_in_config
+from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.simulated_rig import rig_of, simulate_record
 
 FRICTIONS_NM = (0.0, 0.005, 0.02, 0.1)
@@ -31,10 +31,8 @@ OMEGA_RAD_S = np.geomspace(0.63, 627.0, 91)
 BANDS = [(low <= OMEGA_RAD_S) & (high > OMEGA_RAD_S) for low, high in itertools.pairwise(EDGES_RAD_S)]
 
 
-def with_friction(config: RunConfig, torque_Nm: float, counts: int) -> SimulatedSource:
-    """The arm of the configuration with dry friction of this size and an encoder of so many counts a turn."""
-    source = config.source
-    assert isinstance(source, SimulatedSource)
+def with_friction(source: SimulatedSource, torque_Nm: float, counts: int) -> SimulatedSource:
+    """The arm with dry friction of this size and an encoder of so many counts a turn."""
     kept = tuple(effect for effect in source.effects if effect["name"] != "coulomb_friction")
     friction = ({"name": "coulomb_friction", "torque_Nm": torque_Nm},) if torque_Nm else ()
     return source.model_copy(
@@ -64,9 +62,10 @@ def per_band(values: RealArray) -> list[float]:
 def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> None:
     config, _ = built_in_config()
     hub, tip = config.channels
+    assert isinstance(config.source, SimulatedSource)
     out(f"encoder {counts} counts a turn; bands from 0.63 rad/s, half a decade each")
     for torque_Nm in FRICTIONS_NM:
-        source = with_friction(config, torque_Nm, counts)
+        source = with_friction(config.source, torque_Nm, counts)
         motor = rig_of(source).motor
         truth = true_responses(source, OMEGA_RAD_S).T
         found = np.zeros((3, seeds, 2, OMEGA_RAD_S.size))

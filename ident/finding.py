@@ -62,6 +62,13 @@ class FindingKind(Enum):
     TWO_STAGE = auto()
     UNEXPLAINED_INPUT = auto()
     FIRST_STAGE_ERROR = auto()
+    # Noise and nonlinear distortion.
+    LINEAR = auto()
+    DISTORTED = auto()
+    NOISE_HIDES = auto()
+    ONE_REALISATION = auto()
+    ONE_PERIOD = auto()
+    NOT_PERIODIC = auto()
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,17 @@ import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from ident.data.distortion import distortion_of
+from ident.data.record import Record
 from ident.uncertainty import FrequencyUncertainty
+from plant import paper_link
 from tests.workflow import report_examples as example
 from workflow.figures import style
 from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees
 from workflow.figures.bode import draw_bode
 from workflow.figures.closed_loop import draw_closed_loop
+from workflow.figures.distortion import draw_distortion
+from workflow.figures.excitation import draw_excitation
 from workflow.figures.nyquist import uncertain_loop
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import draw_records
@@ -29,6 +34,7 @@ from workflow.figures.repeats import draw_repeat_scatter
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.subjects import RunView
 from workflow.report import rendering
+from workflow.tasks.experiment import Limits, plan_experiment
 from workflow.tasks.results import LoopCheck, LoopRuns, RunRecord, RunResults
 from workflow.tasks.summary import summarise
 
@@ -97,6 +103,16 @@ def has_titles_units_and_a_legend(figure: Figure) -> None:
 
 def same_row(one, other) -> bool:
     return one.get_subplotspec().rowspan == other.get_subplotspec().rowspan
+
+
+def test_pictures_of_a_planned_experiment():
+    limits = Limits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
+    plan = plan_experiment(limits, seed=1, realisations=2)
+    steady = np.tile(plan.voltages_V, 2)  # a gain of one, as it stands
+    records = [Record(str(k), u[:, None], u[:, None], 0.005, ("u",), ("y",)) for k, u in enumerate(steady[0])]
+    for figure in (draw_excitation(plan), draw_distortion(distortion_of(records), ("V", "rad"))):
+        has_titles_units_and_a_legend(figure)
+        is_whole(figure)
 
 
 @pytest.mark.parametrize("names", [(), (HOSTILE, HOSTILE)], ids=["plain", "hostile"])

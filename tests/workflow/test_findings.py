@@ -73,6 +73,15 @@ VALUES = {
     "most_percent": 95.0,
     "explained_percent": 12.3,
     "relative_std": 0.0342,
+    "rms": 4.0012,
+    "unit": "V",
+    "percent": 2.345,
+    "from_Hz": 0.2,
+    "to_Hz": 31.62,
+    "parity": "odd",
+    "trend": "falls",
+    "lines": 61,
+    "n_records": 2,
 }
 # Other values that lead to other words.
 OTHERWISE = {
@@ -87,6 +96,9 @@ OTHERWISE = {
     ],
     "NOT_WHITE": [{"independent": False}, {"noise_order": 8}, {"noise_order": 8, "independent": False}],
     "CHI_SQUARE": [{"chi_square": 100.0}, {"chi_square": 400.0}],
+    "DISTORTED": [{"trend": "grows"}, {"parity": "both", "trend": "unknown"}, {"parity": "unknown"}],
+    "ONE_REALISATION": [{"lines": 0}],
+    "NOT_PERIODIC": [{"from_Hz": 0.0, "to_Hz": 0.0}],
     "INVALIDATION": [{"invalidated": True}, {"outside": 2}],
 }
 

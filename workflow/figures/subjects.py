@@ -20,7 +20,10 @@ from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.basis.options import IdentOptions
+from ident.checks.distortion_findings import distortion_findings
+from ident.data.distortion import Distortion, distortion_of
 from ident.data.record import Record
+from ident.finding import Finding
 from ident.friction import FrictionFit
 from workflow.config.run_config import Channel, RunConfig
 from workflow.figures.bands import Complex, Real
@@ -38,14 +41,16 @@ LIGHT = 0.3  # damping ratio below which a pole pair is called lightly damped
 class ChannelView:
     """One channel: model, ellipses, options of the fit, and the records behind the free runs `found.fresh`.
 
-    units: of input and output, empty where nobody stated them. file: what tells its pictures from those of
-    another channel. closed_loop: poles (n,) of the loop around it, where there is one.
+    measured: records of the fit, as measured. units: of input and output, empty where nobody stated them.
+    file: what tells its pictures from those of another channel. closed_loop: poles (n,) of the loop around
+    it, where there is one.
     """
 
     found: IdentifiedChannel
     spread: UncertainChannel
     options: IdentOptions
     fresh_records: tuple[Record, ...]
+    measured: tuple[Record, ...] = ()
     units: tuple[str, str] = ("", "")
     file: str = ""
     closed_loop: Complex | None = None
@@ -53,6 +58,15 @@ class ChannelView:
     @property
     def name(self) -> str:
         return self.found.name
+
+    @cached_property
+    def distortion(self) -> tuple[tuple[Distortion, ...], list[Finding], str]:
+        """Levels of noise and distortion, what they say, and why there are none where the records refuse."""
+        try:
+            found = distortion_of(self.measured)
+        except ValueError as error:
+            return (), [], str(error)
+        return found, distortion_findings(self.measured, found), ""
 
     @property
     def light(self) -> list[tuple[int, ModelMode]]:
@@ -130,7 +144,9 @@ def log_channel(result: LogIdentification) -> ChannelView:
     """The channel of `flexlink identify`."""
     first = result.measured[0]
     units = "".join(first.input_units[:1]), "".join(first.output_units[:1])
-    return ChannelView(result.about, result.spread, result.options, result.fresh_records, units)
+    return ChannelView(
+        result.about, result.spread, result.options, result.fresh_records, result.measured, units
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +173,7 @@ class RunView:
             self.results.uncertainty.channels[index],
             channel.identification,
             tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in found.fresh),
+            tuple(self.results.records.fitted(channel)),
             (self.unit(found.model.input_name), self.unit(found.model.output_name)),
             f"{index + 1}-{slug}".strip("-"),
             closed_loop_poles(self.controller, self.plant) if with_loop else None,

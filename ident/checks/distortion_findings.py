@@ -1,0 +1,110 @@
+"""What the levels of noise and distortion say: linear, and how far, or distorted, where and of which kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.checks.input_checks import clipped
+from ident.data.distortion import BandLevel, Distortion
+from ident.data.nonparametric import coherence
+from ident.data.record import Record
+from ident.finding import Finding, FindingKind, Value, finding
+
+# Distortion above this share of the response is told where it is; a linear design need not mind less.
+_WORTH_TELLING = 0.01
+# A band in which noise would hide this much says nothing.
+_HIDDEN = 0.05
+# One kind is told where its power is this many times the other's; a trend where the level changes so much.
+_CLEARLY, _TREND = 4.0, 1.25
+
+
+def distortion_findings(records: Sequence[Record], found: Sequence[Distortion]) -> list[Finding]:
+    """Verdicts about records with one input and output, from `distortion_of` them.
+
+    Of records that are not periodic: noise and distortion together, by their coherence.
+    """
+    periodic = {name for levels in found for name in levels.names}
+    rest = [record for record in records if record.name not in periodic]
+    unit = "".join(records[0].input_units[:1]) if records else ""
+    told = [item for levels in found for item in _verdict(levels, found, unit)]
+    if rest:
+        omega, coherent = (np.concatenate(part) for part in zip(*(coherence([r]) for r in rest), strict=True))
+        share = np.sqrt(1 / np.clip(coherent, 1e-12, 1.0) - 1)
+        seen = omega[share < _HIDDEN] / (2 * np.pi)
+        values = {"from_Hz": seen.min(), "to_Hz": seen.max()} if seen.size else {"from_Hz": 0.0, "to_Hz": 0.0}
+        told.append(finding(FindingKind.NOT_PERIODIC, n_records=len(rest), percent=100 * _HIDDEN, **values))
+    if found:
+        told += [item for item in clipped(records) if item.values["signal"] == "output"]
+    return told
+
+
+def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) -> list[Finding]:
+    told: list[Finding] = []
+    about: dict[str, Value] = {"rms": levels.rms, "unit": unit}
+    if levels.realisations < 2:
+        told.append(finding(FindingKind.ONE_REALISATION, **about, lines=_n_detection(levels)))
+    if levels.noise_std is None:
+        told.append(finding(FindingKind.ONE_PERIOD, **about))
+    bands = [band for band in _bands(levels) if band is not None]
+    usable = [band for band in bands if band.significant or band.interval[1] <= _HIDDEN]
+    if not bands or levels.noise_std is None:
+        return told
+    if not usable:
+        return [*told, finding(FindingKind.NOISE_HIDES, **about, percent=100 * _HIDDEN)]
+    distorted = [band for band in usable if band.significant and band.distortion > _WORTH_TELLING]
+    where = distorted or usable
+    ends = {"from_Hz": where[0].from_rad_s / (2 * np.pi), "to_Hz": where[-1].to_rad_s / (2 * np.pi)}
+    if not distorted:
+        limit = 100 * max(band.interval[1] for band in usable)
+        return [*told, finding(FindingKind.LINEAR, **about, percent=limit, **ends)]
+    percent = 100 * max(band.distortion for band in distorted)
+    kind, trend = _kind(levels, distorted), _trend(levels, all_levels, distorted)
+    return [
+        *told,
+        finding(FindingKind.DISTORTED, **about, percent=percent, parity=kind, trend=trend, **ends),
+    ]
+
+
+def _n_detection(levels: Distortion) -> int:
+    return sum(lines.omega_rad_s.size for lines in (levels.odd, levels.even) if lines is not None)
+
+
+def _bands(levels: Distortion) -> list[BandLevel | None]:
+    """Distortion in every band: between realisations, or at the odd detection lines where there is one."""
+    lines = levels.excited or levels.odd
+    return [] if lines is None else [lines.within(*band) for band in levels.bands_rad_s]
+
+
+def _kind(levels: Distortion, distorted: Sequence[BandLevel]) -> str:
+    """odd, even or both, by the detection lines; unknown without them."""
+    power = {"odd": 0.0, "even": 0.0}
+    for name, lines in (("odd", levels.odd), ("even", levels.even)):
+        if lines is None:
+            return "unknown"
+        for band in distorted:
+            level = lines.within(band.from_rad_s, band.to_rad_s)
+            if level is not None:
+                power[name] += level.distortion**2
+    # Even lines are the only place of even distortion where only odd lines are excited.
+    if power["odd"] > _CLEARLY * power["even"]:
+        return "odd"
+    return "even" if power["even"] > _CLEARLY * power["odd"] else "both"
+
+
+def _trend(levels: Distortion, every: Sequence[Distortion], distorted: Sequence[BandLevel]) -> str:
+    """How its share of the response changes when the amplitude grows: falls, grows, same, or unknown."""
+    other = every[0] if levels is every[-1] else every[-1]
+    if other is levels:
+        return "unknown"
+    ratios = []
+    for band in distorted:
+        lines = other.excited or other.odd
+        there = None if lines is None else lines.within(band.from_rad_s, band.to_rad_s)
+        if there is not None and there.distortion > 0:
+            ratios.append(there.distortion / band.distortion)
+    if not ratios:
+        return "unknown"
+    ratio = float(np.median(ratios)) if other.rms > levels.rms else 1 / float(np.median(ratios))
+    return "falls" if ratio < 1 / _TREND else "grows" if ratio > _TREND else "same"
