@@ -204,8 +204,6 @@ def diagnose(
 ) -> Diagnosis:
     """Search, weigh, and answer.
 
-    Parameters
-    ----------
     case
         A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
     progress

@@ -103,8 +103,6 @@ def identify_frf(
 ) -> FrfIdentification:
     """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
-    Parameters
-    ----------
     response : FrequencyUncertainty
         Measurement with a covariance at every frequency (`from_csv`, `FrfRepeats.mean`, `empirical_frf`).
         Errors of different frequencies are taken as independent. One that all of them share (the amplitude
@@ -118,14 +116,9 @@ def identify_frf(
     shared_gain_std : float
         Relative standard deviation of a real factor common to all frequencies; widens the posterior.
 
-    Raises
-    ------
-    ValueError
-        If a frequency has no covariance, there are too few frequencies for the order asked for, or an option
-        asks for an offset, an initial state or a relative degree.
+    Raises ValueError if a frequency has no covariance, there are too few frequencies for the order asked for,
+    or an option asks for an offset, an initial state or a relative degree.
 
-    Notes
-    -----
     Poles by DIRECT in log coordinates and Levenberg-Marquardt, pair by pair; a pole is kept if chi-square
     falls by more than 2 ln Ne, Ne the measured real numbers (two per frequency) as far as the residual is
     white over frequency, and chi-square divided by its excess over what the covariances explain. The result

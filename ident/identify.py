@@ -51,22 +51,15 @@ def identify(
 ) -> Identification:
     """Fit one GOBF model to all records together.
 
-    Parameters
-    ----------
     records : sequence of single-input single-output records of equal sampling time
         Each has its own nuisance columns (offset, initial state).
     options : IdentOptions
     progress : callable, optional
         Called with a fraction 0..1 and a short message.
 
-    Raises
-    ------
-    ValueError
-        If a record cannot be used (constant signal, several columns, other sampling time) or all of them
-        are too short for the order asked for.
+    Raises ValueError if a record cannot be used (constant signal, several columns, other sampling time) or
+    all of them are too short for the order asked for.
 
-    Notes
-    -----
     The result is deterministic: the same records and options give the same numbers.
     """
     options = options or IdentOptions()

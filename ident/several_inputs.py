@@ -38,8 +38,6 @@ def identify_miso(
 ) -> MisoIdentification:
     """Fit one model with shared poles to all inputs of all records together.
 
-    Parameters
-    ----------
     records : sequence of records of equal inputs, one output and equal sampling time
         Each has its own nuisance columns (offset, initial state). An input may rest in some records, so
         experiments that excite one motor at a time can be put together; over all records the inputs must be
@@ -50,14 +48,9 @@ def identify_miso(
     progress : callable, optional
         Called with a fraction 0..1 and a short message.
 
-    Raises
-    ------
-    ValueError
-        If a record cannot be used, the inputs of the records differ or are one signal, the data are too short
-        for the order asked for, or the options ask for a relative degree.
+    Raises ValueError if a record cannot be used, the inputs of the records differ or are one signal, the data
+    are too short for the order asked for, or the options ask for a relative degree.
 
-    Notes
-    -----
     Search, descent and choice of the order are those of `identify` on the joint cost; with one input the
     results agree. Deterministic: the same records and options give the same numbers.
     """

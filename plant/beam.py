@@ -95,10 +95,8 @@ def clamped_free_modes(
 ) -> BeamModes:
     """The first n_modes modes of the link, root clamped at the distance radius_m from the hub axis.
 
-    Raises
-    ------
-    ValueError
-        If stiffness, mass or length is not positive, tip mass or radius negative, or n_modes < 1.
+    Raises ValueError if stiffness, mass or length is not positive, tip mass or radius negative, or n_modes <
+    1.
     """
     positive = bending_stiffness_Nm2, mass_per_length_kg_m, length_m
     if not all(0 < value < np.inf for value in positive):

@@ -117,12 +117,9 @@ class Rig(_Checked):
     def from_toml(cls, path: str | os.PathLike[str]) -> Self:
         """Read a rig file.
 
-        Raises
-        ------
-        ValueError
-            One line with the file and the dotted key (or the line of a syntax error) and what was expected.
-        FileNotFoundError
-            If there is no such file.
+        Raises ValueError: one line with the file and the dotted key (or the line of a syntax error) and what
+        was expected.
+        Raises FileNotFoundError if there is no such file.
         """
         text = Path(path).read_bytes()
         try:

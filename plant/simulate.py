@@ -72,8 +72,6 @@ def simulate(
 ) -> Trajectory:
     """Drive a machine from rest with a held voltage.
 
-    Parameters
-    ----------
     rig, effects
         The machine.
     voltage_V : (T,)
@@ -89,10 +87,8 @@ def simulate(
     substep_s
         Longest step where the machine is not linear; see `plant.plan`.
 
-    Raises
-    ------
-    ValueError
-        One line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect given twice.
+    Raises ValueError: one line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect
+    given twice.
     """
     simulator = Simulator(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
     return simulator.run(voltage_V, rng=rng, hub_torque_Nm=hub_torque_Nm, tip_force_N=tip_force_N)

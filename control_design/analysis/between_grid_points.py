@@ -244,8 +244,6 @@ def bound_all_frequencies(
     its limit 1 where the dense maximum lies closer under it. modes: flexible modes of plant, controller and
     closed loop, where the first partition is finer.
 
-    Notes
-    -----
     Neglected: rounding errors of double precision, also those of the zeros and poles computed from the state
     spaces (the responses and ellipses so represented are compared with those of the dense check on the first
     partition, and the proof is refused beyond a relative difference of 1e-6).

@@ -104,10 +104,8 @@ def certify(
     requirement of its own: ellipses propagate parameters to first order, and no level of theirs speaks for
     draws far outside (`joint_synthesis` designs for it).
 
-    Raises
-    ------
-    ValueError
-        If the plants are none, sampling times or computational delays do not match, or the loop is algebraic.
+    Raises ValueError if the plants are none, sampling times or computational delays do not match, or the loop
+    is algebraic.
     """
     if not plants:
         raise ValueError("certify needs at least one plant")

@@ -63,10 +63,7 @@ class LinearMachine:
     def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
         """Hold the command for one sample.
 
-        Raises
-        ------
-        ValueError
-            If a disturbance torque is given and the system has no second input for it.
+        Raises ValueError if a disturbance torque is given and the system has no second input for it.
         """
         if self._b.shape[1] == 1:
             if hub_torque_Nm != 0.0:
@@ -123,8 +120,6 @@ def simulate(
     input_disturbance) until t_{k+1}. With no limits and no quantisation this is exactly the feedback of K
     z^-delay and the machine used in the loop analysis.
 
-    Parameters
-    ----------
     reference : (T,) array
         Set point at t_k, unit of the measured output.
     hub_torque_Nm, input_disturbance, output_disturbance : (T,) arrays, optional
@@ -132,10 +127,7 @@ def simulate(
     measurement_step, command_step : float
         Quantisation (mid-tread rounding) in output and input units; 0 = none.
 
-    Raises
-    ------
-    ValueError
-        If sampling times or lengths do not match, or a value is not finite.
+    Raises ValueError if sampling times or lengths do not match, or a value is not finite.
     """
     wanted = _signal("reference", reference, None)
     n = wanted.size
@@ -266,10 +258,8 @@ def sensitivity_of(
     come to its periodic motion. On a nonlinear machine the mean over draws is the best linear approximation
     for this spectrum and size, and the scatter between draws holds the distortion.
 
-    Raises
-    ------
-    ValueError
-        If the band holds no line of the period, or nothing would be left to take a scatter from.
+    Raises ValueError if the band holds no line of the period, or nothing would be left to take a scatter
+    from.
     """
     if periods < 1 or draws < 1 or periods * draws < 2:
         raise ValueError(f"a scatter needs two periods or two draws; got {periods} and {draws}")
@@ -322,10 +312,7 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.0
     All relative to the reference's own step: from its first to its last value, timed from the first sample
     that differs from the first value. Steady error is the mean error over the last tenth of the record.
 
-    Raises
-    ------
-    ValueError
-        If the reference is not a step (no change, or more than one level after the change).
+    Raises ValueError if the reference is not a step (no change, or more than one level after the change).
     """
     r, y, t = trajectory.reference, trajectory.measured, trajectory.time_s
     changed = np.flatnonzero(r != r[0])

@@ -85,11 +85,8 @@ def joint_coverage(
     of one plant; gamma(G) is then the largest over all of them. gamma(G) is taken on a grid of about a
     thousand frequencies, as is the worst case it is compared with.
 
-    Raises
-    ------
-    ValueError
-        If coverage is outside (0, 1), draws is below 100 or an uncertainty cannot be drawn from (a response
-        known on its own frequencies only says nothing about their correlation).
+    Raises ValueError if coverage is outside (0, 1), draws is below 100 or an uncertainty cannot be drawn from
+    (a response known on its own frequencies only says nothing about their correlation).
     """
     if not 0 < coverage < 1:
         raise ValueError(f"joint coverage must lie in (0, 1); got {coverage}")
@@ -249,10 +246,7 @@ def unstable_draws(
     """How many of `draws` sampled responses (of every plant) are unstable, and up to `most` different ones
     of each plant, as guards for another synthesis.
 
-    Raises
-    ------
-    ValueError
-        If an uncertainty cannot be drawn from.
+    Raises ValueError if an uncertainty cannot be drawn from.
     """
     unstable = np.zeros(draws, dtype=bool)
     guards: list[Guard] = []

@@ -44,10 +44,7 @@ class NominalLoop:
 def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
     """Poles (n,) of the feedback of plant and controller, delay states included.
 
-    Raises
-    ------
-    ValueError
-        If the loop is algebraic (1 + D_K D_G = 0) or the sampling times differ.
+    Raises ValueError if the loop is algebraic (1 + D_K D_G = 0) or the sampling times differ.
     """
     if not np.isclose(controller.dt_s, plant.dt_s, rtol=1e-9, atol=0):
         raise ValueError(

@@ -115,11 +115,8 @@ def design_reference_filter(
     the options; searched ones start spread around the model's and follow a simplex search on their
     logarithms.
 
-    Raises
-    ------
-    ValueError
-        If an ellipse reaches -1 (no reference filter helps), sampling times differ, or a pole is not in (0,
-        Nyquist).
+    Raises ValueError if an ellipse reaches -1 (no reference filter helps), sampling times differ, or a pole
+    is not in (0, Nyquist).
     """
     options = options or ReferenceFilterOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)

@@ -137,10 +137,7 @@ def youla_bracket(
     with the member as a factor (G S, T) enter the inscribed value by the centre alone and the other two by
     the largest |G|: on its safe side in each.
 
-    Raises
-    ------
-    SpecificationError
-        If specification and plants contradict each other.
+    Raises SpecificationError if specification and plants contradict each other.
     """
     options = options or YoulaOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)

@@ -82,10 +82,7 @@ def coprime_factors(plant: control.StateSpace) -> Factors:
     Y = 1 - F(zI - A_L)^-1 (B + L D), with A_F = A + B F, A_L = A + L C. Any stabilising pair gives all
     controllers; this one weighs output against an input that moves it equally.
 
-    Raises
-    ------
-    ValueError
-        If an unstable or marginal mode cannot be moved by the input or seen at the output.
+    Raises ValueError if an unstable or marginal mode cannot be moved by the input or seen at the output.
     """
     a, b, c, d = (np.asarray(getattr(plant, name), dtype=np.float64) for name in "ABCD")
     n, dt = a.shape[0], plant.dt

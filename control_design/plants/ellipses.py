@@ -88,11 +88,8 @@ class Ellipses:
     ) -> Ellipses:
         """Ellipse e^T P^-1 e <= chi2_2(level) of covariance P (F, 2, 2); the quantile is -2 ln(1 - level).
 
-        Raises
-        ------
-        ValueError
-            If level is outside (0, 1) or a covariance is not symmetric positive semi-definite (names the
-            frequency).
+        Raises ValueError if level is outside (0, 1) or a covariance is not symmetric positive semi-definite
+        (names the frequency).
         """
         if not 0 < level < 1:
             raise ValueError(f"{what}: level must lie in (0, 1); got {level}")

@@ -99,10 +99,7 @@ class Channel:
         that grid; outside the range the nominal response stands alone, without uncertainty (the certificate
         says so).
 
-        Raises
-        ------
-        ValueError
-            If a frequency is asked for at which the record has no ellipse.
+        Raises ValueError if a frequency is asked for at which the record has no ellipse.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         if self.uncertainty is None:

@@ -202,13 +202,8 @@ class Specification(BaseModel):
     def check_against(self, plants: Sequence[UncertainPlant]) -> None:
         """Refuse, before optimising, what no controller can do.
 
-        Raises
-        ------
-        SpecificationError
-            One line: which requirement, what limits it, by how much.
+        Raises SpecificationError: one line: which requirement, what limits it, by how much.
 
-        Notes
-        -----
         At a zero w of G outside the circle (also the one at z = infinity that a sample of delay makes) S(w) =
         1, hence max|W1 S| >= |W1(w)| for a stable loop. On the circle 1 = S + G K S gives gamma >= 1/(1/|W1|
         + |G|/|W3|). Both use the nominal plant, so they are necessary conditions only.

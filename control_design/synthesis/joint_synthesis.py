@@ -54,19 +54,13 @@ def synthesise_jointly(
 ) -> JointDesign:
     """`synthesise`, and again with guards until the share of stable draws is what is asked.
 
-    Parameters
-    ----------
     stable_share : of sampled responses that must be stable.
     draws : responses drawn after every design, fresh ones each time.
     rounds : designs with guards at most.
 
-    Raises
-    ------
-    SpecificationError
-        If specification and plants contradict each other (before optimising).
-    ValueError
-        If the share lies outside (0, 1), the draws are too few to show it, or an uncertainty cannot be drawn
-        from.
+    Raises SpecificationError if specification and plants contradict each other (before optimising).
+    Raises ValueError if the share lies outside (0, 1), the draws are too few to show it, or an uncertainty
+    cannot be drawn from.
     """
     if not 0 < stable_share < 1:
         raise ValueError(f"stable_share must lie in (0, 1); got {stable_share}")

@@ -44,20 +44,13 @@ def synthesise(
 ) -> SynthesisResult:
     """Design one controller for all plants: smallest gamma over every ellipse.
 
-    Parameters
-    ----------
     plants : at least one; several loads, operating points or identified models at once.
     rng : the starts are drawn from it; same generator state, same result.
     progress : called with (fraction, message).
     guards : single responses that must be stable as well, whatever the weights say of them.
 
-    Raises
-    ------
-    SpecificationError
-        If specification and plants contradict each other (before optimising).
+    Raises SpecificationError if specification and plants contradict each other (before optimising).
 
-    Notes
-    -----
     Every controller of order n - 2 is one of order n with a section whose zeros cancel its poles. The orders
     n - 2, n - 4, ... are therefore solved first, each with its own generator derived from `rng`, and handed
     upwards: with the same rng, plants and options two states more never give a larger gamma (from order 3 on

@@ -79,10 +79,7 @@ class SynthesisResult:
     def controller_or_raise(self) -> Controller:
         """The controller if the specification is met on the grid.
 
-        Raises
-        ------
-        SynthesisError
-            Otherwise, with this result attached.
+        Raises SynthesisError otherwise, with this result attached.
         """
         if self.outcome is not Outcome.MET_ON_GRID:
             blocks = (

@@ -42,10 +42,8 @@ ForkingPickler.register(control.StateSpace, _parts)  # for transport between our
 class WorkPool:
     """Does start tasks with `jobs` processes (1: in this one); use as a context manager.
 
-    Raises
-    ------
-    ValueError
-        If jobs > 1 and the plants cannot be sent to another process (an uncertainty made of local functions).
+    Raises ValueError if jobs > 1 and the plants cannot be sent to another process (an uncertainty made of
+    local functions).
     """
 
     def __init__(self, workshop: Workshop, jobs: int) -> None:

@@ -162,10 +162,7 @@ def best_of_sets(hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, ...], Hypo
 def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     """Probabilities from the evidence of everything that was fitted.
 
-    Raises
-    ------
-    ValueError
-        If there is no hypothesis.
+    Raises ValueError if there is no hypothesis.
     """
     if not hypotheses:
         raise ValueError("probabilities need at least one hypothesis")

@@ -39,16 +39,11 @@ class Discrepancy:
 def discrepancy(residuals: Real, segments: Sequence[int], outputs: int = 2) -> Discrepancy:
     """Bands of all records and outputs judged together.
 
-    Parameters
-    ----------
     residuals : (N,)
         Whitened, record after record, sample by sample.
     segments : samples of each record; N is `outputs` times their sum.
 
-    Raises
-    ------
-    ValueError
-        If the residuals are not as many as the segments say.
+    Raises ValueError if the residuals are not as many as the segments say.
     """
     if residuals.size != outputs * sum(segments):
         raise ValueError(

@@ -56,11 +56,8 @@ class Experiment:
 class Case(RecordedCase[Experiment]):
     """A rig as its makers know it, and what it did.
 
-    Raises
-    ------
-    ValueError
-        If there is no estimation or no held-out experiment, a name comes twice, or a noise level is zero
-        (then nothing can be said to lie beyond the noise).
+    Raises ValueError if there is no estimation or no held-out experiment, a name comes twice, or a noise
+    level is zero (then nothing can be said to lie beyond the noise).
     """
 
     name: str

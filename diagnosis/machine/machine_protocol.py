@@ -100,10 +100,7 @@ class RecordOfMachine(Protocol):
 class RecordedCase(ABC, Generic[Record]):
     """A machine and its records, in the order given.
 
-    Raises
-    ------
-    ValueError
-        If a role has no experiment or a name comes twice.
+    Raises ValueError if a role has no experiment or a name comes twice.
     """
 
     name: str

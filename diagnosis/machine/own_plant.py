@@ -263,11 +263,8 @@ class PlantExperiment:
 class PlantCase(RecordedCase[PlantExperiment]):
     """A plant as its makers know it, and what it did.
 
-    Raises
-    ------
-    ValueError
-        If a role has no experiment, a name comes twice, an output is constant (a dead sensor), or the
-        simulation does not give finite outputs of the measured shape for the first experiment.
+    Raises ValueError if a role has no experiment, a name comes twice, an output is constant (a dead sensor),
+    or the simulation does not give finite outputs of the measured shape for the first experiment.
     """
 
     name: str

@@ -27,10 +27,7 @@ _NOTICEABLE = 0.1
 def grid_step(signals: Sequence[Real], noise: float) -> float:
     """Common step of all values of these records of one sensor, 0 where there is none.
 
-    Raises
-    ------
-    ValueError
-        If the noise level is not above zero.
+    Raises ValueError if the noise level is not above zero.
     """
     if not noise > 0:
         raise ValueError(f"the noise level must be above zero; got {noise}")

@@ -82,8 +82,6 @@ def competing_hypotheses(
     A set that contains a more probable one, or lies within it, names the same cause and more or less beside
     it: they do not compete.
 
-    Parameters
-    ----------
     hypotheses
         Of `search`; the best of every set counts.
     sets

@@ -84,10 +84,7 @@ def excitations(
     Random binary (fast, slow), multisine (wide, odd lines at low frequency), doublet (short, long), slow
     triangle through reversals, steps with rests, chirp (up, and slow alone).
 
-    Raises
-    ------
-    ValueError
-        Fewer than 100 samples, or a voltage or period that is not positive.
+    Raises ValueError: fewer than 100 samples, or a voltage or period that is not positive.
     """
     if not n_samples >= 100:
         raise ValueError(f"an experiment needs at least 100 samples; got {n_samples}")

@@ -106,18 +106,13 @@ def next_experiment(
 ) -> NextExperiment:
     """Choose among `excitations` of n_samples within the limits, and two made for these hypotheses.
 
-    Parameters
-    ----------
     competing
         Two at least, all with the same sampling period and noise.
     rng
         Of the random excitations; without it a fixed sequence.
 
-    Raises
-    ------
-    ValueError
-        Fewer than two hypotheses, hypotheses that sample differently or are noise-free, no excitation that
-        stays in the limits.
+    Raises ValueError: fewer than two hypotheses, hypotheses that sample differently or are noise-free, no
+    excitation that stays in the limits.
     """
     competing = tuple(competing)
     _check(competing)

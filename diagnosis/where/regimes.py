@@ -43,10 +43,7 @@ class Motion:
 def motions(case: Case, residuals: Mapping[str, Real]) -> dict[str, Motion]:
     """What the model did in every experiment that has residuals.
 
-    Raises
-    ------
-    ValueError
-        If an experiment of the case has no residuals, or they are not (T, 2) and finite.
+    Raises ValueError if an experiment of the case has no residuals, or they are not (T, 2) and finite.
     """
     dt = case.rig.sampling.dt_s
     reach = case.rig.hub.radius_m + case.rig.link.length_m

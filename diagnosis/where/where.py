@@ -34,8 +34,6 @@ def where(
 ) -> Where:
     """Locate the gap.
 
-    Parameters
-    ----------
     residuals : experiment name -> (T, 2)
         (measured - model) / noise, standard deviation 1 where the model explains everything; every experiment
         of the case.
@@ -47,10 +45,7 @@ def where(
     rng
         Of the shifts and blocks; without it a fixed sequence, so that the same records give the same page.
 
-    Raises
-    ------
-    ValueError
-        Missing or misshaped residuals, a level outside (0, 1), an effect that does not exist.
+    Raises ValueError: missing or misshaped residuals, a level outside (0, 1), an effect that does not exist.
     """
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1; got {level}")
@@ -81,10 +76,7 @@ def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:
     "none" and "unknown" stay on their own. What comes from outside the machine (a periodic disturbance,
     gravity) counts as environment.
 
-    Raises
-    ------
-    ValueError
-        If a name is neither an effect of the registry nor none or unknown.
+    Raises ValueError if a name is neither an effect of the registry nor none or unknown.
     """
     mass = dict.fromkeys(("none", "actuator", "joint", "link", "sensor", "environment", "unknown"), 0.0)
     for name, value in probabilities.items():

@@ -31,10 +31,7 @@ class MisoModel:
     output_name : str
     integrators, input_delay_samples : int
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit, names repeat, a number is not finite or dt_s is not positive.
+    Raises ValueError if the shapes do not fit, names repeat, a number is not finite or dt_s is not positive.
     """
 
     poles: Poles

@@ -31,10 +31,7 @@ class GobfModel:
     integrators, input_delay_samples : int
     input_name, output_name : str
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit, a number is not finite or dt_s is not positive.
+    Raises ValueError if the shapes do not fit, a number is not finite or dt_s is not positive.
     """
 
     poles: Poles

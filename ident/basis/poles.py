@@ -22,13 +22,9 @@ class Poles:
     pairs : (P,) complex array
         One pole p of each conjugate pair, imag(p) > 0 and |p| < 1.
 
-    Raises
-    ------
-    ValueError
-        If a pole is not inside the unit circle, not finite, or a pair member is not above the real axis.
+    Raises ValueError if a pole is not inside the unit circle, not finite, or a pair member is not above the
+    real axis.
 
-    Notes
-    -----
     Equal poles are allowed (a basis may repeat a pole); the order is kept, because it fixes the order of the
     basis functions.
     """

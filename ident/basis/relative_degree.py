@@ -48,10 +48,7 @@ def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArra
     `poles` as in `GobfModel`: with integrators, the first real poles are the zeros that their filters cancel.
     Row k is C A_c^k B_c dt^(k + 1).
 
-    Raises
-    ------
-    ValueError
-        If a pole has no continuous-time counterpart, or there are fewer than r poles in all.
+    Raises ValueError if a pole has no continuous-time counterpart, or there are fewer than r poles in all.
     """
     return _functionals(poles, integrators, relative_degree, None, ())[0]
 

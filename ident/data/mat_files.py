@@ -12,10 +12,7 @@ def mat_variables(content: str | PathLike[str] | bytes, source: object) -> dict[
 
     content: a path, or the bytes of a file; source: what a complaint names.
 
-    Raises
-    ------
-    ValueError
-        If it is a version 7.3 file (HDF5), or no MATLAB file.
+    Raises ValueError if it is a version 7.3 file (HDF5), or no MATLAB file.
     """
     import scipy.io  # here: few runs read such files, and every command would wait for it
 

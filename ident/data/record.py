@@ -39,11 +39,8 @@ class Record:
     time_column : TimeColumn or None
         What the file's time stamps were taken for; None where dt_s was given without any.
 
-    Raises
-    ------
-    ValueError
-        If a shape or a name does not fit, dt_s is not positive, or a sample is not finite or above 1e100
-        (names the first one).
+    Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
+    above 1e100 (names the first one).
     """
 
     name: str

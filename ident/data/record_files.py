@@ -41,10 +41,8 @@ class Table:
     def columns(self, wanted: Sequence[str]) -> dict[str, RealArray]:
         """The wanted columns as equally long finite vectors.
 
-        Raises
-        ------
-        ValueError
-            If one is missing (lists those there are), not numeric, not finite or of another length.
+        Raises ValueError if one is missing (lists those there are), not numeric, not finite or of another
+        length.
         """
         for name in wanted:
             if name not in self.names:
@@ -110,11 +108,8 @@ class Table:
         """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both
         are there.
 
-        Raises
-        ------
-        ValueError
-            If neither is given, dt_s is not positive, or the stamps are not increasing and uniform to
-            `TIME_TOLERANCE`.
+        Raises ValueError if neither is given, dt_s is not positive, or the stamps are not increasing and
+        uniform to `TIME_TOLERANCE`.
         """
         if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
             raise ValueError(f"{self.path}: dt_s must be a positive number of seconds; got {dt_s}")

@@ -29,10 +29,8 @@ def band_limited(
     before the record (and before `skip_s`) is not in it, so that a lightly damped plant not at rest then
     needs an unknown initial state in the fit.
 
-    Raises
-    ------
-    ValueError
-        If the band is empty or leaves (0, pi/dt), both sides are None, or nothing is left after `skip_s`.
+    Raises ValueError if the band is empty or leaves (0, pi/dt), both sides are None, or nothing is left after
+    `skip_s`.
     """
     nyquist = np.pi / record.dt_s
     low, high = low_rad_s, high_rad_s

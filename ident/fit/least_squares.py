@@ -256,10 +256,7 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
 def fit(data: Regression, poles: Poles) -> LinearFit:
     """theta = R^-1 Q^T y by thin QR, never by Phi^T Phi (27).
 
-    Raises
-    ------
-    ValueError
-        If there are not more samples than free numbers.
+    Raises ValueError if there are not more samples than free numbers.
     """
     needed = data.n_parameters(poles.order)
     if not data.n_samples > needed:

@@ -16,10 +16,7 @@ from ident.fit.least_squares import Regression
 def prepare(records: Sequence[Record], structure: Structure) -> Regression:
     """Stack single-input single-output records for one fit.
 
-    Raises
-    ------
-    ValueError
-        As `prepare_inputs`, and if a record has more than one input or output.
+    Raises ValueError as `prepare_inputs`, and if a record has more than one input or output.
     """
     for record in records:
         record.refuse_several()
@@ -29,11 +26,8 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
 def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regression:
     """Stack records of equal inputs and one output for one fit.
 
-    Raises
-    ------
-    ValueError
-        If there is no record, a record has more than one output, the inputs differ between records, or the
-        sampling times differ by more than 0.1 %.
+    Raises ValueError if there is no record, a record has more than one output, the inputs differ between
+    records, or the sampling times differ by more than 0.1 %.
     """
     if not records:
         raise ValueError("identification needs at least one record; got none")

@@ -47,11 +47,8 @@ class _Constrained:
 def structured_fit(data: Regression, poles: Poles, relative_degree: int) -> LinearFit:
     """Least squares for given poles among models of at least this relative degree.
 
-    Raises
-    ------
-    ValueError
-        If a pole has no continuous-time counterpart, there are too few poles or samples, or the regression
-        has a direct term.
+    Raises ValueError if a pole has no continuous-time counterpart, there are too few poles or samples, or the
+    regression has a direct term.
     """
     solved = _solve(data, poles, relative_degree)
     residual = solved.residual

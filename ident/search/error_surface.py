@@ -74,8 +74,6 @@ def error_surface(
     """Mean square residual with the pair number `pair` of the model moved over a grid, its other poles
     frozen.
 
-    Parameters
-    ----------
     structure : Structure
         As in `Identification.structure`.
     coordinates : "raw" for (beta, gamma), "log" for (omega, zeta)
@@ -84,11 +82,8 @@ def error_surface(
         zeta, logarithmic; or a window of ten damping widths in (beta, gamma), gamma spaced logarithmically
         in 1 - gamma.
 
-    Raises
-    ------
-    ValueError
-        If the model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi/dt, 0 <
-        zeta < 1.
+    Raises ValueError if the model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega <
+    pi/dt, 0 < zeta < 1.
     """
     if not 0 <= pair < model.poles.pairs.size:
         raise ValueError(f"the model has {model.poles.pairs.size} pole pairs; there is no pair {pair}")

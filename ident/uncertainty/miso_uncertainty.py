@@ -36,14 +36,10 @@ def response_uncertainty(
 ) -> tuple[FrequencyUncertainty, ...]:
     """Ellipses of every channel's response, one `FrequencyUncertainty` per input.
 
-    Parameters
-    ----------
     records : the records behind the identification
     identification : result of `identify_miso`
     omega_rad_s : (F,) strictly increasing, up to pi/dt (above 0 with integrators)
 
-    Notes
-    -----
     First order in the noise, which is taken as white, and for the order that was chosen: nothing is added for
     modes that the records did not show (`ident.uncertainty.embedding` does that for a single input). Fixed
     poles count as known. Raises ValueError if the records are not those of the identification.

@@ -69,10 +69,7 @@ __all__ = [
 def parse_effect(entry: Mapping[str, Any]) -> Effect:
     """An effect from {"name": id, parameter: value, ...}.
 
-    Raises
-    ------
-    ValueError
-        One line naming the effect and the parameter, or listing the known effects.
+    Raises ValueError: one line naming the effect and the parameter, or listing the known effects.
     """
     if not isinstance(entry, Mapping):
         raise ValueError(f"an effect is a table with a name and its parameters; got {entry!r}")
@@ -102,10 +99,7 @@ def in_words(name: str) -> str:
 def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:
     """The machine made of a rig and effects; the order of the effects does not matter.
 
-    Raises
-    ------
-    ValueError
-        If an entry is not an effect, or an effect is given twice.
+    Raises ValueError if an entry is not an effect, or an effect is given twice.
     """
     machine = Machine(rig)
     seen: set[str] = set()

@@ -118,12 +118,9 @@ class LoadedCase:
 def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     """Read a case folder or case file; `rig` replaces the rig file named there (default rig.toml).
 
-    Raises
-    ------
-    InputError
-        One line naming the file, and the key or line in it: no such case or file, TOML that cannot be read,
-        an unknown key, role or effect, a column that is missing or not finite, a sensor that is dead, records
-        whose sampling the rig file contradicts, no experiment held out.
+    Raises InputError: one line naming the file, and the key or line in it: no such case or file, TOML that
+    cannot be read, an unknown key, role or effect, a column that is missing or not finite, a sensor that is
+    dead, records whose sampling the rig file contradicts, no experiment held out.
     """
     file = place if place.is_file() else place / CASE_FILE
     if not file.is_file():
