@@ -48,18 +48,13 @@ _DRAWS, _BLOCKS, _BLOCK = 4000, 2000, 50
 class NamedEffect:
     """One possible answer.
 
-    Attributes
-    ----------
     name : effect id, or "none" or "unknown"
-    probability : float
-        That it is the main cause; over all answers the sum is one.
+    probability : float. That it is the main cause; over all answers the sum is one.
     presence : float
         That it is there at all, as the main cause or beside another (equals `probability` for none, unknown).
-    parameters, intervals : parameter -> value, 95 % interval (low, high)
-        From the most probable set of effects that holds it; empty for none and unknown, and where no size of
-        the effect was worth a fit.
-    gap_after : float
-        Pooled RMS of the held-out residuals over the noise with that set; nan without a fit.
+    parameters, intervals : parameter -> value, 95 % interval (low, high). From the most probable set of
+        effects that holds it; empty for none and unknown, and where no size of the effect was worth a fit.
+    gap_after : float. Pooled RMS of the held-out residuals over the noise with that set; nan without a fit.
     """
 
     name: str
@@ -74,40 +69,29 @@ class NamedEffect:
 class Diagnosis:
     """What is wrong with a model, as far as its records tell.
 
-    Attributes
-    ----------
     verdict, detail_verdict : str
-    effects : tuple of NamedEffect
-        Every effect, none and unknown; the answer first, then by presence, with none and unknown last unless
-        they are the answer.
-    combination : tuple of str
-        Effects that are accepted together; empty for the verdicts none and unknown.
-    ambiguous_with : tuple of str
-        Answers that the records cannot rule out beside the first.
-    gap_before, gap_refit, gap_after : float
-        Pooled RMS of (measured - model)/noise over the held-out experiments: nominal rig, nominal parameters
-        moved within their tolerances, accepted effects added.
+    effects : tuple of NamedEffect. Every effect, none and unknown; the answer first, then by presence, with
+        none and unknown last unless they are the answer.
+    combination : tuple of str. Effects that are accepted together; empty for the verdicts none and unknown.
+    ambiguous_with : tuple of str. Answers that the records cannot rule out beside the first.
+    gap_before, gap_refit, gap_after : float. Pooled RMS of (measured - model)/noise over the held-out
+        experiments: nominal rig, nominal parameters moved within their tolerances, accepted effects added.
     gap_closed, gap_closed_interval : float, (low, high)
         1 - (R_after - F)/(R_refit - F) with R, F the held-out mean squares and the noise floor's (design 6.2)
         and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
     deviations : key -> tolerances
         How far the nominal parameters are off, with the accepted effects in the model.
-    rig, repair
-        The repaired model: nominal parameters moved (a Rig, or a Plant of one's own), effects to add (of
-        `plant.effects`, or changes of the own plant).
+    rig, repair : The repaired model: nominal parameters moved (a Rig, or a Plant of one's own), effects to
+        add (of `plant.effects`, or changes of the own plant).
     residuals_before, residuals_refit, residuals_after : experiment -> (T, 2)
         Whitened, every experiment; (T, Y) in the machine's order of outputs.
-    simulations : int
-        Number of simulated records.
-    held_out_decided : bool
-        The held-out records did not confirm what the others said, and chose among the answers (none was
-        fitted to them).
-    unlisted : tuple of effects
-        What explains the records where the answer is unknown and yet can be named: a cause beyond the list
-        that looks like one of it, with whatever it acts beside.
-    competing : tuple of CompetingHypothesis
-        Fitted explanations that contradict each other, most probable first, for `next_experiment`; only for a
-        flexible link.
+    simulations : int. Number of simulated records.
+    held_out_decided : bool. The held-out records did not confirm what the others said, and chose among the
+        answers (none was fitted to them).
+    unlisted : tuple of effects. What explains the records where the answer is unknown and yet can be named: a
+        cause beyond the list that looks like one of it, with whatever it acts beside.
+    competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
+        first, for `next_experiment`; only for a flexible link.
     """
 
     case: Any
@@ -204,12 +188,9 @@ def diagnose(
 ) -> Diagnosis:
     """Search, weigh, and answer.
 
-    case
-        A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
-    progress
-        Called with the share done (0 to 1) and what is being done.
-    rng
-        Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
+    case : A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
+    progress : Called with the share done (0 to 1) and what is being done.
+    rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     found = search(case, progress)

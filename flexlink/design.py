@@ -44,8 +44,6 @@ __all__ = [
 class UncertainPlant(Shown, control_design.UncertainPlant):
     """What a controller is designed for: a nominal state space and the ellipses around its response.
 
-    Parameters
-    ----------
     plant : Uncertainty, or control.StateSpace, or a model with `to_control()`
         An `Uncertainty` brings its own ellipses; anything else is exact unless `uncertainty` is given.
 

@@ -49,15 +49,11 @@ _NOMINAL_POINTS = 400
 class Record(Shown, ident.Record):
     """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
 
-    Parameters
-    ----------
     u, y : (T,) or (T, n), or a pandas column or table
         Input and output, one row per sample; also under the names of the attributes, `input` and `output`.
         Pandas names become the names of the signals; without, they are u and y (u1, u2, ... if several).
-    dt_s : float
-        Sampling time in seconds.
-    reference : as y, optional
-        Closed-loop reference.
+    dt_s : float. Sampling time in seconds.
+    reference : as y, optional. Closed-loop reference.
 
     The other arguments are the attributes of `ident.Record`. Raises ValueError where shapes do not fit;
     nothing is transposed to make them.

@@ -35,23 +35,16 @@ __all__ = ["FrfIdentification", "identify_frf"]
 class FrfIdentification:
     """A model fitted to a measured frequency response, and how well it fits.
 
-    Attributes
-    ----------
     model : GobfModel
     posterior : ResponsePosterior
         Tangent embedding on the same rows; `posterior.at(omega)` gives ellipses at any frequency.
-    omega_rad_s : (F,) array
-        Frequencies of the measurement.
-    residual : (F,) complex array
-        Measured minus fitted response.
+    omega_rad_s : (F,) array. Frequencies of the measurement.
+    residual : (F,) complex array. Measured minus fitted response.
     distance : (F,) array
         Its length in units of the measurement's own ellipses (at their level; 1 = on the boundary).
-    rss : float
-        Chi-square: sum of squared residuals, each in units of the given covariance.
-    degrees_of_freedom : int
-        Measured real numbers minus unknowns.
-    dispersion : float
-        rss / degrees_of_freedom; near 1 if the covariances explain the residual.
+    rss : float. Chi-square: sum of squared residuals, each in units of the given covariance.
+    degrees_of_freedom : int. Measured real numbers minus unknowns.
+    dispersion : float. rss / degrees_of_freedom; near 1 if the covariances explain the residual.
     decay_std_per_s (R,), omega_std_rad_s (P,), zeta_std (P,) : arrays
         Standard deviations of the searched poles' decay, natural frequency and damping ratio, to first
         order; multiplied by sqrt(dispersion) where that is above 1. In the order of the model's poles; known
@@ -103,16 +96,13 @@ def identify_frf(
 ) -> FrfIdentification:
     """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
-    response : FrequencyUncertainty
-        Measurement with a covariance at every frequency (`from_csv`, `FrfRepeats.mean`, `empirical_frf`).
-        Errors of different frequencies are taken as independent. One that all of them share (the amplitude
-        of a run, the gain of an amplifier) does not show in the residual and is not averaged away by the fit:
-        state it as shared_gain_std.
-    options : IdentOptions
-        Numbers of poles, integrators, feedthrough, delay and bounds as for records. What only records have
-        (offset, initial state) must be left at "auto" or False.
-    embedding : EmbeddingOptions
-        fir_length, hyperparameters and prior_no_remainder are used.
+    response : FrequencyUncertainty. Measurement with a covariance at every frequency (`from_csv`,
+        `FrfRepeats.mean`, `empirical_frf`). Errors of different frequencies are taken as independent. One
+        that all of them share (the amplitude of a run, the gain of an amplifier) does not show in the
+        residual and is not averaged away by the fit: state it as shared_gain_std.
+    options : IdentOptions. Numbers of poles, integrators, feedthrough, delay and bounds as for records. What
+        only records have (offset, initial state) must be left at "auto" or False.
+    embedding : EmbeddingOptions. fir_length, hyperparameters and prior_no_remainder are used.
     shared_gain_std : float
         Relative standard deviation of a real factor common to all frequencies; widens the posterior.
 

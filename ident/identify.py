@@ -54,8 +54,7 @@ def identify(
     records : sequence of single-input single-output records of equal sampling time
         Each has its own nuisance columns (offset, initial state).
     options : IdentOptions
-    progress : callable, optional
-        Called with a fraction 0..1 and a short message.
+    progress : callable, optional. Called with a fraction 0..1 and a short message.
 
     Raises ValueError if a record cannot be used (constant signal, several columns, other sampling time) or
     all of them are too short for the order asked for.

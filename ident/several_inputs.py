@@ -38,15 +38,13 @@ def identify_miso(
 ) -> MisoIdentification:
     """Fit one model with shared poles to all inputs of all records together.
 
-    records : sequence of records of equal inputs, one output and equal sampling time
-        Each has its own nuisance columns (offset, initial state). An input may rest in some records, so
-        experiments that excite one motor at a time can be put together; over all records the inputs must be
-        distinguishable.
+    records : sequence of records of equal inputs, one output and equal sampling time. Each has its own
+        nuisance columns (offset, initial state). An input may rest in some records, so experiments that
+        excite one motor at a time can be put together; over all records the inputs must be distinguishable.
     options : IdentOptions
         As for `identify`, the same for every input: integrators, delay and direct terms are those of all
         channels. A relative degree is not imposed here, and what is stated as known is not tested.
-    progress : callable, optional
-        Called with a fraction 0..1 and a short message.
+    progress : callable, optional. Called with a fraction 0..1 and a short message.
 
     Raises ValueError if a record cannot be used, the inputs of the records differ or are one signal, the data
     are too short for the order asked for, or the options ask for a relative degree.

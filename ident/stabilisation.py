@@ -55,23 +55,15 @@ class StableMode(NamedTuple):
 class Stabilisation:
     """Pole pairs of fits with 0, 1, 2 ... pairs.
 
-    Attributes
-    ----------
-    rss : (S,) array
-        Residual sum of squares of each fit, of 0, 1, 2 ... pairs.
-    n_real : int
-        Real poles of every fit (known ones not counted).
-    chosen : int
-        Pole pairs of the identified model.
-    n_pairs : (K,) int array
-        For each pole pair, the number of pairs of the fit it belongs to; ascending.
+    rss : (S,) array. Residual sum of squares of each fit, of 0, 1, 2 ... pairs.
+    n_real : int. Real poles of every fit (known ones not counted).
+    chosen : int. Pole pairs of the identified model.
+    n_pairs : (K,) int array. For each pole pair, the number of pairs of the fit it belongs to; ascending.
     omega_rad_s, zeta : (K,) arrays
     previous : (K,) int array
         Index of the counterpart with one pair less, within `FREQUENCY_TOLERANCE`; -1 where there is none.
-    same_damping : (K,) bool array
-        Whether its damping is within `DAMPING_TOLERANCE` as well.
-    needed : (K,) bool array
-        Whether the data would miss the pair in that fit.
+    same_damping : (K,) bool array. Whether its damping is within `DAMPING_TOLERANCE` as well.
+    needed : (K,) bool array. Whether the data would miss the pair in that fit.
     """
 
     rss: RealArray

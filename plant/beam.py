@@ -26,21 +26,14 @@ Real = npt.NDArray[np.float64]
 class BeamModes:
     """The first M modes, normalised to unit modal mass (tip mass included).
 
-    Attributes
-    ----------
-    wave_number_rad_m : (M,)
-        beta, ascending.
-    omega_rad_s : (M,)
-        Natural frequencies with the root clamped.
-    tip : (M,)
-        phi(L), 1/sqrt(kg).
+    wave_number_rad_m : (M,). beta, ascending.
+    omega_rad_s : (M,). Natural frequencies with the root clamped.
+    tip : (M,). phi(L), 1/sqrt(kg).
     coupling : (M,)
         int m (r + x) phi dx + mp (r + L) phi(L): inertial coupling to a rotation about the hub axis.
-    first_moment : (M,)
-        int m phi dx + mp phi(L): inertial coupling to a translation.
+    first_moment : (M,). int m phi dx + mp phi(L): inertial coupling to a translation.
     length_m : float
-    scale : (M,)
-        Factor that turns cosh - cos - sigma (sinh - sin) into phi.
+    scale : (M,). Factor that turns cosh - cos - sigma (sinh - sin) into phi.
     """
 
     wave_number_rad_m: Real

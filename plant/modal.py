@@ -41,24 +41,16 @@ class Equations:
 
     A direction d serves both ways: the displacement d . coordinate, and the generalised force d * f.
 
-    Attributes
-    ----------
     mass, damping, stiffness : (N, N)
     shaft : (N,)
         Motor shaft angle relative to its housing: motor torque, back-EMF, friction and ripple act here.
-    hub, motor : (N,)
-        Absolute angles of the hub and of its motor side; the same but for a backlash.
-    encoder : (N,)
-        Measured hub angle (hub minus base).
-    root : (N,)
-        Absolute angle of the link root.
-    tip : (N,)
-        Tip position (r + L) * root angle + w(L).
-    backlash : (N,) or None
-        Motor side minus hub, where there is a gap between them.
+    hub, motor : (N,). Absolute angles of the hub and of its motor side; the same but for a backlash.
+    encoder : (N,). Measured hub angle (hub minus base).
+    root : (N,). Absolute angle of the link root.
+    tip : (N,). Tip position (r + L) * root angle + w(L).
+    backlash : (N,) or None. Motor side minus hub, where there is a gap between them.
     modes : BeamModes
-    first_mode : int
-        Index of the first modal coordinate; the last one is the last coordinate.
+    first_mode : int. Index of the first modal coordinate; the last one is the last coordinate.
     """
 
     mass: Real

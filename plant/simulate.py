@@ -24,17 +24,11 @@ F = TypeVar("F", float, Real)
 class Trajectory:
     """A simulated record; all arrays (T,), read-only.
 
-    Attributes
-    ----------
-    time_s
-        t_k = k dt.
-    voltage_V
-        Commanded voltage, held over [t_k, t_(k+1)).
-    hub_angle_rad, tip_m
-        As measured at t_k, before the voltage of the same row takes effect: with the effects on the
-        sensors, and with noise if the simulation was given a generator.
-    hub_angle_true_rad, tip_true_m
-        Before every sensor effect and without noise.
+    time_s : t_k = k dt.
+    voltage_V : Commanded voltage, held over [t_k, t_(k+1)).
+    hub_angle_rad, tip_m : As measured at t_k, before the voltage of the same row takes effect: with the
+        effects on the sensors, and with noise if the simulation was given a generator.
+    hub_angle_true_rad, tip_true_m : Before every sensor effect and without noise.
     """
 
     time_s: Real
@@ -72,20 +66,14 @@ def simulate(
 ) -> Trajectory:
     """Drive a machine from rest with a held voltage.
 
-    rig, effects
-        The machine.
-    voltage_V : (T,)
-        Commanded voltage; before the first sample it is zero.
-    rng
-        Source of the sensor noise; without it the measurement is noise-free.
-    dt_s
-        Sampling period, if not the rig's.
+    rig, effects : The machine.
+    voltage_V : (T,). Commanded voltage; before the first sample it is zero.
+    rng : Source of the sensor noise; without it the measurement is noise-free.
+    dt_s : Sampling period, if not the rig's.
     hub_torque_Nm, tip_force_N : (T,), optional
         Outside torque on the hub and transverse outside force at the tip, held over the sample.
-    n_modes
-        Number of modes, if not `plant.modal.default_n_modes`.
-    substep_s
-        Longest step where the machine is not linear; see `plant.plan`.
+    n_modes : Number of modes, if not `plant.modal.default_n_modes`.
+    substep_s : Longest step where the machine is not linear; see `plant.plan`.
 
     Raises ValueError: one line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect
     given twice.

@@ -108,10 +108,7 @@ def two_link_matrices(
     tip, and as under a moment at the tip, (x/L)^2, which those modes lack and link 2 exerts; so N = 3 + 2
     n_modes with that shape last of q_1.
 
-    Raises
-    ------
-    ValueError
-        If a hub has a radius, a mass is negative, the angle is not finite or n_modes < 1.
+    Raises ValueError if a hub has a radius, a mass is negative, the angle is not finite or n_modes < 1.
     """
     if any(hub.radius_m != 0 for hub in hubs):
         raise ValueError("both hub radii must be zero")

@@ -120,8 +120,7 @@ def simulate(
     input_disturbance) until t_{k+1}. With no limits and no quantisation this is exactly the feedback of K
     z^-delay and the machine used in the loop analysis.
 
-    reference : (T,) array
-        Set point at t_k, unit of the measured output.
+    reference : (T,) array. Set point at t_k, unit of the measured output.
     hub_torque_Nm, input_disturbance, output_disturbance : (T,) arrays, optional
         Torque handed to the machine; added to the applied command; added to the measured output.
     measurement_step, command_step : float

@@ -39,8 +39,7 @@ class Discrepancy:
 def discrepancy(residuals: Real, segments: Sequence[int], outputs: int = 2) -> Discrepancy:
     """Bands of all records and outputs judged together.
 
-    residuals : (N,)
-        Whitened, record after record, sample by sample.
+    residuals : (N,). Whitened, record after record, sample by sample.
     segments : samples of each record; N is `outputs` times their sum.
 
     Raises ValueError if the residuals are not as many as the segments say.

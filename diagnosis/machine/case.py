@@ -18,19 +18,13 @@ from plant.rig import Rig
 class Experiment:
     """One record.
 
-    Attributes
-    ----------
     name : str
     role : "estimation" or "held_out"
         Held-out records judge a repaired model; no parameter is fitted to them.
-    voltage_V : (T,)
-        Commanded voltage, held from its row to the next.
-    output : (T, 2)
-        hub_angle_rad, tip_m as measured.
-    kind : str
-        Sort of input, in the words of whoever made the record; only shown.
-    closed_loop : bool
-        The command came from a feedback. It is still the exact input of the actuator.
+    voltage_V : (T,). Commanded voltage, held from its row to the next.
+    output : (T, 2). hub_angle_rad, tip_m as measured.
+    kind : str. Sort of input, in the words of whoever made the record; only shown.
+    closed_loop : bool. The command came from a feedback. It is still the exact input of the actuator.
     """
 
     name: str

@@ -28,13 +28,9 @@ _FEWEST_SAMPLES = 20
 class Weighing:
     """How residuals of a machine are weighed.
 
-    Attributes
-    ----------
-    listed : tuple of str
-        Effects that are looked for; prior probabilities are shared among them.
-    model_error : float
-        What even the right set of effects may leave over, in noise deviations (scale of a half-normal prior,
-        RMS over all samples). Zero where the simulation is as good as the sensors.
+    listed : tuple of str. Effects that are looked for; prior probabilities are shared among them.
+    model_error : float. What even the right set of effects may leave over, in noise deviations (scale of a
+        half-normal prior, RMS over all samples). Zero where the simulation is as good as the sensors.
     correlation_samples : float
         Samples per independent value of what is left over; counts only beside a model error.
     """

@@ -44,10 +44,7 @@ _RUNAWAY = 1e12
 class EffectParameter:
     """A parameter of an effect: range, and values a search starts from.
 
-    Attributes
-    ----------
-    name : str
-        With its unit.
+    name : str. With its unit.
     low, high : float
         On a "log" scale both above zero; the size of an effect is positive (see `PlantEffect.signed`).
     starts : tuple of float
@@ -100,20 +97,15 @@ class Change:
 class PlantEffect:
     """Something the plant may have and its simulation lacks unless told.
 
-    Attributes
-    ----------
     name : str
     parameters : tuple of EffectParameter
         The first is the size: the larger, the more the outputs change (the smaller, if not `grows`, as with a
         stiffness or a limit). Below its lower end the effect must be next to nothing.
-    signed : bool
-        The size may be negative as well: both sides are searched, as one effect.
+    signed : bool. The size may be negative as well: both sides are searched, as one effect.
     grows : bool
-    dependence : "smooth", "continuous" or "non-smooth"
-        How outputs depend on the parameters: differentiable; continuous (dry friction); neither (backlash,
-        rounding), which takes grids in place of slopes.
-    group : str
-        Where it acts (actuator, joint, sensor, ...); only shown.
+    dependence : "smooth", "continuous" or "non-smooth". How outputs depend on the parameters: differentiable;
+        continuous (dry friction); neither (backlash, rounding), which takes grids in place of slopes.
+    group : str. Where it acts (actuator, joint, sensor, ...); only shown.
     """
 
     name: str
@@ -158,8 +150,6 @@ class PlantEffect:
 class Plant:
     """A simulation of one's own with what is known about its parameters and outputs.
 
-    Attributes
-    ----------
     simulation : (parameters, effects, inputs (T, U)) -> outputs (T, Y)
         `parameters` has every stated parameter, `effects` name -> parameter -> value of those to include.
         It must be a function of its arguments alone.
@@ -168,13 +158,11 @@ class Plant:
         Parameters without one are exact. A value fitted to these same records is no knowledge beside them:
         give it a tolerance of 1 or more.
     output_names : (Y,)
-    noise : (Y,)
-        Noise standard deviations, from repeats of an experiment where there are any.
+    noise : (Y,). Noise standard deviations, from repeats of an experiment where there are any.
     effects : tuple of PlantEffect
-    model_error : float
-        What the simulation may leave over even with the right effects, in noise deviations (RMS, scale of a
-        half-normal prior). No simulation of a real machine reaches its noise; with zero here what is left
-        over makes the answer "unknown".
+    model_error : float. What the simulation may leave over even with the right effects, in noise deviations
+        (RMS, scale of a half-normal prior). No simulation of a real machine reaches its noise; with zero here
+        what is left over makes the answer "unknown".
     correlation_samples : float
         Samples per independent value of what is left over (`diagnosis.fit.model_error.correlation_length` of
         the residuals, times the passes of a repeated motion). Counts only beside a model error.

@@ -42,20 +42,14 @@ def _nothing_free(voltage: Real) -> Real:
 class CompetingHypothesis:
     """One explanation that is left.
 
-    Attributes
-    ----------
     probability : float
-    rig : Rig
-        With its fitted nominal parameters.
+    rig : Rig. With its fitted nominal parameters.
     effects : tuple of Effect
-    directions : callable
-        Voltage (T,) -> derivatives (2 T, P) of the outputs in noise deviations, hub before tip sample by
-        sample, by the hypothesis' free parameters; by default there are none.
-    precision : (P, P)
-        What is known about the free parameters: the Gauss-Newton Hessian of the fit to the records, prior
-        included.
-    name : str
-        In sentences; by default the names of the effects.
+    directions : callable. Voltage (T,) -> derivatives (2 T, P) of the outputs in noise deviations, hub before
+        tip sample by sample, by the hypothesis' free parameters; by default there are none.
+    precision : (P, P). What is known about the free parameters: the Gauss-Newton Hessian of the fit to the
+        records, prior included.
+    name : str. In sentences; by default the names of the effects.
     """
 
     probability: float
@@ -82,11 +76,9 @@ def competing_hypotheses(
     A set that contains a more probable one, or lies within it, names the same cause and more or less beside
     it: they do not compete.
 
-    hypotheses
-        Of `search`; the best of every set counts.
-    sets
-        Sorted effect names -> probability, as `probabilities` gives them; names without a fit ("unknown") are
-        passed over.
+    hypotheses : Of `search`; the best of every set counts.
+    sets : Sorted effect names -> probability, as `probabilities` gives them; names without a fit ("unknown")
+        are passed over.
     """
     best = best_of_sets(hypotheses)
     # Equally hopeless sets have probabilities of zero alike: their weight orders them.

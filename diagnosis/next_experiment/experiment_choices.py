@@ -21,14 +21,9 @@ Parameters = Mapping[str, float | int | str]
 class Limits:
     """What an experiment may ask of the machine.
 
-    Attributes
-    ----------
-    voltage_V : float
-        Largest commanded voltage.
-    hub_angle_rad : float
-        Largest deviation of the hub angle from the start.
-    deflection_m : float
-        Largest deflection of the tip, tip_m - (r + L) hub_angle.
+    voltage_V : float. Largest commanded voltage.
+    hub_angle_rad : float. Largest deviation of the hub angle from the start.
+    deflection_m : float. Largest deflection of the tip, tip_m - (r + L) hub_angle.
     """
 
     voltage_V: float

@@ -64,22 +64,14 @@ class Considered:
 class NextExperiment:
     """The experiment to run next.
 
-    Attributes
-    ----------
     kind, parameters, amplitude_V, duration_s, dt_s, voltage_V (T,)
         The excitation.
-    separations : tuple of Separation
-        Every pair of hypotheses.
-    expected_log_bayes_factor : float
-        Over the pairs, weighted with the product of their probabilities.
-    hub_angle_range_rad, deflection_range_m
-        Least and largest value any of the hypotheses predicts.
-    separates : bool
-        Whether any pair comes apart by three standard deviations.
-    decided : bool
-        The records already decide for the first hypothesis; the experiment would only confirm it.
-    considered : tuple of Considered
-        Best first.
+    separations : tuple of Separation. Every pair of hypotheses.
+    expected_log_bayes_factor : float. Over the pairs, weighted with the product of their probabilities.
+    hub_angle_range_rad, deflection_range_m : Least and largest value any of the hypotheses predicts.
+    separates : bool. Whether any pair comes apart by three standard deviations.
+    decided : bool. The records already decide for the first hypothesis; the experiment would only confirm it.
+    considered : tuple of Considered. Best first.
     """
 
     kind: str
@@ -106,10 +98,8 @@ def next_experiment(
 ) -> NextExperiment:
     """Choose among `excitations` of n_samples within the limits, and two made for these hypotheses.
 
-    competing
-        Two at least, all with the same sampling period and noise.
-    rng
-        Of the random excitations; without it a fixed sequence.
+    competing : Two at least, all with the same sampling period and noise.
+    rng : Of the random excitations; without it a fixed sequence.
 
     Raises ValueError: fewer than two hypotheses, hypotheses that sample differently or are noise-free, no
     excitation that stays in the limits.

@@ -34,20 +34,13 @@ _LEAST_DRIFT = 0.1
 class PartGap:
     """Gap in a part of the data: a sensor, an experiment, a sensor in an experiment, a sensor in a band.
 
-    Attributes
-    ----------
-    gap_rms : float
-        Root mean square of the gap itself in noise standard deviations, the noise taken off:
+    gap_rms : float. Root mean square of the gap itself in noise standard deviations, the noise taken off:
         sqrt(max(mean e^2 - 1, 0)). 0 where the part holds no more than noise.
-    interval : (low, high)
-        95 % for gap_rms; what sensor noise moves, the gap being what it is.
-    share : float
-        Of the gap energy of all records; shares of disjoint parts sum to 1 (a part below its noise counts
-        negative, a little). 0 when there is no gap at all.
-    share_interval : (low, high)
-        95 %.
-    p_value : float
-        Chance of as much energy from noise alone.
+    interval : (low, high). 95 % for gap_rms; what sensor noise moves, the gap being what it is.
+    share : float. Of the gap energy of all records; shares of disjoint parts sum to 1 (a part below its noise
+        counts negative, a little). 0 when there is no gap at all.
+    share_interval : (low, high). 95 %.
+    p_value : float. Chance of as much energy from noise alone.
     found : bool
     """
 
@@ -157,15 +150,10 @@ class CommonFinding:
 
     Whatever the input was: a drift, an offset, a disturbance that starts with the record.
 
-    Attributes
-    ----------
-    share : float
-        Of the sensor's gap energy over the experiments' common length.
-    share_by_chance : float
-        Largest share when the sign of some of the experiments is turned.
-    peak_Hz, peak_share : float
-        Strongest line of the common part above the two slowest ones, and the share of the common energy
-        within one line of it.
+    share : float. Of the sensor's gap energy over the experiments' common length.
+    share_by_chance : float. Largest share when the sign of some of the experiments is turned.
+    peak_Hz, peak_share : float. Strongest line of the common part above the two slowest ones, and the share
+        of the common energy within one line of it.
     """
 
     sensor: str
@@ -186,14 +174,10 @@ class CommonFinding:
 class EquivalentCurve:
     """The residuals read as one missing function of a regime variable, at one place of the machine.
 
-    Attributes
-    ----------
     route : str
         hub_torque (a torque on the hub, sent through the model), hub_angle or tip (added to a sensor).
-    axis, unit : str
-        The variable it is a function of: speed, angle, command, deflection, time, position.
-    centres, values, standard_errors : tuple of float
-        The function at the mean of every bin, in Nm, rad or m.
+    axis, unit : str. The variable it is a function of: speed, angle, command, deflection, time, position.
+    centres, values, standard_errors : tuple of float. The function at the mean of every bin, in Nm, rad or m.
     share : float
         Of the whole gap energy that this one function explains, the energy noise alone would add taken off.
     share_by_chance : float
@@ -332,18 +316,12 @@ class Concentration:
 class Where:
     """Where the gap lies.
 
-    Attributes
-    ----------
-    gap : PartGap
-        All records together.
-    sensors, experiments, bands, regimes, drift, common, curves
-        See their records.
-    periodic, amplitude, linear
-        None where the records do not allow it.
+    gap : PartGap. All records together.
+    sensors, experiments, bands, regimes, drift, common, curves : See their records.
+    periodic, amplitude, linear : None where the records do not allow it.
     subsystem : dict
         Probability of none, actuator, joint, link, sensor, environment, unknown; empty without probabilities.
-    level : float
-        Chance of any finding of an axis when there is nothing.
+    level : float. Chance of any finding of an axis when there is nothing.
     """
 
     gap: PartGap

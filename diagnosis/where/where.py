@@ -34,16 +34,13 @@ def where(
 ) -> Where:
     """Locate the gap.
 
-    residuals : experiment name -> (T, 2)
-        (measured - model) / noise, standard deviation 1 where the model explains everything; every experiment
-        of the case.
+    residuals : experiment name -> (T, 2). (measured - model) / noise, standard deviation 1 where the model
+        explains everything; every experiment of the case.
     probabilities : effect id, "none" or "unknown" -> probability, optional
         Of the causes, for the grouping by subsystem.
-    level
-        Chance of a false finding in each axis (frequency, regimes, drift, experiments, sensors) when the
+    level : Chance of a false finding in each axis (frequency, regimes, drift, experiments, sensors) when the
         records hold only noise.
-    rng
-        Of the shifts and blocks; without it a fixed sequence, so that the same records give the same page.
+    rng : Of the shifts and blocks; without it a fixed sequence, so that the same records give the same page.
 
     Raises ValueError: missing or misshaped residuals, a level outside (0, 1), an effect that does not exist.
     """

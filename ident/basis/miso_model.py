@@ -18,16 +18,11 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 class MisoModel:
     """y = sum_i G_i u_i, every G_i a `GobfModel` with the same poles, integrators and delay.
 
-    Attributes
-    ----------
     poles : Poles
-    coefficients : (U, B) array
-        Row i belongs to input i.
+    coefficients : (U, B) array. Row i belongs to input i.
     feedthrough : (U,) array
-    dt_s : float
-        Sampling time in seconds.
-    input_names : tuple of str
-        U distinct names.
+    dt_s : float. Sampling time in seconds.
+    input_names : tuple of str. U distinct names.
     output_name : str
     integrators, input_delay_samples : int
 

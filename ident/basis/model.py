@@ -19,15 +19,10 @@ class GobfModel:
     """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
     (5).
 
-    Attributes
-    ----------
     poles : Poles
-    coefficients : (B,) array
-        One per basis function, real poles first, then two per pair.
-    dt_s : float
-        Sampling time in seconds.
-    feedthrough : float
-        Direct term of the part in brackets.
+    coefficients : (B,) array. One per basis function, real poles first, then two per pair.
+    dt_s : float. Sampling time in seconds.
+    feedthrough : float. Direct term of the part in brackets.
     integrators, input_delay_samples : int
     input_name, output_name : str
 

@@ -15,12 +15,8 @@ from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonl
 class Poles:
     """Discrete-time poles, real ones first, each pair by its member in the upper half plane.
 
-    Attributes
-    ----------
-    real : (R,) array
-        Real poles, -1 < a < 1. Zeros are allowed (FIR).
-    pairs : (P,) complex array
-        One pole p of each conjugate pair, imag(p) > 0 and |p| < 1.
+    real : (R,) array. Real poles, -1 < a < 1. Zeros are allowed (FIR).
+    pairs : (P,) complex array. One pole p of each conjugate pair, imag(p) > 0 and |p| < 1.
 
     Raises ValueError if a pole is not inside the unit circle, not finite, or a pair member is not above the
     real axis.

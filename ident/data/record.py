@@ -20,22 +20,15 @@ _LARGEST = 1e100
 class Record:
     """One uniformly sampled experiment.
 
-    Attributes
-    ----------
-    name : str
-        Shown to the user; the file stem when read from a file.
+    name : str. Shown to the user; the file stem when read from a file.
     input : (T, U) array
     output : (T, Y) array
-    dt_s : float
-        Sampling time in seconds.
-    input_names, output_names : tuple of str
-        U and Y distinct names.
-    reference : (T, R) array or None
-        Closed-loop reference, if there is one.
+    dt_s : float. Sampling time in seconds.
+    input_names, output_names : tuple of str. U and Y distinct names.
+    reference : (T, R) array or None. Closed-loop reference, if there is one.
     reference_names, input_units, output_units : tuple of str
         Units are free text for display, either empty or one per column.
-    source : str
-        Where the data came from (the file), named in later error messages.
+    source : str. Where the data came from (the file), named in later error messages.
     time_column : TimeColumn or None
         What the file's time stamps were taken for; None where dt_s was given without any.
 

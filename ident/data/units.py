@@ -45,18 +45,11 @@ _LONG_STEP_S = 0.5
 class TimeColumn:
     """What the time stamps of a log were taken for.
 
-    Attributes
-    ----------
-    name : str
-        The column.
-    unit : str
-        One of `KNOWN_TIME_UNITS`.
-    in_header : str
-        The unit in the column's name, empty if there is none.
-    stated : bool
-        Whether the user stated the unit (which counts more than the header).
-    doubtful : bool
-        The stamps are called seconds and look like integer milliseconds.
+    name : str. The column.
+    unit : str. One of `KNOWN_TIME_UNITS`.
+    in_header : str. The unit in the column's name, empty if there is none.
+    stated : bool. Whether the user stated the unit (which counts more than the header).
+    doubtful : bool. The stamps are called seconds and look like integer milliseconds.
     """
 
     name: str

@@ -33,17 +33,12 @@ _RANK_TOLERANCE = 1e-12
 class FrfRegression:
     """Everything a fit of a frequency response needs but the poles.
 
-    Attributes
-    ----------
-    z : (F,) complex array
-        exp(j omega dt).
-    common : (F,) complex array
-        Known factor of the response: integrators (z / (z - 1))^k and delay z^-d.
+    z : (F,) complex array. exp(j omega dt).
+    common : (F,) complex array. Known factor of the response: integrators (z / (z - 1))^k and delay z^-d.
     turn, weight : (F,) complex and (2, F) real arrays
         `turn` rotates into the axes of the ellipse, `weight` is one over the standard deviations there. At 0
         and at pi/dt both responses are real: the second weight is zero.
-    y : (2 F,) array
-        The whitened measurement.
+    y : (2 F,) array. The whitened measurement.
     feedthrough : bool
     dt_s : float
     """

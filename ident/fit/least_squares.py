@@ -35,15 +35,10 @@ EXPLAINED = 1e-18
 class Regression:
     """Records made ready for a fit, one after the other: everything it needs but the poles.
 
-    Attributes
-    ----------
-    u : (U, N) array
-        Inputs after delay and integrators. The first `input_delay_samples` rows of a record are left out: the
-        input they answer to was not recorded.
-    y : (N,) array
-        Outputs of the same rows.
-    starts : (K + 1,) int array
-        Record i owns the samples starts[i]:starts[i + 1].
+    u : (U, N) array. Inputs after delay and integrators. The first `input_delay_samples` rows of a record are
+        left out: the input they answer to was not recorded.
+    y : (N,) array. Outputs of the same rows.
+    starts : (K + 1,) int array. Record i owns the samples starts[i]:starts[i + 1].
     polynomials : (Q, N) array
         Per-record polynomial nuisance columns, as rows (Legendre, degrees 0 .. Q - 1).
     structure : Structure
@@ -175,19 +170,12 @@ class Regression:
 class Projection:
     """Columns of a regression as rows, and what they leave of the output.
 
-    Attributes
-    ----------
-    local_q : (Ql, N) array
-        Nuisance columns of each record, orthonormal within each record.
-    shared : (Qs, N) array
-        Columns common to all records: the basis driven by each input, then the inputs if they have a direct
-        term.
-    shared_q : (Qs, N) array
-        The same orthonormal to each other and to the local ones.
-    triangle : (Qs, Qs) array
-        R of the shared columns after the local ones are taken out.
-    residual : (N,) array
-        The output without its part in all these columns.
+    local_q : (Ql, N) array. Nuisance columns of each record, orthonormal within each record.
+    shared : (Qs, N) array. Columns common to all records: the basis driven by each input, then the inputs if
+        they have a direct term.
+    shared_q : (Qs, N) array. The same orthonormal to each other and to the local ones.
+    triangle : (Qs, Qs) array. R of the shared columns after the local ones are taken out.
+    residual : (N,) array. The output without its part in all these columns.
     """
 
     local_q: RealArray

@@ -28,13 +28,9 @@ class Linearisation(NamedTuple):
     The directions are the states of each block driven by the fitted output (one per real pole, two per pair),
     projected off the regression: every pole sensitivity is a combination of them and of regression columns.
 
-    Attributes
-    ----------
     rss : float
-    normal : (B, B) array
-        S^T S of the projected directions: the Gauss-Newton (Kaufman) Hessian.
-    gradient : (B,) array
-        S^T r.
+    normal : (B, B) array. S^T S of the projected directions: the Gauss-Newton (Kaufman) Hessian.
+    gradient : (B,) array. S^T r.
     """
 
     rss: float

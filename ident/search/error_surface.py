@@ -20,16 +20,11 @@ from ident.fit.regression import prepare
 class ErrorSurface:
     """Mean square residual over two coordinates of one pair.
 
-    Attributes
-    ----------
-    first, second : (A,), (B,) arrays
-        Coordinate values: (beta, gamma) of (29), or (omega [rad/s], zeta).
-    names : (str, str)
-        Their names.
+    first, second : (A,), (B,) arrays. Coordinate values: (beta, gamma) of (29), or (omega [rad/s], zeta).
+    names : (str, str). Their names.
     mean_square : (A, B) array
         J/N as in (20), coefficients fitted at every point, in squared units of the output.
-    pole : (float, float)
-        The model's own pair in these coordinates.
+    pole : (float, float). The model's own pair in these coordinates.
     """
 
     first: RealArray
@@ -74,13 +69,11 @@ def error_surface(
     """Mean square residual with the pair number `pair` of the model moved over a grid, its other poles
     frozen.
 
-    structure : Structure
-        As in `Identification.structure`.
+    structure : Structure. As in `Identification.structure`.
     coordinates : "raw" for (beta, gamma), "log" for (omega, zeta)
-    first, second : arrays, optional
-        Grid of the two coordinates. Default: two octaves each way in omega and a factor of 30 each way in
-        zeta, logarithmic; or a window of ten damping widths in (beta, gamma), gamma spaced logarithmically
-        in 1 - gamma.
+    first, second : arrays, optional. Grid of the two coordinates. Default: two octaves each way in omega and
+        a factor of 30 each way in zeta, logarithmic; or a window of ten damping widths in (beta, gamma),
+        gamma spaced logarithmically in 1 - gamma.
 
     Raises ValueError if the model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega <
     pi/dt, 0 < zeta < 1.

@@ -42,14 +42,10 @@ class PolishedMinimum:
 class SearchTrace:
     """All global searches and descents of one identification.
 
-    Attributes
-    ----------
     stages : tuple of SearchStage
-    minima : tuple of PolishedMinimum
-        In the order they were found.
+    minima : tuple of PolishedMinimum. In the order they were found.
     warnings : tuple of Finding
-    evaluations : int
-        Cost evaluations in all, rescans and descents included.
+    evaluations : int. Cost evaluations in all, rescans and descents included.
     """
 
     stages: tuple[SearchStage, ...]

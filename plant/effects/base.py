@@ -32,21 +32,14 @@ class Effect(BaseModel, ABC):
     equation. An instance is frozen; effects commute, because every one changes fields of its own or
     multiplies. Everything else that is known about an effect stands in its class; `@register` lists it.
 
-    Attributes
-    ----------
-    id : str
-        Name in the registry and in configuration files.
-    words : str
-        Its name in a sentence.
-    group : str
-        Where it acts: actuator, joint, link or sensor.
-    neutral : mapping or None
-        Parameter values at which the effect vanishes exactly, zero for those not named; None if there are
-        none within the bounds.
+    id : str. Name in the registry and in configuration files.
+    words : str. Its name in a sentence.
+    group : str. Where it acts: actuator, joint, link or sensor.
+    neutral : mapping or None. Parameter values at which the effect vanishes exactly, zero for those not
+        named; None if there are none within the bounds.
     dependence : str
         How the outputs depend on the parameters: smooth (differentiable), continuous, or non-smooth.
-    environment : bool
-        It comes from outside the machine.
+    environment : bool. It comes from outside the machine.
     friction : bool
         It takes energy at the joint: closed loops are also tried without it and with twice its torques.
     multiplies : str or None

@@ -112,14 +112,11 @@ class EffectKind(Protocol):
 class Candidate:
     """One effect (or one side of it: a ratio above or below 1) as a search space.
 
-    Attributes
-    ----------
     kind : EffectKind
     axes : tuple of Axis
         The first one is the size; larger coordinates mean a larger effect if `grows`, smaller ones otherwise.
     starts : (S, A) tuple of coordinates
-    sign : +1 or -1
-        Of a signed size (ratio - 1, drift).
+    sign : +1 or -1. Of a signed size (ratio - 1, drift).
     """
 
     kind: EffectKind

@@ -69,10 +69,7 @@ def pair_response(pole: complex, x1: RealArray, x2: RealArray, z: ComplexArray) 
     """Values (F, 2) of the two functions with numerators x1 = (m1, m2) and x2 = (m3, m4) at the points z
     (F,).
 
-    Raises
-    ------
-    ValueError
-        If x1 and x2 do not satisfy (14) and (15) to 1e-9.
+    Raises ValueError if x1 and x2 do not satisfy (14) and (15) to 1e-9.
     """
     metric, target = pair_metric(pole), abs(1 - pole**2) ** 2
     gram = np.array([[x1 @ metric @ x1, x1 @ metric @ x2], [x2 @ metric @ x1, x2 @ metric @ x2]])

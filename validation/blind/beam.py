@@ -25,17 +25,11 @@ _POINTS = 13
 class LinkBasis:
     """Modes of the clamped link with its tip mass, sampled at Gauss points.
 
-    Attributes
-    ----------
-    angle : (G, M)
-        P_i at the Gauss points; mass-normalised.
-    integral : (G + 1, G)
-        Row g integrates a function given at the Gauss points from the clamp to point g; the last row to the
-        tip.
-    weights_m : (G,)
-        Quadrature weights over the length.
-    stiffness : (M,)
-        Squared natural frequencies [rad^2/s^2] of the clamped link.
+    angle : (G, M). P_i at the Gauss points; mass-normalised.
+    integral : (G + 1, G). Row g integrates a function given at the Gauss points from the clamp to point g;
+        the last row to the tip.
+    weights_m : (G,). Quadrature weights over the length.
+    stiffness : (M,). Squared natural frequencies [rad^2/s^2] of the clamped link.
     """
 
     angle: Real

@@ -106,10 +106,7 @@ def scores(predictions: Sequence[Document], answers: Sequence[Document]) -> dict
     said), "unlisted" (cause -> answers), "several" (cases with more than one effect), "calibration" (bins),
     "wrong" (every case whose first answer is wrong).
 
-    Raises
-    ------
-    ValueError
-        If the two lists do not name the same cases.
+    Raises ValueError if the two lists do not name the same cases.
     """
     said = {str(p["case"]): p for p in predictions}
     true = {str(a["case"]): a for a in answers}

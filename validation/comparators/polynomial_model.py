@@ -15,14 +15,10 @@ from ident.data.record import Record
 class PolynomialModel:
     """A(q) y(k) = [B(q) / F(q)] u(k - delay_samples) + C(q) e(k), with e white.
 
-    Attributes
-    ----------
     a, b, c, f : (n,) arrays
         Coefficients of q^0, q^-1, ...; a, c and f begin with 1, b[0] multiplies u(k - delay_samples).
-    delay_samples : int
-        1 where the output does not answer within the same sample.
-    dt_s : float
-        Sampling time in seconds.
+    delay_samples : int. 1 where the output does not answer within the same sample.
+    dt_s : float. Sampling time in seconds.
     """
 
     a: RealArray

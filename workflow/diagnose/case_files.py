@@ -96,14 +96,9 @@ class CaseSettings(Section):
 class LoadedCase:
     """A case with what its files said beside the numbers.
 
-    Attributes
-    ----------
-    rig_file : str
-        Name of the rig file that was read.
-    descriptions : dict
-        Free words per experiment.
-    suspected : tuple of str
-        Effects that whoever wrote the case file asks about.
+    rig_file : str. Name of the rig file that was read.
+    descriptions : dict. Free words per experiment.
+    suspected : tuple of str. Effects that whoever wrote the case file asks about.
     input_sha256 : str
         Over the contents of every file that was read, under their names; equal inputs, equal hash.
     """

@@ -1,11 +1,9 @@
 """Plants for `flexlink design`, from whatever file describes them, with what the design file says of them.
 
-A source is one of
-    a run directory;
-    .npz written by `flexlink identify --out` (model and posterior);
-    .json or .mat written by `flexlink identify --export` (model and ellipses);
-    .json, .mat or .npz with plain A, B, C, D and dt_s of a user's own discrete model;
-    .csv with a measured frequency response: with variances, or repeated points.
+A source is one of: a run directory; .npz written by `flexlink identify --out` (model and posterior); .json or
+.mat written by `flexlink identify --export` (model and ellipses); .json, .mat or .npz with plain A, B, C, D
+and dt_s of a user's own discrete model; .csv with a measured frequency response: with variances, or repeated
+points.
 Several sources are several plants that one controller has to serve.
 """
 
