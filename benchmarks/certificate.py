@@ -27,23 +27,11 @@ import numpy as np
 
 from benchmarks.harness import Print, main, median_s
 from benchmarks.random_designs import LOW_EFFORT, RADIUS, random_case
-from control_design import (
-    Controller,
-    Specification,
-    UncertainPlant,
-    certify,
-    synthesise,
-    synthesise_jointly,
-)
+from control_design import Controller, Specification, UncertainPlant, certify, synthesise, synthesise_jointly
 from control_design.analysis.joint_coverage import SampledLoop, joint_coverage
 from control_design.analysis.worst_case import worst_case, worst_of
 from control_design.plants.ellipses import scale_to_minus_one
-from validation.example_plants import (
-    LinkUncertainty,
-    Scenario,
-    flexible_link,
-    flexible_link_specification,
-)
+from validation.example_plants import LinkUncertainty, Scenario, flexible_link, flexible_link_specification
 from workflow.text.templates import said
 
 BRUTE = 400_000

@@ -103,10 +103,7 @@ def design(part: str, ratio: float | None, seed: int) -> dict[str, Any]:
     if part == "exact":
         plant = UncertainPlant("link without ellipses", plant.nominal)
     specification = flexible_link_specification(ORDER).model_copy(
-        update={
-            "mode_peak_ratio": ratio,
-            "controller_damping": CONTROLLER_DAMPING if damped else None,
-        }
+        update={"mode_peak_ratio": ratio, "controller_damping": CONTROLLER_DAMPING if damped else None}
     )
     result = synthesise([plant], specification, OPTIONS, rng=np.random.default_rng(seed))
     certificate = certify(result.controller, [plant], specification)

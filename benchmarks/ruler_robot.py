@@ -164,11 +164,7 @@ def linear_fit(data: Real) -> dict[str, float]:
     return dict(zip(GUESS, map(float, np.exp(found.x)), strict=True))
 
 
-def case(
-    folder: Path,
-    fitted: tuple[int, ...] = (50, 75),
-    judged: tuple[int, ...] = (50, 75),
-) -> PlantCase:
+def case(folder: Path, fitted: tuple[int, ...] = (50, 75), judged: tuple[int, ...] = (50, 75)) -> PlantCase:
     """Stated: linear fit of the third repeat at amplitude 50. Fitted: first repeats. Judged: second repeats.
 
     Noise is the scatter between repeats, of which there are three at each amplitude.

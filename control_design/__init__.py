@@ -10,10 +10,7 @@ from control_design.analysis.closed_loop import (
 )
 from control_design.controllers.c_code import c_source
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import (
-    ReferenceFilterOptions,
-    design_reference_filter,
-)
+from control_design.convex.reference_filter import ReferenceFilterOptions, design_reference_filter
 from control_design.convex.youla import YoulaOptions, youla_bracket
 from control_design.plants.ellipses import Ellipses
 from control_design.plants.guards import Guard
@@ -23,11 +20,7 @@ from control_design.specification import Specification, SpecificationError
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.synthesis import SynthesisOptions, synthesise
-from control_design.synthesis.synthesis_result import (
-    Outcome,
-    SynthesisError,
-    SynthesisResult,
-)
+from control_design.synthesis.synthesis_result import Outcome, SynthesisError, SynthesisResult
 
 __all__ = [
     "Certificate",

@@ -181,10 +181,7 @@ class Diagnosis:
 
 
 def diagnose(
-    case: CaseOfMachine,
-    *,
-    progress: Progress | None = None,
-    rng: np.random.Generator | None = None,
+    case: CaseOfMachine, *, progress: Progress | None = None, rng: np.random.Generator | None = None
 ) -> Diagnosis:
     """Search, weigh, and answer.
 
@@ -251,10 +248,7 @@ def diagnose(
 
 
 def _to_part(
-    case: Case,
-    hypotheses: Sequence[Hypothesis],
-    weighed: Probabilities,
-    alike: Sequence[Hypothesis],
+    case: Case, hypotheses: Sequence[Hypothesis], weighed: Probabilities, alike: Sequence[Hypothesis]
 ) -> tuple[CompetingHypothesis, ...]:
     """What the next experiment is to separate; what is unknown is one where it has a name (a look-alike)."""
     competing = competing_hypotheses(case, hypotheses, weighed.sets)

@@ -22,13 +22,7 @@ from scipy.linalg import expm
 
 from plant.kernel import CONTACT, FRICTION, GRAVITY, SINE, STRIBECK, run
 from plant.machine import Machine
-from plant.modal import (
-    MOTOR_SIDE_SHARE,
-    Equations,
-    default_n_modes,
-    equations_of_motion,
-    static_moment_kg_m,
-)
+from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion, static_moment_kg_m
 
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]

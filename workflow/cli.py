@@ -51,8 +51,7 @@ app = typer.Typer(
 )
 
 Jobs = Annotated[
-    int | None,
-    typer.Option(min=1, help="Processes on this machine [default: one per processor]"),
+    int | None, typer.Option(min=1, help="Processes on this machine [default: one per processor]")
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is taken up.")
@@ -83,8 +82,7 @@ def run(
         typer.Option(help="TOML file (see examples/ and README); without it the built-in default arm."),
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]"),
+        Path | None, typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]")
     ] = None,
     resume: Resume = False,
     replace: Replace = False,
@@ -201,12 +199,10 @@ def identify(
         typer.Option(help="Reference column of logs made in closed loop: identified in two stages."),
     ] = None,
     pairs: Annotated[
-        int | None,
-        typer.Option(min=0, max=12, help="Pole pairs [default: from the data]"),
+        int | None, typer.Option(min=0, max=12, help="Pole pairs [default: from the data]")
     ] = None,
     real: Annotated[
-        int | None,
-        typer.Option(min=0, max=8, help="Real poles [default: from the data]"),
+        int | None, typer.Option(min=0, max=8, help="Real poles [default: from the data]")
     ] = None,
     integrators: Annotated[int, typer.Option(min=0, max=3, help="Known poles at z = 1.")] = 0,
     delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
@@ -252,8 +248,7 @@ def identify(
         ),
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Write model and posterior here (npz), for `flexlink design`."),
+        Path | None, typer.Option(help="Write model and posterior here (npz), for `flexlink design`.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -309,7 +304,7 @@ def design(
         typer.Argument(
             help="Run directory; npz of `flexlink identify --out`; JSON or MAT of its --export, or with A, "
             "B, C, D, dt_s of your own model; CSV with a measured frequency response. Several: one "
-            "controller for all of them.",
+            "controller for all of them."
         ),
     ],
     specification: Annotated[
@@ -343,10 +338,7 @@ def design(
 
 
 @app.command(short_help="Write report.html of a run anew.")
-def report(
-    directory: Annotated[Path, typer.Argument(help="Run directory.")],
-    as_json: Json = False,
-) -> None:
+def report(directory: Annotated[Path, typer.Argument(help="Run directory.")], as_json: Json = False) -> None:
     """Write report.html of a run directory anew and print its table."""
     from workflow.commands.run import rebuild_report
     from workflow.engine.run_directory import RunDirectory
@@ -389,7 +381,7 @@ def diagnose(
         list[Path],
         typer.Argument(
             help="Case folder with case.toml, rig.toml and logs, or a TOML file like case.toml with a column "
-            "map beside logs of your own; several give an overview as well.",
+            "map beside logs of your own; several give an overview as well."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
@@ -404,8 +396,7 @@ def diagnose(
     resume: Resume = False,
     replace: Replace = False,
     controller: Annotated[
-        bool,
-        typer.Option(help="Compare controllers designed on the nominal rig and on the repaired one."),
+        bool, typer.Option(help="Compare controllers designed on the nominal rig and on the repaired one.")
     ] = True,
     as_json: Json = False,
 ) -> None:

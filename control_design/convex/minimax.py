@@ -317,11 +317,7 @@ class _Scaled:
         gradient *= (weight / scale)[:, None]
         if not self.constant:
             reach, curved = _norm_derivatives(
-                self._reaches,
-                q,
-                size_q,
-                np.full(size_q.size, self._reach_rounding),
-                gamma * share,
+                self._reaches, q, size_q, np.full(size_q.size, self._reach_rounding), gamma * share
             )
             gradient += (gamma / scale)[:, None] * (reach - self._levels)
             hessian += curved

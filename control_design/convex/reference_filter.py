@@ -21,22 +21,9 @@ from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
 from control_design.controllers.law import Law
-from control_design.convex.minimax import (
-    MinimaxPoint,
-    PlaneRows,
-    exchanged,
-    plane,
-    smallest_ratio,
-    turning,
-)
+from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
 from control_design.convex.youla_basis import with_constant
-from control_design.plants.ellipses import (
-    Complex,
-    Ellipses,
-    Real,
-    distance_to_minus_one,
-    largest_ratio,
-)
+from control_design.plants.ellipses import Complex, Ellipses, Real, distance_to_minus_one, largest_ratio
 from control_design.plants.frequency_grid import GridOptions, programme_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight

@@ -25,14 +25,7 @@ from pydantic import Field
 
 from control_design.analysis.grids import Grids
 from control_design.analysis.worst_case import PlantData, worst_of
-from control_design.convex.minimax import (
-    MinimaxPoint,
-    PlaneRows,
-    exchanged,
-    plane,
-    smallest_ratio,
-    turning,
-)
+from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
 from control_design.convex.youla_basis import (
     AffineLoop,
     Factors,

@@ -61,12 +61,10 @@ class Specification(BaseModel):
         default=0.5, gt=0, lt=1, description="smallest distance of the loop from -1 (1/max|S|)"
     )
     effort_limit: _Positive | None = Field(
-        default=None,
-        description="largest |K S|, input unit per measured unit; none = not limited",
+        default=None, description="largest |K S|, input unit per measured unit; none = not limited"
     )
     effort_rolloff_rad_s: _Positive | None = Field(
-        default=None,
-        description="above it the limit on |K S| falls with 1/frequency",
+        default=None, description="above it the limit on |K S| falls with 1/frequency"
     )
     delay_margin_s: _Positive | None = Field(
         default=None, description="extra loop delay that must not destabilise, s"
@@ -89,12 +87,10 @@ class Specification(BaseModel):
         description="band of the damping requirement; none = a factor 1.5 either side of the lowest mode",
     )
     input_limit: _Positive | None = Field(
-        default=None,
-        description="saturation of the command (both signs), input unit",
+        default=None, description="saturation of the command (both signs), input unit"
     )
     rate_limit: _Positive | None = Field(
-        default=None,
-        description="largest change of the command, input unit per second",
+        default=None, description="largest change of the command, input unit per second"
     )
     controller_order: int = Field(default=4, ge=1, le=16, description="number of controller states")
     structure: Literal["biquads", "pi_d_notch"] = Field(

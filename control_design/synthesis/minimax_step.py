@@ -85,14 +85,7 @@ def minimax_step(
 
 
 def _direction(
-    factor: Real,
-    matrix: Real,
-    dual: Real,
-    primal: Real,
-    centre: Real,
-    slack: Real,
-    z: Real,
-    ratio: Real,
+    factor: Real, matrix: Real, dual: Real, primal: Real, centre: Real, slack: Real, z: Real, ratio: Real
 ) -> tuple[Real, Real, Real]:
     """Newton direction (dv, dslack, dz) of the perturbed optimality conditions."""
     right = -dual - ((z * primal - centre) / slack) @ matrix

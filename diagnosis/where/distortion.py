@@ -112,14 +112,7 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
         unrepeated.append(float(np.sqrt(2 * np.sum(rest) / freedom)))
     low, high = (float(np.sqrt(chi2.ppf(q, freedom) / freedom)) for q in (0.025, 0.975))
     return PeriodicFinding(
-        x.name,
-        period,
-        count,
-        tuple(bands),
-        tuple(shown),
-        tuple(unrepeated),
-        (low, high),
-        separable,
+        x.name, period, count, tuple(bands), tuple(shown), tuple(unrepeated), (low, high), separable
     )
 
 

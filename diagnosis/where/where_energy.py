@@ -89,9 +89,7 @@ def experiment_gaps(residuals: Mapping[str, Real], level: float) -> tuple[Experi
     each = level / (3 * len(energies))
     return tuple(
         ExperimentGap(
-            name,
-            part_gap(total(parts), whole, each),
-            tuple(part_gap(part, whole, each) for part in parts),
+            name, part_gap(total(parts), whole, each), tuple(part_gap(part, whole, each) for part in parts)
         )
         for name, parts in energies.items()
     )

@@ -75,8 +75,7 @@ class IdentOptions(BaseModel):
     )
 
     algorithm: Algorithm = Field(
-        "DIRECT_L",
-        description="NLopt's DIRECT variants (DIRECT_L is GN_DIRECT_L), or scipy's",
+        "DIRECT_L", description="NLopt's DIRECT variants (DIRECT_L is GN_DIRECT_L), or scipy's"
     )
     coordinates: Literal["log", "raw"] = Field(
         "log",

@@ -268,9 +268,7 @@ def _far_from_zero(records: Sequence[Record], data: Regression) -> list[Finding]
 
 
 def excitation_limit_rad_s(
-    records: Sequence[Record],
-    model: GobfModel | None = None,
-    residuals: Sequence[RealArray] = (),
+    records: Sequence[Record], model: GobfModel | None = None, residuals: Sequence[RealArray] = ()
 ) -> float:
     """Highest frequency at which the input of any record is there, rad/s.
 

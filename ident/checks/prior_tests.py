@@ -62,11 +62,7 @@ def fixed_poles_test(
     """Poles fixed by the user against as many free ones, from where they are and searched anew."""
     k, fixed, poles = given.data.structure.integrators, given.search.fixed, given.poles
     options = given.search.options.model_copy(
-        update={
-            "fixed_poles": (),
-            "n_real": poles.real.size - k,
-            "n_pairs": poles.pairs.size,
-        }
+        update={"fixed_poles": (), "n_real": poles.real.size - k, "n_pairs": poles.pairs.size}
     )
     small = PoleSearch(prepare(*searched), options)
     ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small).run()]

@@ -11,13 +11,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from ident.data.arrays import ComplexArray, RealArray
-from ident.data.ellipses import (
-    Ellipses,
-    chi2_radius,
-    ellipse_distance,
-    relative_deficit,
-    standard_axes,
-)
+from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relative_deficit, standard_axes
 from ident.data.record_files import Table, read_table
 
 # A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by

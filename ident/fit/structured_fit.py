@@ -18,13 +18,7 @@ import numpy as np
 from ident.basis.poles import Poles
 from ident.basis.relative_degree import conditions, conditions_with_sensitivities, null_space
 from ident.data.arrays import ComplexArray, RealArray
-from ident.fit.least_squares import (
-    LinearFit,
-    Projection,
-    Regression,
-    block_states,
-    project,
-)
+from ident.fit.least_squares import LinearFit, Projection, Regression, block_states, project
 from ident.fit.problem import Linearisation
 from ident.fit.refinement import Bounds, Refined, free_optimality, refine
 

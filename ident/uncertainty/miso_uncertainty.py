@@ -91,11 +91,7 @@ def _free_states(identification: MisoIdentification) -> npt.NDArray[np.intp]:
 
 
 def _covariance_factor(
-    data: Regression,
-    poles: Poles,
-    projection: Projection,
-    free: npt.NDArray[np.intp],
-    noise_std: float,
+    data: Regression, poles: Poles, projection: Projection, free: npt.NDArray[np.intp], noise_std: float
 ) -> RealArray:
     """F (P, P) with F F^T the covariance of [coefficients of all channels, direct terms, states' weights]."""
     states = block_states(data, poles, fitted_output(data, projection))[free]

@@ -266,10 +266,7 @@ class JointCompliance(Effect):
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
         k = scales.link_stiffness_Nm_rad
-        axes = [
-            log_axis("stiffness_Nm_rad", 0.05 * k, 1e4 * k),
-            log_axis("damping_Nms", 1e-6 * k, 100 * k),
-        ]
+        axes = [log_axis("stiffness_Nm_rad", 0.05 * k, 1e4 * k), log_axis("damping_Nms", 1e-6 * k, 100 * k)]
         # Damping in proportion to the stiffness: time constants, not torques.
         points = product(geometric(0.2 * k, 1e3 * k, 12), [3e-4, 3e-3, 2e-2])
         return (cls._candidate(axes, ((kj, time_s * kj) for kj, time_s in points), grows=False),)

@@ -160,10 +160,7 @@ def test_a_resonance_the_grid_does_not_know_is_found_by_the_bounds():
             _, needle = self._needle(Intervals(omega_rad_s, np.zeros(omega_rad_s.size), _DT))
             size = np.abs(needle.value) ** 2
             return ResponseRecord(
-                omega_rad_s,
-                record.centre,
-                record.covariance + size[:, None, None] * np.eye(2),
-                level,
+                omega_rad_s, record.centre, record.covariance + size[:, None, None] * np.eye(2), level
             )
 
         def _needle(self, intervals: Intervals) -> tuple[FirstOrder, FirstOrder]:

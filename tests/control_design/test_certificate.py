@@ -6,13 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from control_design import (
-    Channel,
-    LoopFunction,
-    Specification,
-    UncertainPlant,
-    certify,
-)
+from control_design import Channel, LoopFunction, Specification, UncertainPlant, certify
 from validation.example_plants import ResponseRecord
 
 from .plants import RelativeDisc, gain, hub_arm, tip_acceleration, uncertain_hub

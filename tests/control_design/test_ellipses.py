@@ -74,8 +74,7 @@ def test_ellipse_of_a_covariance_is_the_set_of_the_chi_square_quantile():
 
 
 @pytest.mark.parametrize(
-    "covariance",
-    [[[1, 2], [2, 1]], [[1, 0.5], [-0.5, 1]], [[np.nan, 0], [0, 1]], [[-1, 0], [0, -1]]],
+    "covariance", [[[1, 2], [2, 1]], [[1, 0.5], [-0.5, 1]], [[np.nan, 0], [0, 1]], [[-1, 0], [0, -1]]]
 )
 def test_a_covariance_that_is_none_is_refused_with_its_frequency(covariance):
     both = np.array([np.eye(2), covariance])

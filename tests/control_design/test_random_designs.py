@@ -6,14 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from benchmarks.random_designs import (
-    LOW_EFFORT,
-    RADIUS,
-    SAMPLED,
-    random_case,
-    state_space,
-    unstable_samples,
-)
+from benchmarks.random_designs import LOW_EFFORT, RADIUS, SAMPLED, random_case, state_space, unstable_samples
 from control_design import Controller, Outcome, Specification, certify, synthesise
 
 

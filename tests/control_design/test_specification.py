@@ -121,11 +121,7 @@ def test_weights_must_be_stable_and_proper(numerator, denominator, message):
 def test_weights_are_the_formulas_of_their_words(integrators):
     s = 1j * np.geomspace(1e-3, 1e4, 60)
     spec = Specification(
-        bandwidth_rad_s=3.0,
-        integrator=True,
-        modulus_margin=0.4,
-        effort_limit=5.0,
-        effort_rolloff_rad_s=40.0,
+        bandwidth_rad_s=3.0, integrator=True, modulus_margin=0.4, effort_limit=5.0, effort_rolloff_rad_s=40.0
     )
     corner = 3.0 * np.sqrt(2 - 0.4**2)
     expected = (0.4 * s + corner) / s * ((s + corner / 20) / s) ** integrators

@@ -181,10 +181,7 @@ def test_damping_of_the_measured_output_over_ellipses():
     certificate = certify(result.controller_or_raise(), [plant], specification)
     assert certificate.certified
     assert certificate.gamma < 0.97
-    mode = min(
-        certificate.plants[0].closed_loop_modes,
-        key=lambda m: abs(m.omega_rad_s - 15),
-    )
+    mode = min(certificate.plants[0].closed_loop_modes, key=lambda m: abs(m.omega_rad_s - 15))
     assert mode.zeta > 0.05  # open loop 0.015
 
 

@@ -329,8 +329,7 @@ def test_recorded_saturation_shows_in_the_one_experiment_that_saturates(gap_case
 
 
 @pytest.mark.parametrize(
-    ("name", "route", "axis"),
-    [("gravity", "hub_torque", "angle"), ("sensor_drift", "tip", "time")],
+    ("name", "route", "axis"), [("gravity", "hub_torque", "angle"), ("sensor_drift", "tip", "time")]
 )
 def test_recorded_gap_is_read_as_a_function_of_its_own_variable(gap_cases, name, route, axis):
     curve = _recorded(gap_cases, name).best_curve

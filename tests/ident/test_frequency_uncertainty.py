@@ -25,11 +25,7 @@ def single(covariance, centre=1 + 2j, level=0.95):
     return FrequencyUncertainty(np.array([1.0]), np.array([centre]), covariance[None], DT, level)
 
 
-@given(
-    major=st.floats(-12, 3),
-    ratio=st.floats(-6, 0),
-    angle=st.floats(0, np.pi),
-)
+@given(major=st.floats(-12, 3), ratio=st.floats(-6, 0), angle=st.floats(0, np.pi))
 def test_axes_come_back_from_any_covariance(major, ratio, angle):
     s1, s2 = 10.0**major, 10.0 ** (major + ratio)
     ellipse = single(covariance_of(s1, s2, angle)).ellipse()

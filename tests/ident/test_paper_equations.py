@@ -509,10 +509,7 @@ def test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum(algorithm)
     low, high = space.coordinates(np.array([[0.0, 0.0], [1.0, 1.0]]))
     start = (np.array([beta, gamma]) - low) / (high - low)
     best = scipy.optimize.minimize(
-        cost.log,
-        start,
-        method="Nelder-Mead",
-        options={"xatol": 1e-8, "fatol": 1e-12},
+        cost.log, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-12}
     )
     # 1500 evaluations leave boxes of 3^-8 or less around the optimum.
     np.testing.assert_allclose(points[np.argmin(values)], best.x, atol=3.0**-8)

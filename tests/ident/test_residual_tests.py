@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.checks.residual_tests import (
-    independence_test,
-    residual_advice,
-    whiteness_test,
-)
+from ident.checks.residual_tests import independence_test, residual_advice, whiteness_test
 from ident.finding import FindingKind, finding
 
 

@@ -204,10 +204,7 @@ def test_a_parametric_effect_is_the_rig_with_that_parameter():
 @pytest.mark.parametrize(
     ("entry", "complaint"),
     [
-        (
-            {"name": "gravitation", "g": 1.0},
-            r"^unknown effect 'gravitation'; known effects: input_delay, ",
-        ),
+        ({"name": "gravitation", "g": 1.0}, r"^unknown effect 'gravitation'; known effects: input_delay, "),
         ({"torque_Nm": 1.0}, r"^effect without a name; known effects: "),
         ({"name": ["a"]}, r"^unknown effect \['a'\]"),
         ("coulomb_friction", "^an effect is a table"),

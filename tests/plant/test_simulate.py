@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim
 
-from plant import (
-    EFFECTS,
-    SampledArm,
-    linear_arm,
-    paper_link,
-    parse_effect,
-    parse_effects,
-    prbs,
-    simulate,
-)
+from plant import EFFECTS, SampledArm, linear_arm, paper_link, parse_effect, parse_effects, prbs, simulate
 from tests.plant.test_effects import EXAMPLES
 
 RIG = paper_link()

@@ -303,10 +303,7 @@ def changed(**changes):
         (changed(B=[[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), "B is 3x2, expected 3x1"),
         (changed(A=[[1.0, "x"], [0.0, 1.0]]), "matrix of real numbers"),
         (changed(C=[[1.0, float("nan"), 0.0]]), "not finite"),
-        (
-            document(control.ss([[1.0]], [[0.1]], [[1.0]], [[0.0]], DT_S)),
-            "1 of its poles at z = 1 (int",
-        ),
+        (document(control.ss([[1.0]], [[0.1]], [[1.0]], [[0.0]], DT_S)), "1 of its poles at z = 1 (int"),
         (
             document(control.ss([[0.6, -0.8], [0.8, 0.6]], [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]], DT_S)),
             "on the unit circle away from z = 1",

@@ -12,12 +12,7 @@ import pytest
 
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
-from workflow.engine.run_directory import (
-    RunDirectory,
-    default_directory,
-    first_difference,
-    hash_of,
-)
+from workflow.engine.run_directory import RunDirectory, default_directory, first_difference, hash_of
 
 CONFIG = {"run": {"name": "a", "seed": 1}, "channels": [{"input": "u", "output": "y"}]}
 

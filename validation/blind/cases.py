@@ -245,11 +245,7 @@ def _run(
 
 
 def _answer(
-    sort: Sort,
-    rig: Rig,
-    tolerances: dict[str, float],
-    effects: list[Table],
-    records: tuple[Record, ...],
+    sort: Sort, rig: Rig, tolerances: dict[str, float], effects: list[Table], records: tuple[Record, ...]
 ) -> dict[str, Any]:
     """As the answer files of the labelled cases, and besides what only a sealed label needs."""
     largest = max(float(np.max(record.ratio)) for record in records)

@@ -34,13 +34,7 @@ from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress
-from workflow.engine.storage import (
-    read_json,
-    sha256_of_file,
-    write_bytes,
-    write_json,
-    write_text,
-)
+from workflow.engine.storage import read_json, sha256_of_file, write_bytes, write_json, write_text
 from workflow.engine.store import Store
 from workflow.tasks.summary import RunSummary
 
@@ -125,12 +119,7 @@ def _begin(store: BlindDirectory, settings: Mapping[str, Any], resume: bool) -> 
 
 
 def _sealed_cases(
-    out: Path,
-    n_cases: int,
-    seed: int,
-    jobs: int,
-    only: Sort | None,
-    progress: Progress,
+    out: Path, n_cases: int, seed: int, jobs: int, only: Sort | None, progress: Progress
 ) -> None:
     """Cases and closed seal; an interrupted generation goes on where it stopped."""
     taken_up = (out / COMMITMENT).is_file()
@@ -147,15 +136,7 @@ def _sealed_cases(
             count += 1
             update(count / n_cases, f"{count} of {n_cases}")
 
-        answers = generate(
-            n_cases,
-            seed,
-            out / "cases",
-            jobs=jobs,
-            only=only,
-            finished=finished,
-            keep=keep,
-        )
+        answers = generate(n_cases, seed, out / "cases", jobs=jobs, only=only, finished=finished, keep=keep)
         close_seal(out, answers)
         shutil.rmtree(parts)
 

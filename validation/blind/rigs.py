@@ -78,10 +78,7 @@ def draw_rig(rng: np.random.Generator) -> Rig:
             "gear_ratio": gear,
         },
         "payload": {"mass_kg": payload},
-        "sensors": {
-            "hub_angle_noise_rad": log(0.0006, 0.0015),
-            "tip_noise_m": log(0.0006, 0.0015),
-        },
+        "sensors": {"hub_angle_noise_rad": log(0.0006, 0.0015), "tip_noise_m": log(0.0006, 0.0015)},
         "sampling": {"dt_s": 0.005 if rng.random() < 0.75 else 0.004},
     }
     return {

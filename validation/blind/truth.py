@@ -268,11 +268,7 @@ class Truth:
             K[...] += k * np.outer(d, d)
             C[...] += c * np.outer(d, d)
 
-        bodies = (
-            (BASE, p.base_inertia),
-            (MOTOR, p.motor_inertia),
-            (HUB, p.hub_inertia),
-        )
+        bodies = ((BASE, p.base_inertia), (MOTOR, p.motor_inertia), (HUB, p.hub_inertia))
         for body, inertia in bodies:
             M[:R, :R] += inertia * np.outer(couple[body], couple[body])
         ground = np.zeros(R)

@@ -37,12 +37,7 @@ def arx(record: Record, na: int, nb: int, *, delay_samples: int = 1) -> Polynomi
 
 
 def oe(
-    record: Record,
-    nb: int,
-    nf: int,
-    *,
-    delay_samples: int = 1,
-    arx_start: bool = True,
+    record: Record, nb: int, nf: int, *, delay_samples: int = 1, arx_start: bool = True
 ) -> PolynomialModel:
     """y = (B / F) u + e by prediction-error minimisation: nb coefficients in B, nf in F, F stable.
 
@@ -59,13 +54,7 @@ def oe(
 
 
 def armax(
-    record: Record,
-    na: int,
-    nb: int,
-    nc: int,
-    *,
-    delay_samples: int = 1,
-    output_error_start: bool = True,
+    record: Record, na: int, nb: int, nc: int, *, delay_samples: int = 1, output_error_start: bool = True
 ) -> PolynomialModel:
     """A y = B u + C e by prediction-error minimisation: na, nb, nc coefficients, C stable (A need not be).
 

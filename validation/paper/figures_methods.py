@@ -57,11 +57,7 @@ def draw_simulation(results: PaperResults) -> Figure:
     omega = shown.omega_rad_s
     curves = [
         Curve("simulated plant", shown.truth, TRUTH_LINE),
-        Curve(
-            "GOBF, DIRECT alone in the raw box",
-            results.recipe.frequency_response(omega),
-            RECIPE_LINE,
-        ),
+        Curve("GOBF, DIRECT alone in the raw box", results.recipe.frequency_response(omega), RECIPE_LINE),
         Curve("GOBF, this project", shown.models["GOBF"].frequency_response(omega), METHOD_LINES["GOBF"]),
     ]
     return _bode(shown, curves, "Simulation: plant and GOBF model of order 4")

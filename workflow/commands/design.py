@@ -16,12 +16,7 @@ from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, writ
 from workflow.tasks.design import certify_asked, find_design, joint_numbers
 from workflow.tasks.design_source import DesignFile, load_sources, read_design_file
 from workflow.tasks.reference_filter import check_filter, find_filter
-from workflow.tasks.results import (
-    AchievablePerformance,
-    CertifyResult,
-    DesignResult,
-    ReferenceFilterResult,
-)
+from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, ReferenceFilterResult
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import rows_of, said
 

@@ -8,10 +8,7 @@ from typing import Any
 from workflow.engine.errors import InputError
 
 # Tables at the top: earlier name -> name now.
-RENAMED = {
-    "yardstick": "achievable_performance",
-    "prefilter": "reference_filter",
-}
+RENAMED = {"yardstick": "achievable_performance", "prefilter": "reference_filter"}
 
 
 class RenamedKeyWarning(FutureWarning):

@@ -18,11 +18,7 @@ from control_design.synthesis.synthesis import SynthesisOptions
 from ident.basis.options import IdentOptions
 from ident.uncertainty.embedding import EmbeddingOptions
 from plant import ExperimentPlan
-from workflow.config.design_options import (
-    AchievableOptions,
-    CertificateOptions,
-    ReferenceFilterSettings,
-)
+from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.config.excitations import Excitation, Multisine
 from workflow.config.rig_settings import EffectTable, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated

@@ -17,12 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.analysis.certificate import certify
-from control_design.analysis.closed_loop import (
-    LinearMachine,
-    SampledMachine,
-    measure_sensitivity,
-    simulate,
-)
+from control_design.analysis.closed_loop import LinearMachine, SampledMachine, measure_sensitivity, simulate
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import Channel, UncertainPlant, modes_of

@@ -13,9 +13,7 @@ from workflow.tasks.results import RunRecord
 
 
 def identify_page(
-    result: LogIdentification,
-    inputs: Mapping[str, str],
-    progress: Callable[[float, str], None] | None = None,
+    result: LogIdentification, inputs: Mapping[str, str], progress: Callable[[float, str], None] | None = None
 ) -> str:
     """One self-contained HTML page; inputs are the files with their SHA-256. Same results, same page."""
     options, channel = result.options, log_channel(result)

@@ -14,9 +14,7 @@ def write_page(stage: StageInput) -> ReportResult:
     from workflow.report.run_report import write_report
 
     path = write_report(
-        stage.results,
-        stage.config,
-        lambda fraction, name: stage.progress.update("report", fraction, name),
+        stage.results, stage.config, lambda fraction, name: stage.progress.update("report", fraction, name)
     )
     return ReportResult(storage.sha256_of_file(path))
 

@@ -29,11 +29,7 @@ from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config.design_options import (
-    AchievableOptions,
-    CertificateOptions,
-    ReferenceFilterSettings,
-)
+from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.config.run_config import RunConfig
 from workflow.config.settings import InputPath, Section, check, read_toml
 from workflow.engine import codec, storage
@@ -60,8 +56,7 @@ class PlantSection(Section):
         "a model fitted to it, known at every frequency",
     )
     nominal: InputPath | None = Field(
-        None,
-        description="model (state space) whose poles stand for a measured response; none: one is fitted",
+        None, description="model (state space) whose poles stand for a measured response; none: one is fitted"
     )
     fit: IdentOptions = Field(
         default_factory=IdentOptions, description="how a model is fitted to a measured response"
@@ -73,8 +68,7 @@ class PlantSection(Section):
         None, gt=0, description="repeats: points farther out, in robust standard deviations, are dropped"
     )
     between_points: Literal["nothing", "linear"] = Field(
-        "nothing",
-        description="what the certificate may assume of ellipses between their own frequencies",
+        "nothing", description="what the certificate may assume of ellipses between their own frequencies"
     )
 
     @model_validator(mode="after")

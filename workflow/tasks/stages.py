@@ -16,12 +16,7 @@ from workflow.tasks.friction_check import friction_feedforward
 from workflow.tasks.identification import identify_channels
 from workflow.tasks.records import make_records
 from workflow.tasks.reference_filter import find_filter
-from workflow.tasks.results import (
-    AchievablePerformance,
-    CertifyResult,
-    DesignResult,
-    ReferenceFilterResult,
-)
+from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, ReferenceFilterResult
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.uncertainty import find_uncertainty
 
@@ -78,11 +73,7 @@ _PURPOSES = {"channels": {"__all__": {"purpose"}}}
 
 STAGES: tuple[Stage, ...] = (
     Stage(
-        "records",
-        (),
-        make_records,
-        1.0,
-        uses={"source": True, "channels": {"__all__": {"input", "output"}}},
+        "records", (), make_records, 1.0, uses={"source": True, "channels": {"__all__": {"input", "output"}}}
     ),
     Stage(
         "identify",

@@ -289,9 +289,7 @@ def scatter_of(
     if not repeated:
         return None
     flat = record_posteriors(
-        [record for group in repeated for record in group],
-        result.identification.model,
-        channel.uncertainty,
+        [record for group in repeated for record in group], result.identification.model, channel.uncertainty
     )
     omega = np.geomspace(bands[0][0], bands[-1][1] * (1 - 1e-6), 20 * len(bands))
     estimates = iter([posterior.at(omega, channel.uncertainty.level) for posterior in flat])
