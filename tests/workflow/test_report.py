@@ -139,7 +139,8 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
     for item in certificate.items:
         assert f"{item.achieved:.4g}" in text
     # Responses were sampled in a stage of their own, and the page says that instead.
-    opened = environment().get_template("certificate.j2").module.not_checked(certificate, True).splitlines()
+    standing = environment().get_template("certificate.j2").module
+    opened = standing.not_checked(certificate, True, True).splitlines()
     assert "joint level: sampled, not certified; see the sampled responses" in opened
     for line in opened:
         assert line[1:] in text
@@ -296,13 +297,20 @@ def test_missing_stage_is_one_line(tmp_path):
 
 
 def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn):
-    """A smaller peak at small excitation is put down to friction; a large gap is a warning."""
+    """A smaller peak at small excitation is put down to friction, and predicted where that was identified; a
+    large gap is a warning."""
     page = page_for(tmp_path, example.config())
     assert "measured and predicted are 0.4 % apart" in page.text
-    assert "the peak is 12 % lower than predicted: dry friction takes" in page.text
+    assert "For references from 0.002 rad to 0.2 rad (rms)" in page.text
+    assert "below 0.01 rad friction breaks the linear prediction of it by more than 5 %" in page.text
+    assert "2 of 3 peaks measured on the arm lie in the intervals" in page.text
+    assert "sticks on reference steps below 0.0013 rad (0.00120 to 0.00140)" in page.text
     assert "payload 200 %" in page.text
     assert "something <else>" in page.text
     run = RunDirectory.open(tmp_path / "run")
+    change_loop(run, friction=None)
+    text = text_of(run, example.config())
+    assert "the peak is 12 % lower than predicted: dry friction takes" in text
     loop = RunResults(run).closed_loop.check
     offs = zip(loop.sensitivity.measured, (9.0, 0.1), strict=True)
     rows = tuple(replace(row, off_nominal_percent=off) for row, off in offs)
