@@ -14,7 +14,8 @@ seeds (2007, 2008) spend a pole on dry friction, and the design then says that i
 
 Three peaks are compared: nominal (identified model with the controller), certified (worst case over the 95 %
 ellipses), measured. What should agree is measured with nominal, for the arm is one plant of the set, and
-measured should not exceed certified by more than its own scatter.
+measured should not exceed certified by more than its own scatter. What dry friction does at other sizes is
+predicted in `benchmarks.friction_in_the_loop`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import Print, main, reading
+from benchmarks.harness import Print, main
 from control_design.analysis.certificate import Certificate, certify
 from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
@@ -49,8 +50,6 @@ DRAWS = 4
 LARGE, SMALL = 0.2, 0.02  # rad rms; the records of the fit have 0.5
 PAYLOADS_KG = (0.0, 0.02, 0.04)
 BETWEEN_KG = (0.0, 0.01, 0.02, 0.03, 0.04)
-FRICTIONS_NM = (0.0, 0.02, 0.1, 0.3)
-SIZES_RAD = (0.003, 0.01, 0.03, 0.1, 0.2)
 
 
 def altered(config: RunConfig, *, seed: int | None = None, **effects: dict[str, Any]) -> RunConfig:
@@ -165,22 +164,6 @@ def several_payloads(out: Print, config: RunConfig, folder: Path) -> float:
     return off
 
 
-def friction(out: Print, config: RunConfig, folder: Path) -> None:
-    """The controller of seed 2006 on arms with other dry friction, by size of excitation."""
-    plant = identified(altered(config), folder / "friction")
-    controller, certificate = designed([plant], config)
-    bound = certificate.plants[0].worst_peak_sensitivity
-    out(f"3. Where friction breaks it: controller of seed 2006, certified {bound:.4f}; off % by rms size")
-    out("   dry friction  " + "  ".join(f"{size:>7g} rad" for size in SIZES_RAD))
-    for level in FRICTIONS_NM:
-        cells = []
-        for size in SIZES_RAD:
-            found = measured(controller, config, rms=size, seed=3, coulomb_friction={"torque_Nm": level})
-            cells.append(f"{100 * (found.peak[0] / bound - 1):+7.1f}    ")
-        out(f"   {level:8.2f} N m  " + "  ".join(cells))
-    out(reading("closed_loop_sensitivity"))
-
-
 def words(found: MeasuredSensitivity) -> str:
     """Peak, its standard deviation and place."""
     value, std, omega = found.peak
@@ -188,13 +171,12 @@ def words(found: MeasuredSensitivity) -> str:
 
 
 def run(out: Print, *, seeds: int = 5) -> None:
-    """The three tables."""
+    """The two tables."""
     config, _ = built_in_config()
     with tempfile.TemporaryDirectory() as folder:
         same_plant(out, config, seeds, Path(folder))
         several_payloads(out, config, Path(folder))
-        friction(out, config, Path(folder))
 
 
 if __name__ == "__main__":
-    main(run, seeds="{seeds} records from 2006, payloads 7, friction 3")
+    main(run, seeds="{seeds} records from 2006, payloads 7")

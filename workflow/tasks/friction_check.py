@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from control_design.analysis.closed_loop import simulate
 from control_design.controllers.controller import Controller
-from control_design.controllers.feedforward import FrictionFeedforward
 from ident.friction import FrictionFit
 from workflow.config.run_config import SimulatedSource
-from workflow.tasks.friction_loop import FrictionLoop, Interval, drawn, interval_of
+from workflow.tasks.friction_loop import (
+    FrictionLoop,
+    Interval,
+    drawn,
+    friction_feedforward,
+    interval_of,
+    predicted_peak,
+)
 from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples
 from workflow.tasks.results import FrictionCheck, SensitivityCheck, SlowSine
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine
@@ -29,20 +36,6 @@ _SHARES = (1.0, 0.3, SMALL, 0.03, 0.01)
 # The sine's period is so many times the delay of the loop; its linear error is 2 pi over that.
 _SLOW, _LONGEST = 300.0, 20_000
 _SINE_SHARE = 0.2  # of the reference step
-
-
-def low_frequency_delay_s(stage: StageInput, controller: Controller) -> float:
-    """Delay of T = G K / (1 + G K), as identified, towards standstill; a sample at least."""
-    omega = np.array([1e-5 * np.pi / controller.dt_s])
-    loop = controller.response(omega) * stage.plant.channel.nominal_response(omega)
-    return max(float(-np.angle(loop / (1 + loop))[0] / omega[0]), controller.dt_s)
-
-
-def friction_feedforward(stage: StageInput, controller: Controller) -> FrictionFeedforward:
-    """From the identified friction and the loop's own delay."""
-    found = stage.results.identify.friction
-    assert found is not None  # or the configuration had been refused
-    return FrictionFeedforward(found.level, found.presliding, low_frequency_delay_s(stage, controller))
 
 
 def check_friction(
@@ -69,12 +62,8 @@ def check_friction(
     for k, (name, share) in enumerate(zip(names, _SHARES, strict=True)):
         excitation = plan.excitation(share)
         noise = stage.rng("closed_loop", "friction noise", name)
-        low[k], high[k] = interval_of(
-            [
-                loop.sensitivity(stage.rng("closed_loop", "sensitivity", name), noise, **excitation).peak[0]
-                for loop in loops
-            ]
-        )
+        phases = partial(stage.rng, "closed_loop", "sensitivity", name)
+        low[k], high[k] = predicted_peak(loops, phases, noise, **excitation)
         if sensitivity is not None and name.isdigit():
             measured[k] = sensitivity.measured[int(name)].peak
         elif sensitivity is not None:
@@ -132,13 +121,13 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
     identified arm with its friction; after the first quarter of a period."""
     found = stage.results.identify.friction
     assert found is not None
-    delay_s = low_frequency_delay_s(stage, controller)
-    period = int(min(_SLOW * delay_s / controller.dt_s, _LONGEST))
+    forward = friction_feedforward(controller, found)
+    period = int(min(_SLOW * forward.lag_s / controller.dt_s, _LONGEST))
     reference = amplitude * np.sin(2 * np.pi * np.arange(round(1.25 * period)) / period)
     given = stage.results.reference_filter.filter
     reference = reference if given is None else given.filtered(reference)
     errors = []
-    for feedforward in (None, friction_feedforward(stage, controller)):
+    for feedforward in (None, forward):
         law = replace(controller, feedforward=feedforward)
         noise = stage.rng("closed_loop", "slow sine")
         if on_arm:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,7 @@ from scipy.stats import t as student
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, MeasuredSensitivity, sensitivity_of
 from control_design.controllers.controller import Controller
+from control_design.controllers.feedforward import FrictionFeedforward
 from ident.friction import FrictionFit
 from ident.friction.loop import loop_through
 
@@ -129,6 +130,25 @@ def drawn(
         level = max(found.level + float(moved[-1]), 0.0)
         loops.append(FrictionLoop(controller, found, found.coefficients + moved[:-1], level, **steps))
     return loops
+
+
+def predicted_peak(
+    loops: Sequence[FrictionLoop],
+    phases: Callable[[], np.random.Generator],
+    noise: np.random.Generator,
+    **excitation: Any,
+) -> Interval:
+    """95 % interval of the peak of |S| as it would be measured with the excitation of `sensitivity_of`, whose
+    phases (the same in every call) are known; arm, friction and noise are those of the loops."""
+    return interval_of([loop.sensitivity(phases(), noise, **excitation).peak[0] for loop in loops])
+
+
+def friction_feedforward(controller: Controller, found: FrictionFit) -> FrictionFeedforward:
+    """Of the identified level, as late as T = G K / (1 + G K) is towards standstill."""
+    omega = np.array([1e-5 * np.pi / controller.dt_s])
+    loop = controller.response(omega) * found.model.frequency_response(omega)
+    delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
+    return FrictionFeedforward(found.level, found.presliding, max(delay_s, controller.dt_s))
 
 
 def interval_of(values: Sequence[float], level: float = 0.95) -> Interval:

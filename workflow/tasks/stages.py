@@ -12,7 +12,7 @@ from workflow.engine.errors import naming
 from workflow.tasks.achievable_performance import UNKNOWN_TO_BRACKET, find_bracket
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import certify_asked, find_design
-from workflow.tasks.friction_check import friction_feedforward
+from workflow.tasks.friction_loop import friction_feedforward
 from workflow.tasks.identification import identify_channels
 from workflow.tasks.records import make_records
 from workflow.tasks.reference_filter import find_filter
@@ -63,8 +63,9 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
         )
     with naming("reference filter"):
         found = find_filter(synthesis.controller, [stage.plant], settings)
-    if stage.config.closed_loop.friction_feedforward:
-        found = replace(found, feedforward=friction_feedforward(stage, synthesis.controller))
+    friction = stage.results.identify.friction
+    if stage.config.closed_loop.friction_feedforward and friction is not None:
+        found = replace(found, feedforward=friction_feedforward(synthesis.controller, friction))
     return found
 
 
