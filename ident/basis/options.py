@@ -10,7 +10,6 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 
 Algorithm = Literal[
-    "DIRECT_L",
     "GN_DIRECT_L",
     "GN_DIRECT",
     "GN_DIRECT_NOSCAL",
@@ -19,8 +18,6 @@ Algorithm = Literal[
     "GN_DIRECT_L_RAND_NOSCAL",
     "GN_ORIG_DIRECT",
     "GN_ORIG_DIRECT_L",
-    "SCIPY_DIRECT",
-    "SCIPY_DIRECT_L",
 ]
 
 
@@ -74,9 +71,7 @@ class IdentOptions(BaseModel):
         "drift), poles and coefficients are sought behind a noise model",
     )
 
-    algorithm: Algorithm = Field(
-        "DIRECT_L", description="NLopt's DIRECT variants (DIRECT_L is GN_DIRECT_L), or scipy's"
-    )
+    algorithm: Algorithm = Field("GN_DIRECT_L", description="NLopt's variants of DIRECT")
     coordinates: Literal["log", "raw"] = Field(
         "log",
         description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the "

@@ -1,10 +1,11 @@
-"""DIRECT over the unit cube: NLopt's variants and scipy's, recorded point by point."""
+"""DIRECT over the unit cube: NLopt's variants, recorded point by point."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import nlopt
 import numba
 import numpy as np
 
@@ -27,37 +28,21 @@ def minimise(
         costs.append(value)
         return value
 
-    if algorithm.startswith("SCIPY"):
-        from scipy.optimize import Bounds, direct
-
-        direct(
-            recorded,
-            Bounds(np.zeros(dimension), np.ones(dimension)),
-            maxfun=evaluations,
-            maxiter=evaluations,
-            vol_tol=0.0,
-            len_tol=0.0,
-            locally_biased=algorithm.endswith("_L"),
-        )
-    else:
-        import nlopt
-
-        if "RAND" in algorithm:
-            # These variants draw from NLopt's own generator; a fixed seed keeps the search reproducible.
-            nlopt.srand(1)
-        name = "GN_DIRECT_L" if algorithm == "DIRECT_L" else algorithm
-        problem = nlopt.opt(getattr(nlopt, name), dimension)
-        problem.set_lower_bounds(np.zeros(dimension))
-        problem.set_upper_bounds(np.ones(dimension))
-        problem.set_min_objective(recorded)
-        problem.set_maxeval(evaluations)
-        try:
-            problem.optimize(np.full(dimension, 0.5))
-        except nlopt.runtime_error:
-            # The original DIRECT may fill its tables in mid-iteration (noise-free data) and report a bare
-            # failure; the points it looked at are a search all the same.
-            if not points:
-                raise
+    if "RAND" in algorithm:
+        # These variants draw from NLopt's own generator; a fixed seed keeps the search reproducible.
+        nlopt.srand(1)
+    problem = nlopt.opt(getattr(nlopt, algorithm), dimension)
+    problem.set_lower_bounds(np.zeros(dimension))
+    problem.set_upper_bounds(np.ones(dimension))
+    problem.set_min_objective(recorded)
+    problem.set_maxeval(evaluations)
+    try:
+        problem.optimize(np.full(dimension, 0.5))
+    except nlopt.runtime_error:
+        # The original DIRECT may fill its tables in mid-iteration (noise-free data) and report a bare
+        # failure; the points it looked at are a search all the same.
+        if not points:
+            raise
     return np.array(points), np.array(costs)
 
 

@@ -85,7 +85,7 @@ def test_best_points_are_apart():
     np.testing.assert_array_equal(chosen, points[[0, 2, 3]])
 
 
-@pytest.mark.parametrize("algorithm", ["GN_DIRECT_L", "SCIPY_DIRECT_L"])
+@pytest.mark.parametrize("algorithm", ["GN_DIRECT_L", "GN_ORIG_DIRECT_L"])
 def test_joint_search_finds_the_mode_and_traces_it(algorithm):
     search = searching(p1(0).record, algorithm=algorithm)
     end = search.rescan(search.joint(2, 1))
