@@ -17,6 +17,7 @@ from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
 
 _DOTS: dict[str, Any] = {"ls": "none", "marker": ".", "ms": 5, "color": "white", "mec": "black", "mew": 0.3}
+_PAIR_AXIS = "frequency of the pair [rad/s]"
 _HOLLOW: dict[str, Any] = {
     "ls": "none",
     "marker": "v",
@@ -55,13 +56,13 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     label = f"found: {surface.pole[0]:.4g} rad/s, damping {surface.pole[1]:.3g}"
     left.plot(surface.pole[:1], surface.pole[1:], **style.STAR | {"ms": 15, "mew": 0.8}, label=label)
     left.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=(zeta[0], zeta[-1]))
-    left.set(xlabel="frequency of the pair [rad/s]", ylabel="damping ratio of the pair [1]")
+    left.set(xlabel=_PAIR_AXIS, ylabel="damping ratio of the pair [1]")
     left.set_title(f"Error surface: {style.plain(channel.name, 34)}")
     _round_ticks(figure.colorbar(filled, ax=left, pad=0.01, aspect=30), levels)
     right.plot(omega, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
     right.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]))
-    right.set(xlabel="frequency of the pair [rad/s]", ylabel="residual RMS / smallest [1]")
+    right.set(xlabel=_PAIR_AXIS, ylabel="residual RMS / smallest [1]")
     right.set_title("Along frequency, best damping")
     return figure
 

@@ -57,7 +57,7 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
     left.axhline(floor, **gap_style.FLOOR, zorder=1)
     left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
-    left.set(ylabel="residual over noise, RMS [1]", title="Held-out experiments together")
+    left.set(ylabel=gap_style.RESIDUAL_AXIS, title="Held-out experiments together")
     left.grid(visible=False, axis="x")
     for model in gaps:
         marker, offset = _LOOKS[model]
@@ -67,7 +67,7 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     largest = max(max(entry.values()) for entry in rows.values())
     right.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(largest, 2 * floor)))
     right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
-    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel="residual over noise, RMS [1]")
+    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=gap_style.RESIDUAL_AXIS)
     right.set_title("Every experiment alone")
     return figure
 
@@ -85,7 +85,7 @@ def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
     axes.axvline(floor, **gap_style.FLOOR, zorder=0)
     axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
     axes.set_yticks(at, [f"{style.plain(c['name'], 34)}: {style.plain(c['answer'], 44)}" for c in cases])
-    axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel="held-out residual over noise, RMS [1]")
+    axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"held-out {gap_style.RESIDUAL_AXIS}")
     axes.set_title("How far each gap shrinks")
     return figure
 

@@ -20,7 +20,7 @@ def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequ
     figure, (above, below) = style.panels(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
     above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
     above.set(ylabel="voltage [V]", title="Proposed experiment")
-    below.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
+    below.axhspan(-2, 2, **gap_style.NOISE_BAND)
     for signal, colour, words in zip(
         difference.T, gap_style.SENSOR_COLOURS, gap_style.SENSOR_WORDS, strict=True
     ):

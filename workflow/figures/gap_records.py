@@ -31,7 +31,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
         time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
         role = " (held out)" if experiment.role == "held_out" else ""
         for column, axes in enumerate(row):
-            axes.axhspan(-2, 2, color="#e6e6e6", lw=0, label="2 standard deviations of the sensor noise")
+            axes.axhspan(-2, 2, **gap_style.NOISE_BAND)
             for model, e in residuals.items():
                 look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
                 axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])

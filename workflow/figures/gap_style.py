@@ -19,6 +19,8 @@ WORDS: Mapping[str, str] = {
     "refit": "nominal parameters, re-estimated",
     "repaired": "effects added",
 }
+RESIDUAL_AXIS = "residual over noise, RMS [1]"
+NOISE_BAND = {"color": "#e6e6e6", "lw": 0, "label": "2 standard deviations of the sensor noise"}
 SENSOR_WORDS = ("hub angle", "tip position")
 SENSOR_COLOURS = (style.UNCERTAIN, style.HIGHLIGHT)
 # Of a share or probability bar that is not the first answer.

@@ -12,6 +12,7 @@ from workflow.figures.registry import drawing
 _LOOKS = dict(zip(SENSORS, zip(gap_style.SENSOR_WORDS, gap_style.SENSOR_COLOURS, strict=True), strict=True))
 _MOST_REGIMES = 6
 _FEW_BINS = 2
+_GAP_AXIS = "gap over noise, RMS [1]"
 _SMALLEST = 0.05  # noise deviations; less is drawn there
 _WHISKER = {"color": "#444444", "lw": 1.0}
 _REGIMES = {
@@ -51,7 +52,7 @@ def draw_bands_and_experiments(where: Where) -> Figure:
             )
             left.plot([middle, middle], np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
-    left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="gap over noise, RMS [1]")
+    left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=_GAP_AXIS)
     left.set_ylim(bottom=_SMALLEST)
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
@@ -60,7 +61,7 @@ def draw_bands_and_experiments(where: Where) -> Figure:
             right.barh(row + offset, part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
             right.plot(part.interval, [row + offset] * 2, **_WHISKER)
     right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel="gap over noise, RMS [1]")
+    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=_GAP_AXIS)
     right.set_title("By experiment and sensor")
     right.grid(visible=False, axis="y")
     left.plot([], [], **_WHISKER, label="95 % interval")

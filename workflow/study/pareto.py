@@ -33,8 +33,8 @@ def draw_pareto(study: StudyView) -> Figure:
 def _draw(axes: Axes, study: StudyView, plot: ParetoPlot, front: list[int]) -> None:
     x_column, y_column = study.column(plot.x), study.column(plot.y)
     x_label, y_label = study.heading(plot.x), study.heading(plot.y)
-    axes.set_xlabel(f"{style.plain(x_label, 40)} ({x_column.better} is better)")
-    axes.set_ylabel(f"{style.plain(y_label, 40)} ({y_column.better} is better)")
+    for say, label, column in ((axes.set_xlabel, x_label, x_column), (axes.set_ylabel, y_label, y_column)):
+        say(f"{style.plain(label, 40)} ({column.better} is better)")
     axes.set_title(style.plain(f"{y_label} against {x_label}", 70))
     at = np.array([(row.numbers[plot.x], row.numbers[plot.y]) for row in study.rows], dtype=np.float64)
     there = ~np.isnan(at).any(axis=1)
