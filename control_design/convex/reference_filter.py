@@ -30,6 +30,7 @@ from control_design.plants.weights import RationalWeight
 from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
 
+_BOUNDARY_SAMPLES = 24  # of every ellipse
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
 
 
@@ -45,7 +46,6 @@ class ReferenceFilterOptions(GridOptions):
     unit_gain: bool = Field(
         default=True, description="F(1) = 1: what the loop does with constant references stays as it is"
     )
-    boundary_samples: int = Field(default=24, ge=8, le=500, description="samples of every ellipse's boundary")
     exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")
 
 
@@ -149,7 +149,7 @@ class _Matching:
             poles = self._searched_poles()
         before = max(float(np.max(each)) for each in self._errors(Poles(), np.ones(1)))
         best = exchanged(
-            lambda _: self._coefficients(poles, self.grids, self.options.boundary_samples),
+            lambda _: self._coefficients(poles, self.grids, _BOUNDARY_SAMPLES),
             lambda x: self._errors(poles, self._full(poles, x)),
             self.grids,
             self._omegas,
@@ -177,7 +177,7 @@ class _Matching:
     def _searched_poles(self) -> Poles:
         """Simplex search of the logarithmic decay rates on thinned grids, half the samples."""
         thin = [grid[::3] for grid in self.grids]
-        samples = max(8, self.options.boundary_samples // 2)
+        samples = _BOUNDARY_SAMPLES // 2
         nyquist = np.pi / self.dt_s
         low, high = np.log(1e-5 * nyquist), np.log(0.95 * nyquist)
 

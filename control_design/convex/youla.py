@@ -41,6 +41,7 @@ from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
 
+_ELLIPSE_ROUNDS = 20  # turns of angles and Q
 Region = Literal["inscribed", "ellipse", "enclosing"]
 
 
@@ -60,7 +61,6 @@ class YoulaOptions(GridOptions):
         default=False,
         description="also bound from below by hulls of what every frequency allows; some seconds",
     )
-    ellipse_rounds: int = Field(default=20, ge=1, le=100, description="turns of angles and Q for the ellipse")
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class BracketProblem:
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         basis, loop = self._basis(data), self._loop(data)
         point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
-        for _ in range(self.options.ellipse_rounds):
+        for _ in range(_ELLIPSE_ROUNDS):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
             rows = self._rows(data, "ellipse", angles)
             new = smallest_ratio(basis, rows, start)

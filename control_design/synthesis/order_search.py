@@ -11,6 +11,7 @@ import numpy as np
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Real
 from control_design.synthesis.descent import MinimaxDescent, natural_units
+from control_design.synthesis.problem import EXCHANGE_TOLERANCE
 from control_design.synthesis.search_tasks import Candidate, StartTask, Workshop
 from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import StartReport
@@ -104,7 +105,7 @@ class OrderSearch:
         lost = [c for c in found if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
         for _ in range(_RETRIEVALS):
             best = min((c.gamma for c in kept), default=np.inf)
-            limit = best * (1 - self.options.exchange_tolerance)
+            limit = best * (1 - EXCHANGE_TOLERANCE)
             lost = different([c for c in lost if c.gamma_grid < limit], _CARRIED, on_grid=True)
             if not lost or self._enough(kept):
                 break
@@ -176,7 +177,7 @@ class OrderSearch:
         Several are carried along at first: the best on a coarse grid is often not the best on a finer one.
         In between, hops from the best look for a better valley.
         """
-        history, tolerance = [found[0].gamma], self.options.exchange_tolerance
+        history, tolerance = [found[0].gamma], EXCHANGE_TOLERANCE
         pool, fresh = different(found, _CARRIED), list[Candidate]()
         for number in range(self.options.exchange_rounds):
             self.tell(0.5 + 0.5 * number / self.options.exchange_rounds, f"exchange {number + 1}")
@@ -214,7 +215,7 @@ class OrderSearch:
         """The best alone, violated frequencies added and improved until dense check and grid agree."""
         current = best
         for _ in range(_FINISHING):
-            agreed = current.gamma <= current.gamma_grid * (1 + self.options.exchange_tolerance)
+            agreed = current.gamma <= current.gamma_grid * (1 + EXCHANGE_TOLERANCE)
             if agreed or self._enough([best]):
                 break
             self.problem.add_violated(self.cascade, current.parameters, current.gamma_grid)

@@ -20,6 +20,7 @@ from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
+EXCHANGE_TOLERANCE = 5e-4  # accepted relative excess of the dense check over the programme
 _LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points of a dense grid
 _DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
 
@@ -38,7 +39,6 @@ class Problem(Grids):
         self.options, self.guards = options, guards
         self._guarded = sorted_by_plant(guards)
         self.dt_s = plants[0].dt_s
-        self.scale = options.scale_rad_s or self.scale_rad_s
         self._loops = [NominalLoop(plant, specification.computational_delay_samples) for plant in plants]
 
     @property
@@ -168,7 +168,7 @@ class Problem(Grids):
 
     def add_violated(self, cascade: Cascade, parameters: Real, gamma_grid: float, most: int = 12) -> int:
         """Put maxima of the dense check that exceed the grid's gamma on the grids; how many were new."""
-        limit = gamma_grid * (1.0 + self.options.exchange_tolerance)
+        limit = gamma_grid * (1.0 + EXCHANGE_TOLERANCE)
         added = 0
         for position, data in self.checks(cascade, parameters):
             omega = data.ellipses.omega_rad_s
@@ -209,7 +209,7 @@ class Problem(Grids):
         of i integrators.
         """
         integrators = plant.n_integrators + int(self.spec.integrator)
-        slope = np.minimum(1.0, ellipses.omega_rad_s / self.scale) ** integrators
+        slope = np.minimum(1.0, ellipses.omega_rad_s / self.scale_rad_s) ** integrators
         scale = np.asarray(np.minimum(slope, 1.0 / np.maximum(sensitivity, 1.0)), dtype=np.float64)
         return Rows(ellipses, delay, weights, scale, self._start_window(plant), reaches_nyquist)
 

@@ -69,7 +69,7 @@ def synthesise(
     workshop = Workshop(problem)
     with WorkPool(workshop, options.jobs) as pool:
         for number, sections in enumerate(ladder):
-            lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale)
+            lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale_rad_s)
             own = np.random.default_rng([root, cascade.order])
             given: list[Real] = []
             if lower is not None and result.best is not None:

@@ -23,12 +23,6 @@ class SynthesisOptions(GridOptions):
         description="stop as soon as a stable design reaches this gamma; 0 = look for the best",
     )
     exchange_rounds: int = Field(default=4, ge=0, le=20, description="rounds of adding violated frequencies")
-    exchange_tolerance: float = Field(
-        default=5e-4,
-        gt=0,
-        lt=0.1,
-        description="accepted relative excess of the dense check over the programme",
-    )
     iterations: int = Field(
         default=100,
         ge=10,
@@ -40,9 +34,4 @@ class SynthesisOptions(GridOptions):
         ge=1,
         le=64,
         description="processes that work on the starts; the result does not depend on it",
-    )
-    scale_rad_s: float | None = Field(
-        default=None,
-        gt=0,
-        description="frequency scale of controller parameters and starts; none = from the specification",
     )

@@ -25,7 +25,7 @@ def _problem(plants: list[UncertainPlant], **fields: float) -> Problem:
 
 def _gain(problem: Problem, gain: float) -> tuple[Cascade, np.ndarray]:
     """A constant: first-order section whose zero sits on its pole."""
-    cascade = Cascade(("first_order",), problem.dt_s, problem.scale)
+    cascade = Cascade(("first_order",), problem.dt_s, problem.scale_rad_s)
     return cascade, np.array([gain, gain, 0.0])
 
 
@@ -68,12 +68,12 @@ def test_a_controller_that_rings_is_named_by_its_own_pair():
         controller_order=2, controller_damping=0.5, computational_delay_samples=0, modulus_margin=0.3
     )
     problem = Problem((UncertainPlant("lag", _LAG),), specification, SynthesisOptions(dense_points=1000))
-    cascade = Cascade(("second_order",), problem.dt_s, problem.scale)
+    cascade = Cascade(("second_order",), problem.dt_s, problem.scale_rad_s)
     corner, damping = 3.0, 0.1
     pair = [np.log(2 * damping * corner), 2 * np.log(corner)]
     found = what_destabilises(problem, cascade, np.array([0.0, 0.0, 0.1, *pair]))
     assert [point.weight for point in found] == [DAMPING]
-    assert found[0].omega_rad_s == pytest.approx(corner * problem.scale)
+    assert found[0].omega_rad_s == pytest.approx(corner * problem.scale_rad_s)
     assert found[0].value == pytest.approx(5.0)
 
 

@@ -46,7 +46,7 @@ def _damping(order: int, ratio: float = 0.3) -> Specification:
 
 def _search(specification: Specification) -> tuple[Problem, Cascade, MinimaxDescent]:
     problem = Problem((_plant(),), specification, SynthesisOptions())
-    cascade = Cascade(specification.sections(), _DT_S, problem.scale)
+    cascade = Cascade(specification.sections(), _DT_S, problem.scale_rad_s)
     descent = MinimaxDescent(
         cascade,
         problem.rows(),
@@ -132,7 +132,7 @@ def test_curvature_of_the_descent_agrees_with_finite_differences(fields):
     problem = Problem((flexible_link("B"),), flexible_link_specification(5), SynthesisOptions())
     specification = problem.spec.model_copy(update=fields | {"mode_peak_ratio": 0.5})
     problem = Problem(problem.plants, specification, SynthesisOptions())
-    cascade = Cascade(specification.sections(), problem.dt_s, problem.scale)
+    cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
     boundary = _Boundary(cascade, problem.rows()[0])
     rng = np.random.default_rng(0)
     x = 0.3 * rng.standard_normal(cascade.parameters)
