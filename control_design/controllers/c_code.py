@@ -18,12 +18,12 @@ _INPUT_LIMIT = """\
     if (command < -INPUT_LIMIT) command = -INPUT_LIMIT;
 """
 _FEEDFORWARD = """\
-    $number ahead = reference - state->behind;
-    $number turned = ahead / WIDTH;
-    if (turned > 1) turned = 1;
-    if (turned < -1) turned = -1;
-    wanted += LEVEL * turned;
-    state->behind += SHARE * ahead;
+    $number sign = (reference - state->reference) / TURN;
+    if (sign > 1) sign = 1;
+    if (sign < -1) sign = -1;
+    state->smoothed += SHARE * (sign - state->smoothed);
+    state->reference = reference;
+    wanted += LEVEL * state->smoothed;
 """
 _RATE_LIMIT = """\
     if (command > state->last + LARGEST_CHANGE) command = state->last + LARGEST_CHANGE;
@@ -93,7 +93,11 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
 
     constants, limits, given = "", "", controller.feedforward
     if given is not None:
-        named = {"LEVEL": given.level, "WIDTH": given.width, "SHARE": given.share(controller.dt_s)}
+        named = {
+            "LEVEL": given.level,
+            "TURN": given.turn(controller.dt_s),
+            "SHARE": given.share(controller.dt_s),
+        }
         constants = "".join(
             f"static const {number} {name} = {literal(value)};\n" for name, value in named.items()
         )
@@ -114,7 +118,7 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         constants=constants,
         limits=limits,
         feedforward="" if given is None else Template(_FEEDFORWARD).substitute(number=number),
-        at_rest="" if given is None else "    state->behind = 0;\n",
+        at_rest="" if given is None else "    state->reference = state->smoothed = 0;\n",
         **_names(controller, prefix, number),
     )
 
@@ -129,7 +133,7 @@ def _names(controller: Controller, prefix: str, number: Number) -> dict[str, Any
         "size": max(controller.order, 1),
         "reference": f", {number} reference" if given else "",
         "friction": " + friction feed-forward" if given else "",
-        "behind": f"    {number} behind;  /* what the loop follows, late; rests at 0 at first */\n"
+        "moving": f"    {number} reference, smoothed;  /* previous one, sign of its speed */\n"
         if given
         else "",
     }

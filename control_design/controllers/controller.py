@@ -136,15 +136,17 @@ class ControllerStepper:
         self._limit = np.inf if controller.input_limit is None else controller.input_limit
         rate = np.inf if controller.rate_limit is None else controller.rate_limit
         self._change = rate * controller.dt_s
-        self._feedforward = controller.feedforward
-        self._share = 0.0 if self._feedforward is None else self._feedforward.share(controller.dt_s)
+        self._level, self._share, self._turn = 0.0, 0.0, 1.0
+        if (given := controller.feedforward) is not None:
+            self._level, self._share = given.level, given.share(controller.dt_s)
+            self._turn = given.turn(controller.dt_s)
         self.reset()
 
     def reset(self) -> None:
         """Back to rest: zero state, previous command zero."""
         self._x = np.zeros(self._controller.order)
         self._last = 0.0
-        self._behind = 0.0
+        self._reference, self._smoothed = 0.0, 0.0
         self.limited = False
 
     def step(self, error: float, reference: float = 0.0) -> float:
@@ -152,11 +154,10 @@ class ControllerStepper:
 
         reference: the set point, which the feed-forward (if any) looks at; it rested at zero before.
         """
-        wanted = float(self._c @ self._x) + self._d * error
-        if self._feedforward is not None:
-            ahead = reference - self._behind
-            wanted += self._feedforward.at(ahead)
-            self._behind += self._share * ahead
+        sign = min(max((reference - self._reference) / self._turn, -1.0), 1.0)
+        self._smoothed += self._share * (sign - self._smoothed)
+        self._reference = reference
+        wanted = float(self._c @ self._x) + self._d * error + self._level * self._smoothed
         command = min(max(wanted, self._last - self._change), self._last + self._change)
         command = min(max(command, -self._limit), self._limit)
         self.limited = command != wanted

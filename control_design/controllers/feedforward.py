@@ -11,16 +11,17 @@ from control_design.plants.ellipses import Real
 
 @dataclass(frozen=True)
 class FrictionFeedforward:
-    """level times the sign of the speed at which the loop follows its reference.
+    """level times the smoothed sign of the reference's speed, as late as the loop follows.
 
-    What a loop follows a reference r with is r seen late; here q, r behind a first-order lag of lag_s, the
-    delay of the closed loop at low frequency. The speed of q is (r - q) / lag_s, and its sign turns round
-    while r - q goes through +-width, as the friction turns round over its pre-sliding deflection: level
-    clip((r - q) / width, -1, 1). It dies out where the reference rests, so that it drives no limit cycle, and
-    it is no feedback: poles and margins stay as they are.
+    The sign turns round while the speed goes through +-width / lag_s, at which the reference moves by the
+    pre-sliding deflection `width` while the loop answers; it then goes through a first-order lag of lag_s,
+    the delay of the closed loop towards standstill: p+ = p + share (clip(lag_s v / width, -1, 1) - p), level
+    p joins the command. It dies out where the reference rests, so that it drives no limit cycle, and it is no
+    feedback: poles and margins stay as they are. A step is over in one sample and gets next to nothing of it.
 
     level >= 0 in units of the command, width > 0 of the reference, lag_s > 0. Neglected: friction that
-    depends on speed, position or load; motion that something other than the reference causes.
+    depends on speed, position or load; motion that something other than the reference causes; a reference
+    that comes in steps longer than a sample, which counts as resting between them.
     """
 
     level: float
@@ -36,18 +37,19 @@ class FrictionFeedforward:
             )
 
     def share(self, dt_s: float) -> float:
-        """Of r - q that q catches up with in a sample."""
+        """Of its way that the lag goes in a sample."""
         return float(-np.expm1(-dt_s / self.lag_s))
 
-    def at(self, ahead: float) -> float:
-        """What joins the command where the reference is so far ahead of q."""
-        return self.level * min(max(ahead / self.width, -1.0), 1.0)
+    def turn(self, dt_s: float) -> float:
+        """Motion of the reference in a sample from which on its sign is whole."""
+        return self.width * dt_s / self.lag_s
 
     def signal(self, reference: Real, dt_s: float) -> Real:
-        """(T,) for a reference (T,) that rested at zero before."""
-        share, behind = self.share(dt_s), 0.0
+        """What joins the command, (T,), for a reference (T,) that rested at zero before."""
+        share, turn, last, smoothed = self.share(dt_s), self.turn(dt_s), 0.0, 0.0
         added = np.empty(reference.size)
         for k, wanted in enumerate(reference.tolist()):
-            added[k] = self.at(wanted - behind)
-            behind += share * (wanted - behind)
+            smoothed += share * (min(max((wanted - last) / turn, -1.0), 1.0) - smoothed)
+            last = wanted
+            added[k] = self.level * smoothed
         return added

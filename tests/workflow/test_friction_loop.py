@@ -121,19 +121,25 @@ class Slider:
 
 
 def test_feedforward_is_the_friction_of_a_pure_integrator():
-    """Its loop is a lag of first order, so that what the feed-forward follows is the output: friction and
-    feed-forward cancel wherever the lag exceeds the width, and elsewhere the slider stands."""
+    """Ten lags after a ramp has begun it equals the friction, so that the loop follows as without either; at
+    rest it is gone, and what friction leaves is that of the loop without it."""
     gain, level, width = 5.0, 0.3, 1e-4
-    lag_s = -DT_S / np.log(1 - gain * Slider.gain * DT_S)
     plain = Controller.proportional(gain, DT_S, computational_delay_samples=0)
-    law = replace(plain, feedforward=FrictionFeedforward(level, width, lag_s))
+    law = replace(plain, feedforward=FrictionFeedforward(level, width, 1 / (gain * Slider.gain)))
     time_s = np.arange(4000) * DT_S
-    reference = np.interp(time_s, [0, 2, 5, 8, 12, 20], [0, 0.5, 0.5, -0.3, 0.2, 0.2])
-    linear = simulate(plain, Slider(0.0), reference).measured
-    given = simulate(law, Slider(level), reference).measured
-    without = simulate(plain, Slider(level), reference).measured
-    assert np.max(np.abs(given - linear)) < width
-    assert np.max(np.abs(without - linear)) > 0.9 * level / gain
+    reference = np.interp(time_s, [0, 3, 5, 9, 12, 20], [0, 0.5, 0.5, -0.3, 0.2, 0.2])
+    linear, given, without = (
+        simulate(one, Slider(size), reference) for one, size in ((plain, 0.0), (law, level), (plain, level))
+    )
+    moving = ((time_s > 1) & (time_s < 3)) | ((time_s > 6) & (time_s < 9)) | ((time_s > 10) & (time_s < 12))
+    friction = np.clip(given.command, -level, level)
+    added = law.feedforward.signal(reference, DT_S)
+    # e^-10 of the level, and of twice the level where the ramp turns round.
+    np.testing.assert_allclose(added[moving], friction[moving], rtol=0, atol=1e-4 * level)
+    np.testing.assert_allclose(given.measured[moving], linear.measured[moving], rtol=0, atol=1e-4)
+    assert np.min(np.abs(without.measured - linear.measured)[moving]) > 0.9 * level / gain
+    assert abs(added[-1]) < 1e-6 * level
+    assert abs(given.measured[-1] - reference[-1]) <= level / gain
 
 
 def test_predicted_response_is_that_of_the_nonlinear_arm():
