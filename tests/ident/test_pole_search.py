@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from ident.basis.coordinates import search_space
 from ident.basis.functions import block_parameters
@@ -83,6 +84,19 @@ def test_best_points_are_apart():
     points = np.array([[0.5, 0.5], [0.52, 0.5], [0.9, 0.9], [0.1, 0.1]])
     chosen = best_apart(points, np.array([1.0, 1.1, 2.0, 3.0]), 3)
     np.testing.assert_array_equal(chosen, points[[0, 2, 3]])
+
+
+def test_a_pair_between_two_close_modes_is_split_into_both():
+    # 3 % apart, half widths of 0.5 %: one pair in the middle is what a model with a pair less ends with.
+    true = Poles.from_continuous(omega_rad_s=[19.7, 20.3, 60.0], zeta=[0.005, 0.005, 0.01], dt_s=0.005)
+    u = np.sign(np.random.default_rng(0).standard_normal(1000))
+    modes = zip((1.0, -1.0, 3.0), true.pairs, strict=True)
+    y = sum(lfilter([0.0, gain], [1.0, -2 * pole.real, abs(pole) ** 2], u) for gain, pole in modes)
+    search = searching(as_record(u, y + 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(u.size)))
+    between = Poles.from_continuous(omega_rad_s=[20.0, 60.0], zeta=[0.02, 0.01], dt_s=0.005)
+    found = search.split_pair(search.descend(between, "one pair less").poles)
+    assert found.rss < 1.02e-6 * u.size * np.var(y)
+    np.testing.assert_allclose(np.sort(found.poles.omega_rad_s(0.005)), [19.7, 20.3, 60.0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("algorithm", ["GN_DIRECT_L", "GN_ORIG_DIRECT_L"])
