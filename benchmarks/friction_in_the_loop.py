@@ -71,7 +71,7 @@ def one_arm(
     error at rest over its bound; rms errors on the sine."""
     config, _ = built_in_config()
     channel = config.control_channel
-    source = with_friction(config, torque_Nm, 16384)
+    source = with_friction(config.source, torque_Nm, 16384)
     key = [seed, FRICTIONS_NM.index(torque_Nm)]
     records = [simulate_record(source, e, seed) for e in source.records if e.role == "estimation"]
     at_hub = [record.siso(channel.input, channel.output) for record in records]
