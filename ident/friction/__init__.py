@@ -1,6 +1,17 @@
-"""Dry friction identified with the linear arm: the response behind it, as if it were not there."""
+"""Dry friction identified with the linear arm: the response behind it, and what it makes of it."""
 
+from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, input_rms
 from ident.friction.fit import FrictionFit, fit_friction
-from ident.friction.posterior import other_output_without_friction, without_friction
+from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
-__all__ = ["FrictionFit", "fit_friction", "other_output_without_friction", "without_friction"]
+__all__ = [
+    "BehindFriction",
+    "EquivalentFriction",
+    "FrictionFit",
+    "at_amplitudes",
+    "equivalent_friction",
+    "fit_friction",
+    "input_rms",
+    "other_output_without_friction",
+    "without_friction",
+]

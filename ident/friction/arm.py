@@ -18,7 +18,7 @@ from ident.friction.kernel import STRIDES, step_through
 # microradians, and at 32 steps of 5 ms the position is right to a hundredth of a milliradian.
 _SUBSTEPS = 32
 # A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped.
-_FASTEST_POLE = 2e-3
+FASTEST_POLE = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class SteppedArm:
                 "integrator and no direct term"
             )
         # Taken twice, a pole moved that little still spans the same responses to a few parts in a million.
-        real = np.maximum(poles.real, _FASTEST_POLE).astype(np.complex128)
+        real = np.maximum(poles.real, FASTEST_POLE).astype(np.complex128)
         single = np.concatenate([np.log(real), np.log(poles.pairs)]) / dt_s
         rates = np.concatenate([np.zeros(structure.integrators, np.complex128), np.repeat(single, 2)])
         chain = np.concatenate(

@@ -8,17 +8,34 @@ motion of an arm that is estimated too. Both are columns beside the basis functi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import FrictionFit, linearised, moved_to
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding import EmbeddingOptions, tangent_beside
 from ident.uncertainty.embedding_rows import Beside
+
+
+@dataclass(frozen=True, eq=False)
+class BehindFriction:
+    """What records say of an arm and of the friction at its shaft, together.
+
+    response: from the input to an output, as if there were no dry friction; shaft: the same of the shaft's
+    position; level + level_factor (P',) times unit normals: level of the friction. All three stand on the
+    same P' unit normals.
+    """
+
+    response: ResponsePosterior
+    shaft: ResponsePosterior
+    level: float
+    level_factor: RealArray
+    friction: FrictionFit
 
 
 def without_friction(
@@ -26,7 +43,7 @@ def without_friction(
     found: FrictionFit,
     model: GobfModel | None = None,
     options: EmbeddingOptions | None = None,
-) -> ResponsePosterior:
+) -> BehindFriction:
     """Posterior of the response from input to the shaft's position, as if there were no dry friction.
 
     records: those of the fit, as measured. model: of the arm, fitted with the friction taken off, that the
@@ -35,15 +52,16 @@ def without_friction(
     """
     if model is not None:
         found = moved_to(found, records, model)
-    moved, beside = [], []
+    corrected, beside = [], []
     for record in records:
         local = linearised(found.arm, found.coefficients, found.level, found.presliding, record.input[:, 0])
         # To first order y = y0 + D (c - c0) + d (level - level0): rows for the coefficients c themselves.
         target = record.output[:, 0] - local.position + local.by_coefficients @ found.coefficients
         less = less_friction(record, local.friction, found.arm.structure.input_delay_samples)
-        moved.append(replace(less, output=target[:, None]))
+        corrected.append(replace(less, output=target[:, None]))
         beside.append(Beside(local.by_coefficients, local.by_level[:, None]))
-    return tangent(moved, found.model, options, beside=beside)
+    response, change, factor = tangent_beside(corrected, found.model, beside, options)
+    return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
 
 
 def other_output_without_friction(
@@ -51,13 +69,13 @@ def other_output_without_friction(
     found: FrictionFit,
     model: GobfModel,
     options: EmbeddingOptions | None = None,
-) -> ResponsePosterior:
+) -> BehindFriction:
     """The same for another output of the arm, which the same friction reaches through the motor's shaft.
 
     records: with that output; model: fitted to them with the friction taken off. The friction is that of the
     fit to the shaft's position; what is not known about it is what that fit does not know.
     """
-    undelayed = GobfModel(model.poles, model.coefficients, model.dt_s, integrators=model.integrators)
+    undelayed = replace(model, input_delay_samples=0)
     less, beside = [], []
     for record in records:
         local = linearised(found.arm, found.coefficients, found.level, found.presliding, record.input[:, 0])
@@ -65,4 +83,14 @@ def other_output_without_friction(
         columns = -local.friction_by @ found.covariance_factor
         driven = np.column_stack([undelayed.simulate(column) for column in columns.T])
         beside.append(Beside(np.zeros((record.n_samples, 0)), driven))
-    return tangent(less, model, options, beside=beside, known_to_one=True)
+    response, mean, factor = tangent_beside(less, model, beside, options, known_to_one=True)
+    shaft = ResponsePosterior(
+        found.arm.poles.doubled(),
+        found.coefficients + found.covariance_factor[:-1] @ mean,
+        found.covariance_factor[:-1] @ factor,
+        model.dt_s,
+        integrators=found.arm.structure.integrators,
+        input_delay_samples=found.arm.structure.input_delay_samples,
+    )
+    level = found.level + float(found.covariance_factor[-1] @ mean)
+    return BehindFriction(response, shaft, level, found.covariance_factor[-1] @ factor, found)

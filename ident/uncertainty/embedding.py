@@ -106,9 +106,6 @@ def tangent(
     records: Sequence[Record],
     model: GobfModel,
     options: EmbeddingOptions | None = None,
-    *,
-    beside: Sequence[Beside] = (),
-    known_to_one: bool = False,
 ) -> ResponsePosterior:
     """Posterior of the response around a model whose poles were chosen from these records.
 
@@ -120,16 +117,29 @@ def tangent(
     would have kept them (after whitening, or in a model whose order was given); then, once each, pairs of one
     further mode that has a probability worth counting (`ident.uncertainty.undetected_mode`). A mode that is
     not seen in these records at all stays outside the ellipses at its peak: no data speak of it.
-
-    beside: columns beside the basis functions, one per record; their coefficients are estimated too, freely
-    or (known_to_one) as independent unknowns of zero mean and unit variance.
     """
-    options = options or EmbeddingOptions()
+    return tangent_beside(records, model, (), options)[0]
+
+
+def tangent_beside(
+    records: Sequence[Record],
+    model: GobfModel,
+    beside: Sequence[Beside],
+    options: EmbeddingOptions | None = None,
+    *,
+    known_to_one: bool = False,
+) -> tuple[ResponsePosterior, RealArray, RealArray]:
+    """The tangent posterior with q columns beside the basis functions, in every record, and their
+    coefficients: mean (q,) and factor (q, P') on the same unit normals as the response's covariance_factor.
+
+    The coefficients are estimated freely or (known_to_one) as independent unknowns of zero mean and unit
+    variance. Arguments and errors otherwise as `tangent`.
+    """
     return _embed(
         records,
         model,
         model.poles.doubled(),
-        options,
+        options or EmbeddingOptions(),
         classical_recipe=False,
         beside=beside,
         known_to_one=known_to_one,
@@ -145,7 +155,7 @@ def classical(
     and prior_no_remainder is not used. Do not design a controller on it: see the module docstring.
     """
     options = options or EmbeddingOptions()
-    return _embed(records, model, model.poles, options, classical_recipe=True)
+    return _embed(records, model, model.poles, options, classical_recipe=True)[0]
 
 
 def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
@@ -165,7 +175,7 @@ def _embed(
     classical_recipe: bool,
     beside: Sequence[Beside] = (),
     known_to_one: bool = False,
-) -> ResponsePosterior:
+) -> tuple[ResponsePosterior, RealArray, RealArray]:
     rows = replace(_rows(records, model, poles, options), beside=tuple(beside))
     if known_to_one:
         rows = replace(rows, known_std=_noise_std(rows))
@@ -189,9 +199,8 @@ def _embed(
         poles = Poles(poles.real, np.concatenate([poles.pairs, missed.poles]))
     # The columns beside the basis functions are no part of the response.
     after = solved.rows.poles.order + int(rows.structure.feedthrough)
-    mean, factor = (
-        np.delete(part, slice(after, after + rows.n_beside), axis=0) for part in joint_factor(reduced, kernel)
-    )
+    joint, beside_rows = joint_factor(reduced, kernel), slice(after, after + rows.n_beside)
+    mean, factor = (np.delete(part, beside_rows, axis=0) for part in joint)
     if missed is not None and missed.poles.size:
         mean, factor = (
             _pairs_after_poles(part, solved.rows.poles.order, missed.poles) for part in (mean, factor)
@@ -205,7 +214,8 @@ def _embed(
         missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
         n_added_modes=(solved.rows.poles.order - rows.poles.order) // 4,
     )
-    return _posterior(model, poles, rows.structure.feedthrough, rows.fir_length, mean, factor, report)
+    posterior = _posterior(model, poles, rows.structure.feedthrough, rows.fir_length, mean, factor, report)
+    return posterior, joint[0][beside_rows], joint[1][beside_rows]
 
 
 def embed_response(

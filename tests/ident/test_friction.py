@@ -9,11 +9,20 @@ import pytest
 
 from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
 from ident.data.arrays import ComplexArray, RealArray
-from ident.friction import FrictionFit, fit_friction, other_output_without_friction, without_friction
+from ident.friction import (
+    FrictionFit,
+    at_amplitudes,
+    equivalent_friction,
+    fit_friction,
+    other_output_without_friction,
+    without_friction,
+)
+from ident.friction.amplitude import damped_poles
 from ident.friction.arm import SteppedArm
 from ident.friction.fit import linearised
 from ident.uncertainty.embedding import tangent
 from plant import parse_effect, simulate
+from plant.excitation import multisine, multisine_lines
 from plant.modal import linear_arm
 from plant.presets import paper_link
 from validation.blind.truth import Truth
@@ -77,7 +86,7 @@ def test_ellipses_hold_the_arm_behind_its_friction(rubbing: tuple[float, list[Re
     """As recorded, hardly any ellipse of these records does."""
     torque_Nm, records, found = rubbing
     truth, _ = true_response(LOW_RAD_S)
-    ellipses = without_friction(records, found).at(LOW_RAD_S)
+    ellipses = without_friction(records, found).response.at(LOW_RAD_S)
     as_recorded = tangent(records, identify(records, OPTIONS).model).at(LOW_RAD_S)
     assert np.mean(ellipses.contains(truth)) > 0.8
     assert np.mean(as_recorded.contains(truth)) < 0.5
@@ -93,12 +102,11 @@ def test_friction_of_the_shaft_is_taken_off_the_tip_too(
     tip = recorded(torque_Nm, 5, output=1)
     model = identify([found.taken_off(record) for record in tip], OPTIONS).model
     _, truth = true_response(LOW_RAD_S)
-    assert np.mean(other_output_without_friction(tip, found, model).at(LOW_RAD_S).contains(truth)) > 0.7
+    ellipses = other_output_without_friction(tip, found, model).response.at(LOW_RAD_S)
+    assert np.mean(ellipses.contains(truth)) > 0.7
     # What is not known of the friction widens the ellipses.
     known = tangent([found.taken_off(record) for record in tip], model).at(LOW_RAD_S)
-    assert np.median(known.enclosing_radius()[:20]) < 0.8 * np.median(
-        other_output_without_friction(tip, found, model).at(LOW_RAD_S).enclosing_radius()[:20]
-    )
+    assert np.median(known.enclosing_radius()[:20]) < 0.8 * np.median(ellipses.enclosing_radius()[:20])
 
 
 def test_no_friction_is_not_significant() -> None:
@@ -147,6 +155,68 @@ def test_derivatives_are_those_of_the_simulation() -> None:
     ends = [found.arm.run(found.coefficients, u, found.level * f, found.presliding)[0] for f in (1.01, 0.99)]
     direct = (ends[0] - ends[1]) / (0.02 * found.level)
     assert np.linalg.norm(local.by_level - direct) < 0.02 * np.linalg.norm(direct)
+
+
+def test_more_viscous_friction_moves_the_poles_where_the_equations_of_motion_say() -> None:
+    """The arm's own matrices with another hub against the identified model's with damping added."""
+    added_Nms = 0.3
+    volts = added_Nms / RIG.motor.torque_per_volt_Nm_V
+    hub = RIG.hub.model_copy(update={"viscous_friction_Nms": RIG.hub.viscous_friction_Nms + added_Nms})
+    arms = [linear_arm(rig, n_modes=2) for rig in (RIG, RIG.model_copy(update={"hub": hub}))]
+    before, after = (np.sort_complex(np.exp(np.linalg.eigvals(arm.A) * RIG.sampling.dt_s)) for arm in arms)
+    moving = before[np.abs(before - 1) > 1e-9]
+    # The sampled position has one term more than an integrator and these poles.
+    poles = Poles(np.append(2e-3, moving[moving.imag == 0].real), moving[moving.imag > 0])
+    u = np.random.default_rng(2).standard_normal(600)
+    y = simulate(RIG, u, n_modes=2).output[:, 0]
+    columns = np.column_stack(
+        [
+            GobfModel(poles, one, RIG.sampling.dt_s, integrators=1).simulate(u)
+            for one in np.eye(poles.real.size + 2 * poles.pairs.size)
+        ]
+    )
+    exact = GobfModel(poles, np.linalg.lstsq(columns, y)[0], RIG.sampling.dt_s, integrators=1)
+    assert np.max(np.abs(exact.simulate(u) - y)) < 1e-4 * np.max(np.abs(y))
+    moved = damped_poles(exact, volts)
+    there = np.sort_complex(np.concatenate([moved.real[1:], moved.pairs, moved.pairs.conj()]))
+    np.testing.assert_allclose(there, after[np.abs(after - 1) > 1e-9], rtol=1e-4)
+    assert np.max(np.abs(there - np.sort_complex(moving))) > 1e-3
+
+
+def test_friction_is_viscous_on_average_at_amplitudes_that_were_not_recorded() -> None:
+    """Ellipses over a range of amplitudes hold the mean of many fresh experiments at one between."""
+    period, dt_s, torque_Nm = 500, RIG.sampling.dt_s, 0.05
+    lines = multisine_lines(period, dt_s, (0.5, 20.0), "odd")
+    omega = 2 * np.pi * lines / (period * dt_s)
+    friction = [parse_effect({"name": "coulomb_friction", "torque_Nm": torque_Nm})]
+    records = []
+    for k, rms in enumerate((2.0, 2.0, 6.0, 6.0)):
+        rng = np.random.default_rng(k)
+        u = multisine(lines, period, rms, rng, periods=2)
+        y = simulate(RIG, u, friction, rng=rng).output[:, :1]
+        records.append(Record(str(k), u[:, None], y, dt_s, ("voltage_V",), ("hub_angle_rad",)))
+    found = fit_friction(records, OPTIONS)
+    rng = np.random.default_rng(9)
+    equivalent = equivalent_friction(found, records, rng, (2.0, 6.0))
+    posterior, _ = at_amplitudes(without_friction(records, found), equivalent, rng)
+
+    ratios = []
+    for _ in range(300):
+        u = multisine(lines, period, 3.5, rng, periods=2)
+        moved = np.diff(simulate(RIG, u, friction).output[:, 0])[-period:]
+        ratios.append(np.fft.rfft(moved)[lines] / np.fft.rfft(u[-period:])[lines])
+    truth = np.mean(ratios, axis=0) / (1 - np.exp(-1j * omega * dt_s))
+    ellipses = posterior.at(omega)
+    assert np.mean(ellipses.contains(truth)) > 0.9
+    # They are no wider than the arm's response differs between the ends, and that of the arm without friction
+    # is another one.
+    linear = true_response(omega)[0]
+    low = omega < 10
+    assert np.median((ellipses.enclosing_radius() / np.abs(truth))[low]) < 0.05
+    assert not np.any(ellipses.contains(linear)[low])
+    assert np.all(np.diff(equivalent.damping) < 0)
+    with pytest.raises(ValueError, match="an rms from 2 to 6"):
+        equivalent_friction(found, records, rng, (1.0, 6.0))
 
 
 def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:

@@ -134,6 +134,11 @@ def test_every_excitation_gives_its_samples_and_its_size(table):
         ("uncertainty = {{ {0} }}\nincrements = true", "records as measured"),
         ("uncertainty = {{ {0} }}\nband_rad_s = [1.0, 20.0]", "records as measured"),
         ("uncertainty = {{ {0} }}\nidentification = {{ integrators = 2 }}", "at most one integrator"),
+        (
+            "uncertainty = {{ promise = 'amplitudes from 8 to 2' }}",
+            "must be positive and smaller",
+        ),
+        ("uncertainty = {{ promise = 'amplitudes 2..8' }}", "promise"),
     ],
 )
 def test_a_promise_that_cannot_be_kept_is_refused(tmp_path, channel, complaint):

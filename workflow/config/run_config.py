@@ -4,6 +4,7 @@ sense."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from importlib import resources
 from itertools import combinations
@@ -145,6 +146,10 @@ class FileSource(Section):
 Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
 
 
+_NUMBER = r"(\d+(?:\.\d+)?)"
+_RANGE = rf"amplitudes from {_NUMBER} to {_NUMBER}"
+
+
 class UncertaintyOptions(EmbeddingOptions):
     """How the ellipses around an identified response are made (design 4.5)."""
 
@@ -155,19 +160,33 @@ class UncertaintyOptions(EmbeddingOptions):
         "between records of different condition; classical: the published recipe, for comparison",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
-    promise: Literal["this amplitude", "without friction"] = Field(
-        "this amplitude",
-        description="what response the ellipses are about: this amplitude: the best linear one at the size "
-        "of these records, dry friction included; without friction: that of the linear arm behind its "
-        "Coulomb friction, identified from the control channel (its output is the shaft's position)",
+    promise: str = Field(
+        "as recorded",
+        pattern=rf"^(as recorded|without friction|this amplitude|{_RANGE})$",
+        description="what response the ellipses are about: as recorded: a linear arm's, whatever is not "
+        "linear taken for noise. The others identify the Coulomb friction of the control channel (its output "
+        "is the shaft's position). without friction: the linear arm behind it; this amplitude: the best "
+        "linear approximation, friction included, at the rms of the records' inputs; amplitudes from 2 to 8: "
+        "at any rms of the input between these, in its unit",
     )
+
+    @property
+    def friction_identified(self) -> bool:
+        """The Coulomb friction of the shaft is identified with the arm."""
+        return self.promise != "as recorded"
+
+    @property
+    def amplitudes(self) -> tuple[float, float] | None:
+        """Smallest and largest rms of the input, where a range is promised."""
+        ends = re.fullmatch(_RANGE, self.promise)
+        return None if ends is None else (float(ends[1]), float(ends[2]))
 
     @model_validator(mode="after")
     def _friction_by_tangent(self) -> Self:
-        if self.promise == "without friction" and self.method != "tangent":
-            raise ValueError(
-                f"promise = 'without friction' goes with method = 'tangent', not {self.method!r}"
-            )
+        if self.friction_identified and self.method != "tangent":
+            raise ValueError(f"promise = {self.promise!r} goes with method = 'tangent', not {self.method!r}")
+        if self.amplitudes is not None and not 0 < self.amplitudes[0] < self.amplitudes[1]:
+            raise ValueError(f"promise = {self.promise!r}: the first amplitude must be positive and smaller")
         return self
 
 
@@ -215,14 +234,11 @@ class Channel(Section):
             raise ValueError("give increments or a band, not both: each is a filter of its own")
         if self.bounds_band_rad_s is not None and self.band_rad_s is None:
             raise ValueError("bounds_band_rad_s goes with band_rad_s, the band of the fit")
-        if self.without_friction and (self.increments or self.band_rad_s):
-            raise ValueError("promise = 'without friction' takes records as measured: no increments, no band")
+        if self.uncertainty.friction_identified and (self.increments or self.band_rad_s):
+            raise ValueError(
+                f"promise = {self.uncertainty.promise!r} takes records as measured: no increments, no band"
+            )
         return self
-
-    @property
-    def without_friction(self) -> bool:
-        """The response wanted is that behind the dry friction."""
-        return self.uncertainty.promise == "without friction"
 
     @property
     def label(self) -> str:
@@ -331,20 +347,20 @@ class RunConfig(Section):
             raise ValueError("closed_loop.machine = 'simulated' needs [source] kind = 'simulated'")
         if self.closed_loop.effects and self.machine != "simulated":
             raise ValueError("closed_loop.effects act on the simulated arm only")
-        if self.closed_loop.friction_feedforward and not self.without_friction:
+        if self.closed_loop.friction_feedforward and not self.friction_identified:
             raise ValueError(
                 "closed_loop.friction_feedforward = true needs an identified friction: promise = "
                 "'without friction' in [channels.uncertainty] of a channel"
             )
-        if self.without_friction:
+        if self.friction_identified:
             if self.closed_loop_data.method == "two_stage":
-                raise ValueError("promise = 'without friction' needs closed_loop_data.method = 'direct'")
+                raise ValueError("identifying friction needs closed_loop_data.method = 'direct'")
             if (
                 self.control_channel.identification.integrators > 1
                 or self.control_channel.identification.feedthrough
             ):
                 raise ValueError(
-                    "promise = 'without friction': the output of the control channel is the position of the "
+                    "friction is identified from the control channel: its output is the position of the "
                     "shaft, so it has at most one integrator and no direct term"
                 )
         if self.closed_loop_data.method == "two_stage" and not self._has_references:
@@ -382,9 +398,9 @@ class RunConfig(Section):
         return self.closed_loop.machine or ("simulated" if self.source.kind == "simulated" else "identified")
 
     @property
-    def without_friction(self) -> bool:
-        """Dry friction is identified: some channel's response is wanted without it."""
-        return any(channel.without_friction for channel in self.channels)
+    def friction_identified(self) -> bool:
+        """The Coulomb friction of the shaft is identified: the promise of some channel needs it."""
+        return any(channel.uncertainty.friction_identified for channel in self.channels)
 
     @property
     def control_channel(self) -> Channel:

@@ -165,7 +165,7 @@ class RunView:
     def _channel(self, index: int) -> ChannelView:
         channel, found = self.config.channels[index], self.results.identify.channels[index]
         by_name = {item.name: item.record for item in self.results.records.records}
-        friction = self.results.identify.friction if channel.without_friction else None
+        friction = self.results.identify.friction if channel.uncertainty.friction_identified else None
         slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
         with_loop = index == self.config.control_index and self.results.design.has_controller
         return ChannelView(

@@ -47,7 +47,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     config, records = stage.config, stage.results.records
     measured = [item.record for item in records.of_role("estimation")]
     unseen = [item for item in records.records if item.role != "estimation"]
-    friction = friction_of(stage, measured) if config.without_friction else None
+    friction = friction_of(stage, measured) if config.friction_identified else None
     channels = []
     for k, channel in enumerate(config.channels):
 
@@ -55,7 +55,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
             stage.progress.update("identify", (k + fraction) / len(config.channels), f"{label}: {message}")
 
         with naming(f"channel {channel.label!r}"):
-            known = friction if channel.without_friction else None
+            known = friction if channel.uncertainty.friction_identified else None
             bounded, finding = [as_bounded(record, channel, known) for record in measured], None
             used = [as_fitted(record, channel, known) for record in measured]
             if config.closed_loop_data.method == "two_stage":

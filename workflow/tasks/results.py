@@ -29,7 +29,7 @@ from ident.checks.residual_tests import ResidualTest
 from ident.checks.validation import FreshFit, ScatterRow
 from ident.data.record import Record
 from ident.finding import Finding
-from ident.friction import FrictionFit
+from ident.friction import EquivalentFriction, FrictionFit
 from ident.identification import Identification
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -266,7 +266,10 @@ class UncertainChannel:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyResult:
+    """equivalent: viscous friction that acts like the dry one, where ellipses are about amplitudes."""
+
     channels: tuple[UncertainChannel, ...]
+    equivalent: EquivalentFriction | None = None
 
     def plant(self, config: RunConfig) -> UncertainPlant:
         """What the controller is designed for: control channel and first performance channel."""

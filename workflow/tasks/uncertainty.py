@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,15 @@ from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatte
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
-from ident.friction import FrictionFit, other_output_without_friction, without_friction
+from ident.friction import (
+    BehindFriction,
+    EquivalentFriction,
+    FrictionFit,
+    at_amplitudes,
+    equivalent_friction,
+    other_output_without_friction,
+    without_friction,
+)
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, group_posteriors, record_posteriors
 from ident.uncertainty.embedding import classical, tangent
@@ -51,25 +60,31 @@ N_BANDS = 6
 
 def find_uncertainty(stage: StageInput) -> UncertaintyResult:
     """Posterior, ellipses on a display grid, residual tests and repeat scatter of every channel."""
-    records, channels = stage.results.records.records, []
-    for k, (channel, result) in enumerate(
-        zip(stage.config.channels, stage.results.identify.channels, strict=True)
-    ):
-        stage.progress.update("uncertainty", k / len(stage.config.channels), channel.label)
+    records, channels = stage.results.records.records, list[UncertainChannel]()
+    # The control channel first: it says what the friction does at an amplitude.
+    control, equivalents = stage.config.control_index, dict[str, EquivalentFriction]()
+    order = sorted(range(len(stage.config.channels)), key=lambda k: k != control)
+    for done, k in enumerate(order):
+        channel, result = stage.config.channels[k], stage.results.identify.channels[k]
+        stage.progress.update("uncertainty", done / len(order), channel.label)
         with naming(f"channel {channel.label!r}"):
-            friction = stage.results.identify.friction if channel.without_friction else None
+            friction = stage.results.identify.friction if channel.uncertainty.friction_identified else None
+            poles, behind = result.model.poles, None
             if friction is None:
-                posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
+                linear = posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
             else:
-                measured = [
-                    item.record.siso(channel.input, channel.output)
-                    for item in stage.results.records.of_role("estimation")
-                ]
-                if k == stage.config.control_index:
-                    posterior = without_friction(measured, friction, result.model, channel.uncertainty)
-                else:
-                    posterior = other_output_without_friction(
-                        measured, friction, result.model, channel.uncertainty
+                measured = [item.record for item in stage.results.records.of_role("estimation")]
+                behind = behind_friction(channel, measured, friction, result.model, shaft=k == control)
+                linear = posterior = behind.response
+                if channel.uncertainty.promise != "without friction":
+                    promise, rng = channel.uncertainty.promise, stage.rng("uncertainty", channel.label)
+                    if promise not in equivalents:
+                        siso = [record.siso(channel.input, channel.output) for record in measured]
+                        equivalents[promise] = equivalent_friction(
+                            friction, siso, rng, channel.uncertainty.amplitudes
+                        )
+                    posterior, poles = at_amplitudes(
+                        behind, equivalents[promise], rng, channel.uncertainty.level
                     )
             omega = display_grid(result.model, result.bounded)
             channels.append(
@@ -80,10 +95,23 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                     result,
                     omega,
                     nominal_grid(omega, result.data_band_rad_s),
+                    poles=poles,
+                    linear=linear,
                     repeat_scatter=scatter_of(channel, result, records, bands_of(omega), friction),
                 )
             )
-    return UncertaintyResult(tuple(channels))
+    in_order = tuple(found for _, found in sorted(zip(order, channels, strict=True), key=itemgetter(0)))
+    return UncertaintyResult(in_order, next(iter(equivalents.values()), None))
+
+
+def behind_friction(
+    channel: Channel, measured: Sequence[Record], friction: FrictionFit, model: GobfModel, *, shaft: bool
+) -> BehindFriction:
+    """What the records (estimation, as measured) say of the channel's arm and its friction; shaft: its output
+    is the position that the friction acts on."""
+    records = [record.siso(channel.input, channel.output) for record in measured]
+    find = without_friction if shaft else other_output_without_friction
+    return find(records, friction, model, channel.uncertainty)
 
 
 def uncertain_channel(
@@ -94,14 +122,17 @@ def uncertain_channel(
     omega: Real,
     nominal_omega: Real,
     *,
+    poles: Poles | None = None,
+    linear: ResponsePosterior | None = None,
     repeat_scatter: tuple[ScatterRow, ...] | None = None,
     tests: Tests | None = None,
 ) -> UncertainChannel:
     """Everything said about a posterior. omega (F,): shown; nominal_omega (F,): where the nominal has to be
-    right; tests: of the residuals, where they are known already."""
-    model = result.model
+    right; poles: of the nominal, where they are not the model's; linear: posterior of the model, where that
+    is another one; tests: of the residuals, where they are known already."""
+    model, linear = result.model, linear or posterior
     frequency = posterior.at(omega, level)
-    nominal = nominal_of(posterior, model.poles, nominal_omega)
+    nominal = nominal_of(posterior, poles or model.poles, nominal_omega)
     return UncertainChannel(
         name=result.name,
         method=method,
@@ -116,9 +147,9 @@ def uncertain_channel(
             band_rad_s=result.data_band_rad_s,
         ),
         bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
-        tests=residual_tests(posterior, result.bounded) if tests is None else tests,
+        tests=residual_tests(linear, result.bounded) if tests is None else tests,
         agreement=agreement_of(posterior.at(nominal_omega, level), nominal.frequency_response),
-        intervals=intervals_of(posterior, model.poles, level),
+        intervals=intervals_of(linear, model.poles, level),
         repeat_scatter=repeat_scatter,
     )
 

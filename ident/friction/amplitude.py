@@ -1,0 +1,262 @@
+"""The arm with its friction as a linear response: what it is at one amplitude, and over a range of them.
+
+A nonlinear arm answers a random-phase multisine with its best linear approximation (BLA) and a rest that is
+uncorrelated with the input (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd
+ed., ch. 3). For dry friction the approximation is an equivalent viscous friction, f = N d theta/dt with N
+nearly a positive number that falls as the amplitude grows (statistical linearisation), so that
+
+    BLA = G / (1 + j omega N G_shaft),    N(j omega) = n_0 + n_1 j omega + n_2 (j omega)^2 + n_3 (j omega)^3.
+
+N comes from simulations of the identified arm at the amplitudes asked for, G and the level of the friction
+from their common posterior. So amplitudes that were not measured have a response, too.
+
+Neglected: every other nonlinearity, and how N depends on the arm's coefficients (the speed of the shaft is
+known to parts in a thousand).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm, logm
+from scipy.optimize import brentq
+
+from ident.basis.functions import basis_response
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.basis.structure import front_response
+from ident.data.arrays import ComplexArray, RealArray
+from ident.data.record import Record
+from ident.friction.arm import FASTEST_POLE
+from ident.friction.fit import FrictionFit
+from ident.friction.posterior import BehindFriction
+
+_TERMS = 4
+_REALISATIONS, _AMPLITUDES, _DRAWS = 128, 5, 400
+# The first period dies out from rest, the second is in steady state.
+_PERIODS = 2
+_CHANGE_OF_LEVEL = 0.02
+# An amplitude this close to the end of what was recorded counts as recorded.
+_SAME = 1e-3
+# Every so many draws are counted when the ellipses are made large enough.
+_THINNED = 5
+# A line of the spectrum counts as excited above this share of the largest.
+_EXCITED = 1e-3
+_N_GRID = 300
+
+
+def input_rms(records: Sequence[Record]) -> RealArray:
+    """Root mean square (R,) of the input of every record."""
+    return np.array([float(np.sqrt(np.mean(record.input[:, 0] ** 2))) for record in records])
+
+
+@dataclass(frozen=True, eq=False)
+class EquivalentFriction:
+    """The viscous friction that acts like the dry one, on average, at amplitudes of the input.
+
+    friction: what it was simulated from. rms (A,), ascending: of the input. omega_rad_s (F,): excited lines.
+    mean, by_level (A, M): coefficients of N in powers of j omega / omega_rad_s[-1], and their derivative with
+    respect to the level; factor (A, M, M): what the finite number of simulations leaves open of them.
+    """
+
+    friction: FrictionFit
+    rms: RealArray
+    omega_rad_s: RealArray
+    mean: RealArray
+    by_level: RealArray
+    factor: RealArray
+
+    @property
+    def damping(self) -> RealArray:
+        """(A,) N at low frequency, in units of the input per (unit of position / s)."""
+        return np.maximum(self.mean[:, 0], 0.0)
+
+    def drawn(self, change: RealArray, omega: RealArray, rng: np.random.Generator) -> ComplexArray:
+        """(A, K, W) values of N at omega (W,) for changes (K,) of the friction's level."""
+        normals = rng.standard_normal((len(self.rms), change.size, self.mean.shape[1]))
+        left_open = normals @ self.factor.transpose(0, 2, 1)
+        values = self.mean[:, None] + change[:, None] * self.by_level[:, None] + left_open
+        # No line says how N goes on beyond the last.
+        inside = np.minimum(omega, self.omega_rad_s[-1]) / self.omega_rad_s[-1]
+        return np.asarray(values @ (1j * inside) ** np.arange(self.mean.shape[1])[:, None])
+
+
+def equivalent_friction(
+    friction: FrictionFit,
+    records: Sequence[Record],
+    rng: np.random.Generator,
+    amplitudes: tuple[float, float] | None = None,
+) -> EquivalentFriction:
+    """For random-phase multisines with the records' power spectrum.
+
+    amplitudes: smallest and largest rms of the input, five are simulated from one to the other in equal steps
+    of the logarithm; none: that of the records together. Raises ValueError where the range is not inside that
+    of the records.
+    """
+    recorded = input_rms(records)
+    smallest, largest = float(recorded.min()), float(recorded.max())
+    if amplitudes is None:
+        rms = np.array([np.sqrt(np.mean(recorded**2))])
+    else:
+        low, high = amplitudes
+        if not smallest * (1 - _SAME) <= low < high <= largest * (1 + _SAME):
+            raise ValueError(
+                f"amplitudes from {low:.4g} to {high:.4g} cannot be promised: the inputs of the records have "
+                f"an rms from {smallest:.4g} to {largest:.4g}"
+            )
+        rms = np.geomspace(low, high, _AMPLITUDES)
+    spectrum = _power_spectrum(records)
+    lines = np.flatnonzero(spectrum > _EXCITED * spectrum.max())
+    found = [_at_amplitude(friction, spectrum, lines, float(a), rng) for a in rms]
+    omega = lines.astype(np.float64) * (np.pi / ((spectrum.size - 1) * friction.arm.dt_s))
+    return EquivalentFriction(friction, rms, omega, *(np.stack(part) for part in zip(*found, strict=True)))
+
+
+def at_amplitudes(
+    behind: BehindFriction, equivalent: EquivalentFriction, rng: np.random.Generator, level: float = 0.95
+) -> tuple[ResponsePosterior, Poles]:
+    """Posterior of the best linear approximation, and poles of a model of it.
+
+    Over a range of amplitudes, the centre lies halfway between its ends, and the ellipses are as large as it
+    takes to hold the response with probability `level`, averaged over the amplitudes of the range.
+    """
+    friction, arm = behind.friction, behind.friction.arm
+    omega = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
+    normals = rng.standard_normal((_DRAWS, behind.level_factor.size))
+    coefficients, shaft = (
+        part.mean + normals @ part.covariance_factor.T for part in (behind.response, behind.shaft)
+    )
+    change = behind.level + normals @ behind.level_factor - equivalent.friction.level
+    undelayed = np.exp(1j * omega * arm.dt_s * arm.structure.input_delay_samples)
+    speed = 1j * omega * undelayed * behind.shaft.response_of(shaft, omega)
+    linear = behind.response.response_of(coefficients, omega)
+    responses = linear / (1 + speed * equivalent.drawn(change, omega, rng))
+
+    damping = equivalent.damping
+    ends = [damped_poles(friction.model, float(one)) for one in (damping.max(), damping.min())]
+    form, draws = _on_poles(behind.response, ends, coefficients, responses, omega)
+    centres = draws.mean(axis=1)
+    middle = 0.5 * (centres[0] + centres[-1])
+    spread = (draws - centres[:, None]).reshape(-1, middle.size) / np.sqrt(draws.shape[0] * (_DRAWS - 1))
+    own = np.asarray(np.linalg.qr(spread, mode="r")).T
+    between = (centres - middle).T / np.sqrt(len(centres))
+
+    def posterior(share: float) -> ResponsePosterior:
+        return replace(form, mean=middle, covariance_factor=np.hstack([own, share * between]))
+
+    share = 0.0
+    if len(centres) > 1:
+        flat = responses.reshape(-1, omega.size)
+
+        def missing(share: float) -> float:
+            ellipses = posterior(share).at(omega, level)
+            return level - float(np.mean([ellipses.contains(one) for one in flat[::_THINNED]]))
+
+        share = brentq(missing, 0.0, 3.0, xtol=0.01)
+    return posterior(share), damped_poles(friction.model, float(np.sqrt(damping[0] * damping[-1])))
+
+
+def damped_poles(model: GobfModel, damping: float) -> Poles:
+    """Poles of the model of a shaft's position with more viscous friction at the shaft (its input's units per
+    speed), in continuous time behind the hold."""
+    real = np.maximum(model.poles.real, FASTEST_POLE)  # a pole at zero has no rate
+    arm = replace(model, poles=Poles(real, model.poles.pairs), input_delay_samples=0).to_control()
+    n, dt_s = arm.nstates, model.dt_s
+    held = np.block([[arm.A, arm.B], [np.zeros((1, n)), np.ones((1, 1))]])
+    rates = np.real(logm(held)) / dt_s
+    a, b = rates[:n, :n], rates[:n, n:]
+    poles = np.linalg.eigvals(expm((a - damping * b @ arm.C @ a) * dt_s))
+    # The integrators stay: friction that grows with speed holds no position.
+    poles = poles[np.argsort(np.abs(poles - 1))][model.integrators :]
+    plain = np.abs(poles.imag) < 1e-9
+    return Poles(np.sort(poles[plain].real), poles[poles.imag >= 1e-9].astype(np.complex128))
+
+
+def _at_amplitude(
+    friction: FrictionFit,
+    spectrum: RealArray,
+    lines: npt.NDArray[np.intp],
+    rms: float,
+    rng: np.random.Generator,
+) -> tuple[RealArray, RealArray, RealArray]:
+    """Coefficients (M,) of N, their derivative (M,) by the level, factor (M, M) of their covariance."""
+    period = 2 * (spectrum.size - 1)
+    arm, structure = friction.arm, friction.arm.structure
+    omega = lines.astype(np.float64) * (2 * np.pi / (period * arm.dt_s))
+    z = np.exp(1j * omega * arm.dt_s)
+    delayed = z ** -float(structure.input_delay_samples)
+    front = front_response(omega, arm.dt_s, structure.integrators, 0)
+    speed = 1j * omega * front * (basis_response(arm.poles.doubled(), z) @ friction.coefficients)
+    terms = (1j * omega / omega[-1])[:, None] ** np.arange(_TERMS)
+    phases = np.exp(2j * np.pi * rng.random((_REALISATIONS, spectrum.size)))
+    inputs = [np.fft.irfft(spectrum * one, period) for one in phases]
+    inputs = [np.tile(rms * u / np.sqrt(np.mean(u**2)), _PERIODS) for u in inputs]
+
+    def simulated(level: float) -> ComplexArray:
+        """(R, F) friction over input, line by line in steady state."""
+        ratios = np.empty((_REALISATIONS, lines.size), dtype=np.complex128)
+        for row, u in zip(ratios, inputs, strict=True):
+            force = arm.run(friction.coefficients, u, level, friction.presliding)[1]
+            row[:] = np.fft.rfft(force[-period:])[lines] / np.fft.rfft(u[-period:])[lines]
+        return ratios
+
+    def solved(ratios: ComplexArray) -> tuple[RealArray, RealArray]:
+        """N (M,) from H = N j omega G (z^-d - H), whose rest is the relative error of the BLA; and how far
+        each realisation (R, M) would move it."""
+        mean = ratios.mean(axis=0)
+        columns = (speed * (delayed - mean))[:, None] * terms
+        inverse = np.linalg.pinv(np.vstack([columns.real, columns.imag]))
+        n = inverse @ np.concatenate([mean.real, mean.imag])
+        rest = (ratios - mean) * (1 + speed * (terms @ n))
+        return n, np.hstack([rest.real, rest.imag]) @ inverse.T
+
+    n, moves = solved(simulated(friction.level))
+    # A level that is not told from none has its uncertainty for a step, and cannot be negative.
+    step = max(_CHANGE_OF_LEVEL * friction.level, 0.5 * friction.level_std)
+    ends = friction.level + step, max(friction.level - step, 0.0)
+    above, below = (solved(simulated(end))[0] for end in ends)
+    left_open = np.asarray(np.linalg.qr((moves - moves.mean(axis=0)) / _REALISATIONS, mode="r")).T
+    return n, (above - below) / (ends[0] - ends[1]), left_open
+
+
+def _power_spectrum(records: Sequence[Record]) -> RealArray:
+    """(F,) amplitudes of the lines of the longest record (of an even number of samples), all records weighed
+    alike."""
+    longest = max(record.n_samples for record in records) // 2 * 2
+    grid, power = np.linspace(0, 1, longest // 2 + 1), np.zeros(longest // 2 + 1)
+    for record in records:
+        own = np.abs(np.fft.rfft(record.input[:, 0])) ** 2
+        power += np.interp(grid, np.linspace(0, 1, own.size), own / own.sum())
+    power[0] = power[-1] = 0.0
+    return np.sqrt(power)
+
+
+def _on_poles(
+    response: ResponsePosterior,
+    ends: Sequence[Poles],
+    coefficients: RealArray,
+    responses: ComplexArray,
+    omega: RealArray,
+) -> tuple[ResponsePosterior, RealArray]:
+    """Responses (A, K, F) as coefficients (A, K, P) on the poles of both ends of the range and those of the
+    arm, each once, and the form they stand in; taps are those of the draws (K, .) themselves."""
+    own = response.poles
+    parts = (*ends, Poles(np.unique(own.real), np.unique(own.pairs)))
+    poles = Poles(
+        np.concatenate([part.real for part in parts]), np.concatenate([part.pairs for part in parts])
+    )
+    size = poles.order + response.fir_length
+    form = replace(response, poles=poles, mean=np.zeros(size), covariance_factor=np.zeros((size, 1)))
+    rows, taps = form.frequency_rows(omega), coefficients[:, own.order :]
+    scale = 1 / np.abs(responses.mean(axis=(0, 1)))
+    targets = ((responses - taps @ rows[:, poles.order :].T) * scale).reshape(-1, omega.size).T
+    columns = scale[:, None] * rows[:, : poles.order]
+    solved = np.linalg.lstsq(
+        np.vstack([columns.real, columns.imag]), np.vstack([targets.real, targets.imag]), rcond=1e-10
+    )[0]
+    on_poles = solved.T.reshape(*responses.shape[:2], -1)
+    return form, np.concatenate([on_poles, np.broadcast_to(taps, (len(responses), *taps.shape))], axis=2)
