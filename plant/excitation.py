@@ -28,16 +28,11 @@ def prbs(
     The period is (2^register_length - 1) * hold_samples; the sequence s of one period (unheld, unit
     amplitude) has the circular autocorrelation sum_k s_k s_(k+l) = -1 for every l but 0.
 
-    Parameters
-    ----------
-    start
-        Register at the start: bits (register_length,) that are not all zero, or a generator that draws them
-        (the first bit is then set to 1); None starts with all ones.
+    start : Register at the start: bits (register_length,) that are not all zero, or a generator that draws
+        them (the first bit is then set to 1); None starts with all ones.
 
-    Raises
-    ------
-    ValueError
-        For a register length outside 2..20, a hold or length below 1, a bad amplitude or register.
+    Raises ValueError for a register length outside 2..20, a hold or length below 1, a bad amplitude or
+    register.
     """
     if not 2 <= register_length <= 20:
         raise ValueError(f"register_length must be 2..20; got {register_length}")
@@ -76,11 +71,8 @@ def multisine_lines(
     every group of four: even and odd distortions of a nonlinear machine then appear at lines that are not
     excited.
 
-    Raises
-    ------
-    ValueError
-        If no line is left, the band is not 0 < low < high < Nyquist, or "odd_random" comes without a
-        generator.
+    Raises ValueError if no line is left, the band is not 0 < low < high < Nyquist, or "odd_random" comes
+    without a generator.
     """
     if period_samples < 2:
         raise ValueError(f"period_samples must be at least 2; got {period_samples}")
@@ -119,18 +111,12 @@ def multisine(
 ) -> Real:
     """Equal-amplitude multisine (lead_in_samples + period_samples * periods,) with uniform random phases.
 
-    Parameters
-    ----------
-    lines
-        Harmonics, from `multisine_lines`; 1 and up, below period_samples / 2.
-    rms_V
-        Root mean square.
-    draws
-        Number of phase draws, of which the one with the lowest crest factor is kept; 1 leaves the phases
+    lines : Harmonics, from `multisine_lines`; 1 and up, below period_samples / 2.
+    rms_V : Root mean square.
+    draws : Number of phase draws, of which the one with the lowest crest factor is kept; 1 leaves the phases
         uniform.
-    lead_in_samples
-        Samples before the whole periods, of the same periodic signal: a machine that starts at rest is in
-        steady state behind them.
+    lead_in_samples : Samples before the whole periods, of the same periodic signal: a machine that starts at
+        rest is in steady state behind them.
     """
     harmonics = np.asarray(lines, dtype=np.int64)
     if harmonics.ndim != 1 or harmonics.size == 0 or len(set(harmonics.tolist())) != harmonics.size:

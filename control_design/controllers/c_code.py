@@ -13,31 +13,11 @@ from control_design.plants.ellipses import Real
 
 Number = Literal["double", "float"]
 
-_INPUT_LIMIT = """\
-    if (command > INPUT_LIMIT) command = INPUT_LIMIT;
-    if (command < -INPUT_LIMIT) command = -INPUT_LIMIT;
-"""
-_FEEDFORWARD = """\
-    $number sign = (reference - state->reference) / TURN;
-    if (sign > 1) sign = 1;
-    if (sign < -1) sign = -1;
-    state->smoothed += SHARE * (sign - state->smoothed);
-    state->reference = reference;
-    wanted += LEVEL * state->smoothed;
-"""
-_RATE_LIMIT = """\
-    if (command > state->last + LARGEST_CHANGE) command = state->last + LARGEST_CHANGE;
-    if (command < state->last - LARGEST_CHANGE) command = state->last - LARGEST_CHANGE;
-"""
-
 
 def c_header(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
     """Declarations to include: the state, `<prefix>_reset` and `<prefix>_step`.
 
-    Raises
-    ------
-    ValueError
-        If names that start with the prefix are no C identifiers.
+    Raises ValueError if names that start with the prefix are no C identifiers.
     """
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix):
         raise ValueError(f"prefix must be a C identifier; got {prefix!r}")
@@ -53,28 +33,16 @@ def c_header(controller: Controller, prefix: str = "controller", number: Number 
 def c_source(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
     """A self-contained C99 translation unit (it repeats the declarations of `c_header`).
 
-    Parameters
-    ----------
     controller : Controller
-    prefix : str
-        Start of every name, a C identifier.
-    number : "double" or "float"
-        Type of states, coefficients and arithmetic.
+    prefix : str. Start of every name, a C identifier.
+    number : "double" or "float". Type of states, coefficients and arithmetic.
 
-    Returns
-    -------
-    str
-        `<prefix>_step(&state, error)` returns the limited command for the error at this sample; the
-        state keeps whether a limit was active. One call every `dt_s`; order n costs (n + 1)^2
-        multiplications. With a friction feed-forward it is `<prefix>_step(&state, error, reference)`.
+    `<prefix>_step(&state, error)` returns the limited command for the error at this sample; the state keeps
+    whether a limit was active. One call every `dt_s`; order n costs (n + 1)^2 multiplications. With a
+    friction feed-forward it is `<prefix>_step(&state, error, reference)`.
 
-    Raises
-    ------
-    ValueError
-        If the prefix is no C identifier.
+    Raises ValueError if the prefix is no C identifier.
 
-    Notes
-    -----
     Same law and same order of operations as `ControllerStepper`: x+ = A x + B e + M (u_limited - u). In
     `double` the two differ by the rounding of sums only. The computational delay is not in the code: a
     real-time loop that writes its command one sample later has it by itself. Not covered: fixed point, and an
@@ -103,11 +71,11 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         )
     if controller.input_limit is not None:
         constants += f"static const {number} INPUT_LIMIT = {literal(controller.input_limit)};\n"
-        limits = _INPUT_LIMIT
+        limits = _template("input_limit.c.in").template
     if controller.rate_limit is not None:
         change = literal(controller.rate_limit * controller.dt_s)
         constants += f"static const {number} LARGEST_CHANGE = {change};  /* rate_limit * dt_s */\n"
-        limits = _RATE_LIMIT + limits
+        limits = _template("rate_limit.c.in").template + limits
     return _template("controller.c.in").substitute(
         header=c_header(controller, prefix, number),
         A=",\n    ".join(vector(row) for row in controller.A) or vector(controller.C[0]),
@@ -117,7 +85,7 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         M=vector(controller.anti_windup_gain[:, 0]),
         constants=constants,
         limits=limits,
-        feedforward="" if given is None else Template(_FEEDFORWARD).substitute(number=number),
+        feedforward="" if given is None else _template("feedforward.c.in").substitute(number=number),
         at_rest="" if given is None else "    state->reference = state->smoothed = 0;\n",
         **_names(controller, prefix, number),
     )

@@ -61,10 +61,7 @@ def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) ->
         return [*told, finding(FindingKind.LINEAR, **about, percent=limit, **ends)]
     percent = 100 * max(band.distortion for band in distorted)
     kind, trend = _kind(levels, distorted), _trend(levels, all_levels, distorted)
-    return [
-        *told,
-        finding(FindingKind.DISTORTED, **about, percent=percent, parity=kind, trend=trend, **ends),
-    ]
+    return [*told, finding(FindingKind.DISTORTED, **about, percent=percent, parity=kind, trend=trend, **ends)]
 
 
 def _n_detection(levels: Distortion) -> int:

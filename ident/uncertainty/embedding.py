@@ -103,9 +103,7 @@ class EmbeddingOptions(BaseModel):
 
 
 def tangent(
-    records: Sequence[Record],
-    model: GobfModel,
-    options: EmbeddingOptions | None = None,
+    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> ResponsePosterior:
     """Posterior of the response around a model whose poles were chosen from these records.
 

@@ -134,10 +134,7 @@ def test_every_excitation_gives_its_samples_and_its_size(table):
         ("uncertainty = {{ {0} }}\nincrements = true", "records as measured"),
         ("uncertainty = {{ {0} }}\nband_rad_s = [1.0, 20.0]", "records as measured"),
         ("uncertainty = {{ {0} }}\nidentification = {{ integrators = 2 }}", "at most one integrator"),
-        (
-            "uncertainty = {{ promise = 'amplitudes from 8 to 2' }}",
-            "must be positive and smaller",
-        ),
+        ("uncertainty = {{ promise = 'amplitudes from 8 to 2' }}", "must be positive and smaller"),
         ("uncertainty = {{ promise = 'amplitudes 2..8' }}", "promise"),
     ],
 )

@@ -15,15 +15,15 @@ from control_design.controllers.c_code import c_header, c_source
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from workflow.engine import codec, storage
+from workflow.text.templates import render_text
 
 RUN_FILES = ("controller.json", "controller.c", "controller.h")
 """What a run leaves in its directory; those of a reference filter are named after them (`filter_file`)."""
 
-_NOTE = (
-    "/* Reference filter F of u = K (F r - y): give each sample of the reference to\n"
-    "   reference_filter_step as its argument `error`; what it returns, less the measurement, is the error\n"
-    "   for the controller. */\n"
-)
+
+def _noted(code: str) -> bytes:
+    """The C code of a reference filter behind a note on how it is called."""
+    return f"{render_text('reference_filter_note.h.j2').rstrip()}\n{code}".encode("ascii")
 
 
 def _mat(controller: Controller) -> bytes:
@@ -61,8 +61,8 @@ _CONTROLLER: Mapping[str, Callable[[Controller], bytes]] = {
 _FILTER: Mapping[str, Callable[[ReferenceFilter], bytes]] = {
     ".json": lambda found: found.to_json().encode(),
     ".mat": _filter_mat,
-    ".c": lambda found: (_NOTE + c_source(_as_law(found), "reference_filter")).encode("ascii"),
-    ".h": lambda found: (_NOTE + c_header(_as_law(found), "reference_filter")).encode("ascii"),
+    ".c": lambda found: _noted(c_source(_as_law(found), "reference_filter")),
+    ".h": lambda found: _noted(c_header(_as_law(found), "reference_filter")),
 }
 SUFFIXES = (".json", ".mat", ".c")
 

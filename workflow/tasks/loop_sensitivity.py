@@ -66,10 +66,7 @@ class SensitivityPlan:
 
 
 def plan_sensitivity(
-    controller: Controller,
-    plant: UncertainPlant,
-    input_rms: float,
-    transient_samples: int,
+    controller: Controller, plant: UncertainPlant, input_rms: float, transient_samples: int
 ) -> SensitivityPlan:
     """From a twentieth of the predicted peak's frequency to ten times it, lines a twentieth of it apart; as
     large as the rms of the input in the records and the voltage limit allow."""
