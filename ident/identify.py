@@ -75,6 +75,15 @@ def identify(
     return _identified(records, options, report)
 
 
+def untested_model(records: Sequence[Record], options: IdentOptions) -> GobfModel:
+    """The model of `identify` in white noise before what is stated as known is tested: half the time, for
+    searches that are repeated. No relative degree is imposed. Raises ValueError as `identify`."""
+    data = prepare(records, options.structure())
+    refuse_unusable(records, data, least_order(options))
+    outcome, _ = searched(records, data, options, silent)
+    return description(records, outcome, fitted_on_all(records, outcome)[0])[0].channel(0)
+
+
 def _identified(records: Sequence[Record], options: IdentOptions, report: Progress) -> Identification:
     """The fit that takes the noise as white."""
     data = prepare(records, options.structure())

@@ -29,7 +29,7 @@ from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import SteppedArm, less_friction
-from ident.identify import identify
+from ident.identify import untested_model
 
 # Ten microradians: what a stiff bearing or gear deflects before it slips.
 PRESLIDING = 1e-5
@@ -150,7 +150,7 @@ def fit_friction(
             break
         best, level = found, found.level
         # The poles may have been led astray by friction that was not yet right: search for them again.
-        model = identify([found.taken_off(record) for record in records], options).model
+        model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
     report(1.0, "friction identified")
     return best
@@ -181,7 +181,7 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
             less_friction(record, level * sign, options.input_delay_samples)
             for record, sign in zip(records, signs, strict=True)
         ]
-        model = identify(less, options).model
+        model = untested_model(less, options)
         undelayed = GobfModel(model.poles, model.coefficients, model.dt_s, integrators=model.integrators)
         blocks = [
             np.column_stack([_basis(model.poles.doubled(), record, options), -undelayed.simulate(sign)])
