@@ -90,7 +90,8 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
         best, parents = found[0], _parents(found, count)
         if not parents or len(best.names) < (count if _explained(found) else 1):
             break
-        if count > 1 and (_hopeless(parents[0], base) or _as_solvers_differ(model, parents[0])):
+        hopeless = _beyond_noise(parents[0]) > _HOPELESS * _beyond_noise(base)
+        if count > 1 and (hopeless or _as_solvers_differ(model, parents[0])):
             break
         further = _further(screening, parents, listed, explained=_explained(found))
         found += _fitted(model, base, further, _part(report, 0.6 + 0.1 * count, 0.1))
@@ -213,10 +214,6 @@ def _simulated(screening: Screening, trial: _Trial) -> _Trial:
 
 def _beyond_noise(end: Fit) -> float:
     return max(end.rms**2 - 1.0, 0.0)
-
-
-def _hopeless(end: Fit, base: Fit) -> bool:
-    return _beyond_noise(end) > _HOPELESS * _beyond_noise(base)
 
 
 def _as_solvers_differ(model: ResidualModel, end: Fit) -> bool:

@@ -30,9 +30,5 @@ def _choose_rig(value: Any, info: ValidationInfo) -> str | Path:
     return path
 
 
-def _check_effect(value: Any) -> dict[str, Any]:
-    return parse_effect(value).to_dict()
-
-
 RigChoice = Annotated[str | Path, PlainValidator(_choose_rig), PlainSerializer(str, return_type=str)]
-EffectTable = Annotated[dict[str, Any], BeforeValidator(_check_effect)]
+EffectTable = Annotated[dict[str, Any], BeforeValidator(lambda value: parse_effect(value).to_dict())]

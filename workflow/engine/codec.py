@@ -101,13 +101,8 @@ def plain_text(value: Any) -> str:
 def stored_fields(kind: type) -> dict[str, Any]:
     """Name and annotation of the fields of a dataclass that are data."""
     hints = get_type_hints(kind, include_extras=True)
-    return {
-        f.name: hints[f.name] for f in dataclasses.fields(kind) if f.init and not _is_function(hints[f.name])
-    }
-
-
-def _is_function(kind: Any) -> bool:
-    return get_origin(kind) is collections.abc.Callable
+    known = {f.name: hints[f.name] for f in dataclasses.fields(kind) if f.init}
+    return {name: k for name, k in known.items() if get_origin(k) is not collections.abc.Callable}
 
 
 def _pack(value: Any, at: str, arrays: dict[str, AnyArray]) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -73,7 +73,7 @@ def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Seq
         {
             "number": row.number,
             "name": row.name,
-            **{axis.key: _cell(row.values[axis.key]) for axis in axes},
+            **{a.key: v if isinstance(v := row.values[a.key], (int, float)) else short(v) for a in axes},
             "state": row.state,
             **row.numbers,
             **{f"front_{k}": "yes" if row.number in on else "no" for k, on in enumerate(front, 1)},
@@ -83,10 +83,6 @@ def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Seq
     ]
     # As objects: a whole number stays one beside a cell without a number.
     return str(pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n"))
-
-
-def _cell(value: Any) -> Any:
-    return value if isinstance(value, (int, float)) else short(value)
 
 
 def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
