@@ -485,7 +485,7 @@ def test_30_cost_of_eta_is_that_of_the_fitted_coefficients():
 
 def test_31_all_variants_of_nlopt_are_there():
     offered = {name for name in dir(nlopt) if name.startswith("GN_") and "DIRECT" in name}
-    assert offered == set(DIRECT)
+    assert offered <= set(DIRECT)
 
 
 def damped_pair(noise_share):
