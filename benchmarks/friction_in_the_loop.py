@@ -123,17 +123,13 @@ def run(out: Print, *, seeds: int = 14, first: int = 0) -> None:
         held, counted = held + int(np.sum(inside & moves)), counted + int(np.sum(moves))
         allowed = (1 + TOLERANCE_PERCENT / 100) * bound
         claimed = np.cumprod(peaks[:, ::-1, 2] <= allowed, axis=1)[:, ::-1] == 1
-        claims, kept = (
-            claims + int(np.sum(claimed)),
-            kept + int(np.sum(claimed & (peaks[:, :, 0] <= allowed))),
-        )
+        claims += int(np.sum(claimed))
+        kept += int(np.sum(claimed & (peaks[:, :, 0] <= allowed)))
         out(f"\nfriction {torque_Nm:g} N m, {seeds} arms")
         out("  reference, rad rms      " + " ".join(f"{size:>15g}" for size in SIZES_RAD))
         middle = np.median(peaks, axis=0)
-        out(
-            "  predicted |S|, median   "
-            + " ".join(f"{low:.4f} to {high:.4f}"[:15] for _, low, high in middle)
-        )
+        spans = [f"{low:.3f} to {high:.3f}" for _, low, high in middle]
+        out("  predicted |S|, median   " + " ".join(f"{span:>15}" for span in spans))
         out("  measured |S|, median    " + " ".join(f"{value:15.4f}" for value, _, _ in middle))
         out("  claimed, of arms        " + " ".join(f"{int(n):>12}/{seeds}" for n in claimed.sum(axis=0)))
         off = 100 * (middle[:, 0] / plan.nominal_peak - 1)
