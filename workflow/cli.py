@@ -215,6 +215,14 @@ def identify(
         ),
     ] = None,
     level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
+    promise: Annotated[
+        str,
+        typer.Option(
+            help="What the ellipses are about: 'as recorded' (all that is not linear is noise); or, the "
+            "output being the position of a shaft with dry friction: 'without friction', 'this amplitude', "
+            "'amplitudes from 2 to 8' (rms of the input)."
+        ),
+    ] = "as recorded",
     band: Annotated[
         tuple[float, float] | None,
         typer.Option(
@@ -280,6 +288,7 @@ def identify(
             validation=validation or [],
             options=options,
             level=level,
+            promise=promise,
             band_rad_s=band,
             noise_order=noise_order,
             out=out,

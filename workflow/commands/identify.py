@@ -10,6 +10,8 @@ from typing import Any
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
+from workflow.config.run_config import UncertaintyOptions
+from workflow.config.settings import check
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
@@ -35,6 +37,7 @@ def identify_logs(
     validation: Sequence[Path] = (),
     options: IdentOptions | None = None,
     level: float = 0.95,
+    promise: str = "as recorded",
     band_rad_s: tuple[float, float] | None = None,
     noise_order: int | None = None,
     out: Path | None = None,
@@ -48,11 +51,12 @@ def identify_logs(
     or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
     logs made in closed loop, for the two-stage method. time_unit: of the time column, where its name does
     not say it. band_rad_s: fit inside this band only, friction and drift below it and noise above it left
-    out. noise_order: largest order of the noise model behind the ellipses; none given: 8, or 32 where that
+    out. promise: what the ellipses are about, as `uncertainty.promise` of a configuration; output_name is
+    then the position of the shaft that the friction acts on. noise_order: largest order of the noise model
+    behind the ellipses; none given: 8, or 32 where that
     leaves coloured residuals. Raises InputError: one line naming file, column or line.
     """
-    if not 0.5 < level < 1:
-        raise InputError(f"--level must lie between 0.5 and 1, got {level}")
+    promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
         raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
     # A log given twice would count its noise twice as well known, or validate what it was fitted to.
@@ -84,7 +88,7 @@ def identify_logs(
         common[: len(measured)],
         common[len(measured) :],
         options,
-        level=level,
+        promised=promised,
         band_rad_s=band_rad_s,
         noise_order=noise_order,
         with_plot=report is not None,

@@ -74,7 +74,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 two_stage=finding,
             )
             if known is not None:
-                found = _clipped_as_measured(found, [r.siso(channel.input, channel.output) for r in measured])
+                found = clipped_as_measured(found, [r.siso(channel.input, channel.output) for r in measured])
             channels.append(
                 replace(
                     found,
@@ -87,7 +87,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     return IdentifyResult(tuple(channels), friction)
 
 
-def _clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
+def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
     """What stands at its limit is seen in what was measured, not in what taking the friction off has left."""
     search = found.identification.search
     others = tuple(warning for warning in search.warnings if warning.kind is not FindingKind.CLIPPED)

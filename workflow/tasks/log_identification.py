@@ -14,12 +14,15 @@ from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
 from ident.finding import Finding
+from ident.friction import EquivalentFriction, FrictionFit, at_amplitudes, equivalent_friction, fit_friction
+from ident.friction import without_friction as behind_friction
 from ident.identification import Identification
 from ident.uncertainty import ResponsePosterior
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from workflow.config.run_config import UncertaintyOptions
 from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
-from workflow.tasks.identification import identified_channel
+from workflow.tasks.identification import clipped_as_measured, identified_channel
 from workflow.tasks.results import IdentifiedChannel, Tests, UncertainChannel
 from workflow.tasks.truth import TrueMode
 from workflow.tasks.uncertainty import N_BANDS, display_grid, residual_tests, uncertain_channel
@@ -35,7 +38,9 @@ class LogIdentification:
     `measured` are the records as read, `used` the same as the fit saw them (inside the band; with the input
     that the reference explains, where the logs come from a closed loop). `about` and `spread` are results as
     of a run's stages; `careful` says what to look at. The stabilisation plot is None where nobody asked for
-    it. `true_modes`: beside each mode of `about` the true one, known of simulated logs.
+    it. `true_modes`: beside each mode of `about` the true one, known of simulated logs. `promised`: what the
+    ellipses are about; friction: identified, where that asks for it; equivalent: the viscous friction that
+    acts like it, where it asks for amplitudes.
     """
 
     measured: tuple[Record, ...]
@@ -44,6 +49,9 @@ class LogIdentification:
     about: IdentifiedChannel
     spread: UncertainChannel
     careful: tuple[Finding, ...]
+    promised: UncertaintyOptions
+    friction: FrictionFit | None = None
+    equivalent: EquivalentFriction | None = None
     true_modes: tuple[TrueMode | None, ...] = ()
 
 
@@ -52,7 +60,7 @@ def identify_records(
     fresh_records: Sequence[Record] = (),
     options: IdentOptions | None = None,
     *,
-    level: float = 0.95,
+    promised: UncertaintyOptions | None = None,
     band_rad_s: tuple[float, float] | None = None,
     noise_order: int | None = None,
     with_plot: bool = True,
@@ -61,11 +69,22 @@ def identify_records(
     """Identify one channel from records (tangent uncertainty); nothing is written.
 
     The noise is modelled where the residuals are not white. Records with a reference are taken as made in
-    closed loop. Raises InputError.
+    closed loop. promised: what the ellipses are about, and their level. Raises InputError.
     """
     options, progress = options or IdentOptions(), progress or Progress()
+    promised = promised or UncertaintyOptions()
+    friction, equivalent, logs_to_validate = None, None, fresh_records
     with naming("identify"), progress.stage("identify") as update:
         used, opened = list(measured), None
+        if promised.friction_identified:
+            if band_rad_s is not None or any(record.reference is not None for record in measured):
+                raise ValueError(
+                    f"'{promised.promise}' takes logs as measured, in open loop: no band, no reference"
+                )
+            friction = fit_friction(used, options, progress=update)
+            used, fresh_records = (
+                [friction.taken_off(record) for record in part] for part in (used, fresh_records)
+            )
         if band_rad_s is not None:
             # A pair far outside the band could only describe the filter's skirts.
             options = options.model_copy(
@@ -103,9 +122,27 @@ def identify_records(
             with_plot=with_plot,
             two_stage=None if opened is None else opened.finding,
         )
+        if friction is not None:
+            about = clipped_as_measured(about, measured)
         about, found = replace(about, band_rad_s=band_rad_s), about.identification
     with naming("identify"), progress.stage("uncertainty"):
-        posterior, tests = _posterior(used, found, noise_order)
+        poles, linear = found.model.poles, None
+        if friction is None:
+            posterior, tests = _posterior(used, found, noise_order)
+        else:
+            white = whiteness_test(found.residuals).passed
+            behind = behind_friction(
+                measured,
+                friction,
+                found.model,
+                EmbeddingOptions(coloured_noise=not white, max_ar_order=noise_order or _NOISE_ORDERS[0]),
+            )
+            linear = posterior = behind.response
+            tests = residual_tests(posterior, used)
+            if promised.promise != "without friction":
+                rng = np.random.default_rng(0)
+                equivalent = equivalent_friction(friction, measured, rng, promised.amplitudes)
+                posterior, poles = at_amplitudes(behind, equivalent, rng, promised.level)
         omega = display_grid(found.model, used)
         if band_rad_s is not None:
             omega = omega[(omega >= band_rad_s[0]) & (omega <= band_rad_s[1])]
@@ -113,7 +150,9 @@ def identify_records(
                 raise ValueError(
                     f"the band {band_rad_s[0]:g} to {band_rad_s[1]:g} rad/s is too narrow to show"
                 )
-        spread = uncertain_channel("tangent", level, posterior, about, omega, omega, tests=tests)
+        spread = uncertain_channel(
+            "tangent", promised.level, posterior, about, omega, omega, poles=poles, linear=linear, tests=tests
+        )
     return LogIdentification(
         measured=tuple(measured),
         fresh_records=tuple(fresh_records),
@@ -121,12 +160,15 @@ def identify_records(
         about=about,
         spread=spread,
         careful=(
-            *_doubts([*measured, *fresh_records]),
+            *_doubts([*measured, *logs_to_validate]),
             *found.warnings,
             *residual_advice(*spread.tests, noise_order=spread.noise_order),
             *_beyond(found, options, band_rad_s),
             *(opened.warnings(omega) if opened else ()),
         ),
+        promised=promised,
+        friction=friction,
+        equivalent=equivalent,
     )
 
 
