@@ -1,6 +1,6 @@
 """Dry friction identified with the linear arm: the response behind it, and what it makes of it."""
 
-from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, input_rms
+from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, refuse_unrecorded
 from ident.friction.fit import FrictionFit, fit_friction
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
@@ -11,7 +11,7 @@ __all__ = [
     "at_amplitudes",
     "equivalent_friction",
     "fit_friction",
-    "input_rms",
     "other_output_without_friction",
+    "refuse_unrecorded",
     "without_friction",
 ]

@@ -49,7 +49,19 @@ _EXCITED = 1e-3
 _N_GRID = 300
 
 
-def input_rms(records: Sequence[Record]) -> RealArray:
+def refuse_unrecorded(records: Sequence[Record], amplitudes: tuple[float, float] | None) -> None:
+    """Raises ValueError for a range of the input's rms that is not inside that of the records."""
+    rms = _input_rms(records)
+    smallest, largest = float(rms.min()), float(rms.max())
+    low, high = amplitudes or (smallest, largest)
+    if not smallest * (1 - _SAME) <= low <= high <= largest * (1 + _SAME):
+        raise ValueError(
+            f"amplitudes from {low:.4g} to {high:.4g} cannot be promised: the inputs of the records have an "
+            f"rms from {smallest:.4g} to {largest:.4g}"
+        )
+
+
+def _input_rms(records: Sequence[Record]) -> RealArray:
     """Root mean square (R,) of the input of every record."""
     return np.array([float(np.sqrt(np.mean(record.input[:, 0] ** 2))) for record in records])
 
@@ -94,21 +106,13 @@ def equivalent_friction(
     """For random-phase multisines with the records' power spectrum.
 
     amplitudes: smallest and largest rms of the input, five are simulated from one to the other in equal steps
-    of the logarithm; none: that of the records together. Raises ValueError where the range is not inside that
-    of the records.
+    of the logarithm; none: that of the records together. Raises ValueError as `refuse_unrecorded`.
     """
-    recorded = input_rms(records)
-    smallest, largest = float(recorded.min()), float(recorded.max())
+    refuse_unrecorded(records, amplitudes)
     if amplitudes is None:
-        rms = np.array([np.sqrt(np.mean(recorded**2))])
+        rms = np.array([np.sqrt(np.mean(_input_rms(records) ** 2))])
     else:
-        low, high = amplitudes
-        if not smallest * (1 - _SAME) <= low < high <= largest * (1 + _SAME):
-            raise ValueError(
-                f"amplitudes from {low:.4g} to {high:.4g} cannot be promised: the inputs of the records have "
-                f"an rms from {smallest:.4g} to {largest:.4g}"
-            )
-        rms = np.geomspace(low, high, _AMPLITUDES)
+        rms = np.geomspace(*amplitudes, _AMPLITUDES)
     spectrum = _power_spectrum(records)
     lines = np.flatnonzero(spectrum > _EXCITED * spectrum.max())
     found = [_at_amplitude(friction, spectrum, lines, float(a), rng) for a in rms]

@@ -224,6 +224,31 @@ def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
     assert [sentence for sentence in warnings if "outside the band of the data" in sentence]
 
 
+def test_friction_is_identified_from_logs_where_that_is_asked_for(flexlink, undrawn, tmp_path):
+    """On records of the default arm: the model behind its friction simulates unseen ones better."""
+    assert flexlink("simulate", "--out", tmp_path / "logs").code == 0
+    *logs, fresh = sorted((tmp_path / "logs").glob("*.csv"))
+    command = ("identify", *logs[:2], "--validation", fresh, "--input", "voltage_V", "--time", "time_s")
+    command = (*command, "--output", "hub_angle_rad", "--integrators", 1, "--delay", 1, "--json")
+    command = (*command, "--real", 1, "--pairs", 2, "--omega-min", 30, "--noise", "white")
+    told = {}
+    for promise in ("as recorded", "without friction", "this amplitude"):
+        page = tmp_path / "page.html"
+        answer = flexlink(*command, "--promise", promise, "--report", page)
+        assert answer.code == 0, answer.err
+        document = json.loads(answer.out)
+        told[promise] = {row["label"]: row["value"] for row in document["table"]}
+        text = Page(page.read_text(encoding="utf-8")).text
+        assert ("Coulomb" in text) == (promise != "as recorded")
+        assert ("best linear approximation" in text) == (promise == "this amplitude")
+    unexplained = {promise: 100 - float(row["fit, validation"].split()[0]) for promise, row in told.items()}
+    assert unexplained["without friction"] < unexplained["as recorded"] / 2
+    assert unexplained["this amplitude"] == unexplained["without friction"]  # of the same model
+    answer = flexlink(*command, "--promise", "amplitudes from 1 to 8")
+    assert answer.code == 2
+    assert "cannot be promised: the inputs of the records have an rms from" in answer.err
+
+
 def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexlink, undrawn, tmp_path):
     """Same bits: the stamps are divided by 1000, which rounds once."""
     record = p2(5, 600).record
@@ -280,7 +305,9 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--report", "{log}"), "that is a source already"),
         (("--report", "{out}/a", "--out", "{out}/a"), "that is --out already"),
         (("--reference", "r"), "no column 'r'"),
-        (("--level", "0.2"), "--level must lie between"),
+        (("--level", "0.2"), "level: input should be greater than 0.5"),
+        (("--promise", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
+        (("--promise", "this amplitude", "--band", "10", "20"), "logs as measured, in open loop: no band"),
         (("--band", "50", "20"), "lower below upper"),
         (("--band", "50", "2000"), "the band must lie in (0, 628"),
         (("--pairs", "12", "--report", "{out}/page.html"), "too few"),

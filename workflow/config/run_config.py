@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import tomlkit
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from control_design.specification import Specification
 from control_design.synthesis.synthesis import SynthesisOptions
@@ -162,13 +162,22 @@ class UncertaintyOptions(EmbeddingOptions):
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
     promise: str = Field(
         "as recorded",
-        pattern=rf"^(as recorded|without friction|this amplitude|{_RANGE})$",
         description="what response the ellipses are about: as recorded: a linear arm's, whatever is not "
         "linear taken for noise. The others identify the Coulomb friction of the control channel (its output "
         "is the shaft's position). without friction: the linear arm behind it; this amplitude: the best "
         "linear approximation, friction included, at the rms of the records' inputs; amplitudes from 2 to 8: "
         "at any rms of the input between these, in its unit",
     )
+
+    @field_validator("promise")
+    @classmethod
+    def _known(cls, promise: str) -> str:
+        if not re.fullmatch(f"as recorded|without friction|this amplitude|{_RANGE}", promise):
+            raise ValueError(
+                "expected 'as recorded', 'without friction', 'this amplitude' or 'amplitudes from 2 to 8', "
+                f"got {promise!r}"
+            )
+        return promise
 
     @property
     def friction_identified(self) -> bool:

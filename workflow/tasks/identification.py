@@ -12,7 +12,7 @@ from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
 from ident.finding import Finding, FindingKind
-from ident.friction import FrictionFit, fit_friction
+from ident.friction import FrictionFit, fit_friction, refuse_unrecorded
 from ident.identify import identify
 from ident.stabilisation import stabilisation
 from workflow.config.run_config import Channel, Role
@@ -99,8 +99,11 @@ def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:
     """Coulomb friction of the shaft whose position the control channel measures."""
     channel = stage.config.control_channel
     with naming(f"channel {channel.label!r}"):
+        at_shaft = [record.siso(channel.input, channel.output) for record in measured]
+        for other in stage.config.channels:
+            refuse_unrecorded(at_shaft, other.uncertainty.amplitudes)
         return fit_friction(
-            [record.siso(channel.input, channel.output) for record in measured],
+            at_shaft,
             channel.identification,
             progress=lambda done, what: stage.progress.update("identify", 0.0, what),
         )

@@ -14,7 +14,14 @@ from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
 from ident.finding import Finding
-from ident.friction import EquivalentFriction, FrictionFit, at_amplitudes, equivalent_friction, fit_friction
+from ident.friction import (
+    EquivalentFriction,
+    FrictionFit,
+    at_amplitudes,
+    equivalent_friction,
+    fit_friction,
+    refuse_unrecorded,
+)
 from ident.friction import without_friction as behind_friction
 from ident.identification import Identification
 from ident.uncertainty import ResponsePosterior
@@ -81,6 +88,7 @@ def identify_records(
                 raise ValueError(
                     f"'{promised.promise}' takes logs as measured, in open loop: no band, no reference"
                 )
+            refuse_unrecorded(used, promised.amplitudes)
             friction = fit_friction(used, options, progress=update)
             used, fresh_records = (
                 [friction.taken_off(record) for record in part] for part in (used, fresh_records)
