@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from benchmarks.identify_with_friction import weak_records
 from ident import IdentOptions, identify
 from ident.basis.poles import Poles
 from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair, pairs_outside
@@ -14,19 +15,13 @@ from ident.finding import FindingKind
 from tests.ident.benchmark_plants import as_record, p1, p2
 from tests.ident.findings import kinds
 from workflow.config.run_config import built_in_config
-from workflow.tasks.simulated_rig import simulate_record
 
 STATED = {"integrators": 1, "input_delay_samples": 1, "noise": "auto"}
 
 
 def arm_records(seed: int):
-    """The default arm's estimation records: dry friction of 0.02 N m, an encoder, sensor noise of 1 mrad."""
-    source = built_in_config()[0].source
-    return [
-        simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad")
-        for entry in source.records
-        if entry.role == "estimation"
-    ]
+    """Weak records of the default arm: dry friction of 0.02 N m, an encoder, sensor noise of 1 mrad."""
+    return weak_records(built_in_config()[0].source, seed)
 
 
 def frequencies_Hz(found):

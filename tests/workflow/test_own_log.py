@@ -21,13 +21,12 @@ def test_readme_walkthrough_from_csv_files_to_a_certified_controller(flexlink, t
     shutil.copy(ROOT / "examples" / "own_log.toml", tmp_path)
     logs, model = tmp_path / "logs", tmp_path / "hub.npz"
     assert flexlink("simulate", "--out", logs).code == 0
-    first, second, third = sorted(logs.glob("*.csv"))
+    *measured, fresh = sorted(logs.glob("*.csv"))
+    assert len(measured) == 8
     columns = ["--input", "voltage_V", "--output", "hub_angle_rad", "--time", "time_s"]
     structure = ["--integrators", 1, "--delay", 1, "--real", 1, "--pairs", 2]
     written = ["--report", tmp_path / "hub.html", "--export", tmp_path / "hub.mat", "--out", model]
-    told = flexlink(
-        "identify", first, second, "--validation", third, *columns, *structure, *written, "--json"
-    )
+    told = flexlink("identify", *measured, "--validation", fresh, *columns, *structure, *written, "--json")
     assert told.code == 0
     assert (tmp_path / "hub.html").is_file()
     assert read_model(tmp_path / "hub.mat").model.output_name == "hub_angle_rad"
