@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import solve_triangular
 from scipy.signal import butter, sosfiltfilt
 
 from ident.basis.functions import basis_response, regressor
@@ -30,6 +30,7 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import SteppedArm, less_friction
 from ident.identify import untested_model
+from ident.uncertainty.embedding_algebra import triangle_of
 
 # Ten microradians: what a stiff bearing or gear deflects before it slips.
 PRESLIDING = 1e-5
@@ -254,7 +255,7 @@ def _least_squares(
     b = np.concatenate([target - target.mean() for target in targets])
     length = np.linalg.norm(a, axis=0)
     length[length == 0] = 1.0
-    triangle = np.asarray(qr(np.column_stack([a / length, b]), mode="r")[0])[: length.size + 1]
+    triangle = triangle_of(np.column_stack([a / length, b]))
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=1e-12)[0] / length
     return solution, triangle[:-1, :-1] * length, float(b @ b), float(triangle[-1, -1] ** 2)
 
