@@ -16,7 +16,7 @@ from ident.friction.arm import SteppedArm
 from plant import SampledArm, parse_effect
 from plant.presets import paper_link
 from workflow.tasks.friction_check import holds_from
-from workflow.tasks.friction_loop import FrictionLoop, drawn, interval_of
+from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, interval_of
 
 DT_S = 0.005
 POLES = Poles(np.array([0.97]), np.array([0.93 + 0.24j]))
@@ -140,6 +140,16 @@ def test_feedforward_is_the_friction_of_a_pure_integrator():
     assert np.min(np.abs(without.measured - linear.measured)[moving]) > 0.9 * level / gain
     assert abs(added[-1]) < 1e-6 * level
     assert abs(given.measured[-1] - reference[-1]) <= level / gain
+
+
+def test_feedforward_is_as_late_as_the_loop_follows_a_ramp():
+    """Velocity error of a type-1 loop: behind a ramp by its speed over Kv, that is, late by 1 / Kv."""
+    found = replace(fit(), noise_std=0.0)
+    ramp = 0.1 * np.arange(4000) * DT_S
+    behind = ramp[-1] - FrictionLoop(controller(), found, found.coefficients, 0.0).run(ramp).measured[-1]
+    given = friction_feedforward(controller(), found)
+    assert (given.level, given.width) == (found.level, found.presliding)
+    assert given.lag_s == pytest.approx(behind / 0.1, rel=1e-3)
 
 
 def test_predicted_response_is_that_of_the_nonlinear_arm():
