@@ -12,11 +12,8 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, kernel_array
 from ident.data.record import Record
-from ident.friction.kernel import STRIDES, step_through
+from ident.friction.kernel import step_through
 
-# Steps of a sample: the friction turns round within a few hundred microseconds where the pre-sliding is ten
-# microradians, and at 32 steps of 5 ms the position is right to a hundredth of a milliradian.
-_SUBSTEPS = 32
 # A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped.
 FASTEST_POLE = 2e-3
 
@@ -78,20 +75,13 @@ class SteppedArm:
     ) -> tuple[RealArray, RealArray]:
         """Position (T,) and mean friction per sample (T,), in units of the input (T,), from rest."""
         weights = self.weights @ coefficients
-        step_s = self.dt_s / _SUBSTEPS
-        safe = np.where(self.rates == 0, 1.0, self.rates)
-        grown = np.where(self.rates == 0, step_s, (np.exp(self.rates * step_s) - 1) / safe)
-        twice = (step_s * np.exp(self.rates * step_s) - grown) / safe
-        gain = float(np.sum(weights * np.where(self.chain, twice, grown)).real)
         position, friction = np.empty(voltage.size), np.empty(voltage.size)
         step_through(
             kernel_array(filter_input(voltage, 0, self.structure.input_delay_samples)),
             self.rates,
             self.chain,
             weights,
-            max(gain, np.finfo(np.float64).tiny),
-            step_s,
-            _SUBSTEPS // STRIDES,
+            self.dt_s,
             level,
             presliding,
             position,

@@ -12,6 +12,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from ident.friction.kernel import advance, transitions
+
 
 @numba.njit(cache=True)
 def loop_through(
@@ -26,8 +28,7 @@ def loop_through(
     rates: Any,
     chain: Any,
     weights: Any,
-    step_s: float,
-    substeps: int,
+    dt_s: float,
     level: float,
     presliding: float,
     measured: Any,
@@ -43,23 +44,9 @@ def loop_through(
     for none. delay, input_delay: samples between computing a command and giving it to the arm, and until it
     acts there. The arm as in `step_through`.
     """
-    n, order = rates.size, law.shape[0] - 1
-    decay, onto = np.empty(n, dtype=np.complex128), np.empty(n, dtype=np.complex128)
-    carried = np.zeros(n, dtype=np.complex128)
-    speed_gain = 0.0
-    for j in range(n):
-        s = rates[j]
-        if s == 0:
-            decay[j], onto[j] = 1.0, step_s
-        else:
-            decay[j] = np.exp(s * step_s)
-            onto[j] = (decay[j] - 1) / s
-            if chain[j]:
-                carried[j] = step_s * decay[j]
-                onto[j] = (step_s * decay[j] - onto[j]) / s
-        speed_gain += (weights[j] * onto[j]).real
-    stiffness = level / presliding
-    state, x, later = np.zeros(n, dtype=np.complex128), np.zeros(order), np.zeros(order)
+    order = law.shape[0] - 1
+    moves = transitions(rates, chain, dt_s)
+    state, x, later = np.zeros(rates.size, dtype=np.complex128), np.zeros(order), np.zeros(order)
     deflection, shaft, last = 0.0, 0.0, 0.0
     queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
     for k in range(reference.size):
@@ -85,17 +72,6 @@ def loop_through(
         measured[k], command[k], limited[k] = y, u, last != wanted
         waiting[k % (input_delay + 1)] = u
         applied = waiting[(k + 1) % (input_delay + 1)]
-        for _ in range(substeps):
-            free = speed_gain * applied
-            for j in range(n - 1, -1, -1):
-                state[j] *= decay[j]
-                if chain[j]:
-                    state[j] += carried[j] * state[j - 1]
-                free += (weights[j] * state[j]).real
-            force = stiffness * (deflection + 0.5 * (free - shaft)) / (1 + 0.5 * stiffness * speed_gain)
-            force = min(max(force, -level), level)
-            new = free - speed_gain * force
-            deflection = min(max(deflection + new - shaft, -presliding), presliding)
-            shaft = new
-            for j in range(n):
-                state[j] += onto[j] * (applied - force)
+        shaft, deflection, _ = advance(
+            applied, state, shaft, deflection, moves, rates, chain, weights, level, presliding
+        )

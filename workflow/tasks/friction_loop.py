@@ -21,8 +21,6 @@ from ident.friction.loop import loop_through
 Real = npt.NDArray[np.float64]
 Interval = tuple[float, float]
 
-# Steps of a sample: at 16 of 5 ms the shaft of the default arm is right to a microradian.
-_SUBSTEPS = 16
 # A step sought by bisection is right to this share of itself; how far around the guess it may lie.
 _SHARE, _APART = 0.01, 10.0
 
@@ -64,8 +62,7 @@ class FrictionLoop:
             arm.rates,
             arm.chain,
             arm.weights @ self.coefficients,
-            arm.dt_s / _SUBSTEPS,
-            _SUBSTEPS,
+            arm.dt_s,
             self.level,
             self.found.presliding,
             measured,
