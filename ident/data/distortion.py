@@ -68,9 +68,10 @@ class LineLevels:
     def within(self, low_rad_s: float, high_rad_s: float, level: float = 0.95) -> BandLevel | None:
         """Distortion over gain between two frequencies, taken as one number there; None without a line.
 
-        Most likely for powers that are chi-square around (distortion + noise). The interval has the degrees
-        of freedom of their weighted sum (Satterthwaite), or of the scatter of that sum between realisations
-        where that is wider: clipping now and then moves all lines together.
+        Most likely for powers that are chi-square around (distortion + noise): where it is not one number,
+        lines of less noise count more. The interval has the degrees of freedom of their weighted sum
+        (Satterthwaite), or of the scatter of that sum between realisations where that is wider: clipping now
+        and then moves all lines together.
         """
         at = (self.omega_rad_s >= low_rad_s) & (self.omega_rad_s < high_rad_s) & (self.gain > 0)
         if not at.any() or not self.freedom:
@@ -128,8 +129,7 @@ class Distortion:
     rms: of the input. gain (F,) at omega_rad_s (F,): best linear approximation. excited: scatter between
     realisations, None with one of them; odd, even: lines without excitation, None where there are none.
     noise_std (F,): of G in one period, None with one period. drift: largest mean advance of the output from a
-    period to the next. only_odd: no even line is excited, so that even distortion is none at the excited
-    lines.
+    period to the next, taken off.
     """
 
     rms: float
@@ -145,7 +145,6 @@ class Distortion:
     odd: LineLevels | None
     even: LineLevels | None
     drift: float
-    only_odd: bool
 
     @cached_property
     def bands_rad_s(self) -> tuple[tuple[float, float], ...]:
@@ -326,7 +325,6 @@ def _levels(group: Sequence[_Steady]) -> Distortion:
         odd=levels(np.flatnonzero(inside & (harmonics % 2 == 1))),
         even=levels(np.flatnonzero(inside & (harmonics % 2 == 0))),
         drift=max((steady.drift for steady in group), key=abs),
-        only_odd=bool(np.all(harmonics[at] % 2 == 1)),
     )
 
 

@@ -87,7 +87,6 @@ def test_squarer_shows_at_even_detection_lines_only():
 
     (found,) = distortion_of(records_of(rng, system))
     ends = found.omega_rad_s[0], found.omega_rad_s[-1] * 1.001
-    assert found.only_odd
     assert found.even.within(*ends, 0.99).significant
     assert not found.odd.within(*ends, 0.99).significant
     assert not found.excited.within(*ends, 0.99).significant
