@@ -42,6 +42,8 @@ _PERIODS = 2
 _CHANGE_OF_LEVEL = 0.02
 # An amplitude this close to the end of what was recorded counts as recorded.
 _SAME = 1e-3
+# Largest multiple of the scatter between amplitudes that ellipses are made of.
+_MOST = 3.0
 # Every so many draws are counted when the ellipses are made large enough.
 _THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
@@ -160,7 +162,9 @@ def at_amplitudes(
             ellipses = posterior(share).at(omega, level)
             return level - float(np.mean([ellipses.contains(one) for one in flat[::_THINNED]]))
 
-        share = brentq(missing, 0.0, 3.0, xtol=0.01)
+        # Where the amplitudes differ by less than is known of each, nothing has to be added.
+        if missing(0.0) > 0:
+            share = brentq(missing, 0.0, _MOST, xtol=0.01) if missing(_MOST) < 0 else _MOST
     return posterior(share), damped_poles(friction.model, float(np.sqrt(damping[0] * damping[-1])))
 
 
