@@ -22,9 +22,11 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from ident.data.arrays import ComplexArray, RealArray
+from ident.data.ellipses import chi2_radius
+from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
 # A period repeats the input to this share of its power (40 dB: an input as commanded, or well measured).
@@ -145,6 +147,18 @@ class Distortion:
     odd: LineLevels | None
     even: LineLevels | None
     drift: float
+
+    def response(self, level: float = 0.95) -> FrequencyUncertainty | None:
+        """Best linear approximation with its scatter between realisations (None with one), widened to the
+        quantile of F(2, 2 (M - 1)) because they are few."""
+        if self.excited is None:
+            return None
+        variance = self.excited.power / self.realisations
+        widening = 2 * f.ppf(level, 2, 2 * (self.realisations - 1)) / chi2_radius(level) ** 2
+        covariance = 0.5 * widening * variance[:, None, None] * np.eye(2)
+        return FrequencyUncertainty(
+            self.omega_rad_s, self.gain, covariance, self.dt_s, level, "empirical, whole periods"
+        )
 
     @cached_property
     def bands_rad_s(self) -> tuple[tuple[float, float], ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from operator import itemgetter
 
@@ -16,6 +17,7 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.checks.residual_tests import independence_test, whiteness_test
 from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
+from ident.data.distortion import distortion_of
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -282,12 +284,17 @@ def empirical_response(
     level: float = 0.95,
     band_rad_s: tuple[float, float] | None = None,
 ) -> FrequencyUncertainty | None:
-    """Response without a model from the largest set of equally long records, or None if they are too
-    short.
+    """Response without a model: at the excited lines of the largest amplitude where records are periodic and
+    several realisations, else from the largest set of equally long records; None if they are too short.
 
     integrators: as often the differences from sample to sample are taken first, of input and output, unless
     the records are confined to a band.
     """
+    periodic = None
+    with suppress(ValueError):  # records that do not go together there may do so here
+        periodic = next((found.response(level) for found in reversed(distortion_of(records))), None)
+    if periodic is not None:
+        return periodic
     by_length: dict[int, list[Record]] = {}
     for record in records:
         by_length.setdefault(record.n_samples, []).append(record)
