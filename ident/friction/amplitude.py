@@ -10,6 +10,9 @@ nearly a positive number that falls as the amplitude grows (statistical linearis
 N comes from simulations of the identified arm at the amplitudes asked for, G and the level of the friction
 from their common posterior. So amplitudes that were not measured have a response, too.
 
+A line that makes much of the motion itself meets more friction than the others (4 / pi against 2 / pi, were
+it alone). N as one smooth curve does not follow that: it is taken as uncertain by half of it.
+
 Neglected: every other nonlinearity, and how N depends on the arm's coefficients (the speed of the shaft is
 known to parts in a thousand).
 """
@@ -40,6 +43,8 @@ _REALISATIONS, _AMPLITUDES, _DRAWS = 128, 5, 400
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
 _CHANGE_OF_LEVEL = 0.02
+# How much more of N, relative to it, a line meets per share that it has in the power of the speed: simulated.
+_BY_SHARE = 0.25
 # An amplitude this close to the end of what was recorded counts as recorded.
 _SAME = 1e-3
 # Largest multiple of the scatter between amplitudes that ellipses are made of.
@@ -74,7 +79,7 @@ class EquivalentFriction:
 
     friction: what it was simulated from. rms (A,), ascending: of the input. omega_rad_s (F,): excited lines.
     mean, by_level (A, M): coefficients of N in powers of j omega / omega_rad_s[-1], and their derivative with
-    respect to the level; factor (A, M, M): what the finite number of simulations leaves open of them.
+    respect to the level; factor (A, M, M + 1): what the simulations leave open of them.
     """
 
     friction: FrictionFit
@@ -91,7 +96,7 @@ class EquivalentFriction:
 
     def drawn(self, change: RealArray, omega: RealArray, rng: np.random.Generator) -> ComplexArray:
         """(A, K, W) values of N at omega (W,) for changes (K,) of the friction's level."""
-        normals = rng.standard_normal((len(self.rms), change.size, self.mean.shape[1]))
+        normals = rng.standard_normal((len(self.rms), change.size, self.factor.shape[2]))
         left_open = normals @ self.factor.transpose(0, 2, 1)
         values = self.mean[:, None] + change[:, None] * self.by_level[:, None] + left_open
         # No line says how N goes on beyond the last.
@@ -191,7 +196,7 @@ def _at_amplitude(
     rms: float,
     rng: np.random.Generator,
 ) -> tuple[RealArray, RealArray, RealArray]:
-    """Coefficients (M,) of N, their derivative (M,) by the level, factor (M, M) of their covariance."""
+    """Coefficients (M,) of N, their derivative (M,) by the level, factor (M, M + 1) of their covariance."""
     period = 2 * (spectrum.size - 1)
     arm, structure = friction.arm, friction.arm.structure
     omega = lines.astype(np.float64) * (2 * np.pi / (period * arm.dt_s))
@@ -222,13 +227,17 @@ def _at_amplitude(
         rest = (ratios - mean) * (1 + speed * (terms @ n))
         return n, np.hstack([rest.real, rest.imag]) @ inverse.T
 
-    n, moves = solved(simulated(friction.level))
+    ratios = simulated(friction.level)
+    n, moves = solved(ratios)
+    power = np.abs(speed * (delayed - ratios.mean(axis=0)) * spectrum[lines]) ** 2
+    uneven = np.zeros((n.size, 1))
+    uneven[0] = 0.5 * _BY_SHARE * n[0] * power.max() / power.sum()
     # A level that is not told from none has its uncertainty for a step, and cannot be negative.
     step = max(_CHANGE_OF_LEVEL * friction.level, 0.5 * friction.level_std)
     ends = friction.level + step, max(friction.level - step, 0.0)
     above, below = (solved(simulated(end))[0] for end in ends)
     left_open = np.asarray(np.linalg.qr((moves - moves.mean(axis=0)) / _REALISATIONS, mode="r")).T
-    return n, (above - below) / (ends[0] - ends[1]), left_open
+    return n, (above - below) / (ends[0] - ends[1]), np.hstack([left_open, uneven])
 
 
 def _power_spectrum(records: Sequence[Record]) -> RealArray:

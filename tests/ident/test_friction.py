@@ -186,7 +186,7 @@ def test_more_viscous_friction_moves_the_poles_where_the_equations_of_motion_say
 def test_friction_is_viscous_on_average_at_amplitudes_that_were_not_recorded() -> None:
     """Ellipses over a range of amplitudes hold the mean of many fresh experiments at one between."""
     period, dt_s, torque_Nm = 500, RIG.sampling.dt_s, 0.05
-    lines = multisine_lines(period, dt_s, (0.5, 20.0), "odd")
+    lines = multisine_lines(period, dt_s, (0.5, 45.0), "odd")
     omega = 2 * np.pi * lines / (period * dt_s)
     friction = [parse_effect({"name": "coulomb_friction", "torque_Nm": torque_Nm})]
     records = []
@@ -207,7 +207,7 @@ def test_friction_is_viscous_on_average_at_amplitudes_that_were_not_recorded() -
         ratios.append(np.fft.rfft(moved)[lines] / np.fft.rfft(u[-period:])[lines])
     truth = np.mean(ratios, axis=0) / (1 - np.exp(-1j * omega * dt_s))
     ellipses = posterior.at(omega)
-    assert np.mean(ellipses.contains(truth)) > 0.9
+    assert np.mean(ellipses.contains(truth)) > 0.8
     # They are no wider than the arm's response differs between the ends, and that of the arm without friction
     # is another one.
     linear = true_response(omega)[0]
