@@ -76,6 +76,11 @@ class FrictionFit:
         """Simulated position (T,) and friction in units of the input (T,), mean of each sample."""
         return self.arm.run(self.coefficients, record.input[:, 0], self.level, self.presliding)
 
+    def residual(self, record: Record) -> RealArray:
+        """(T,) what the simulation leaves of the position, less its mean."""
+        left = record.output[:, 0] - self.motion(record)[0]
+        return np.asarray(left - left.mean())
+
     def taken_off(self, record: Record) -> Record:
         """The record (one input; any outputs) as if its input had been smaller by the friction."""
         return less_friction(record, self.motion(record)[1], self.arm.structure.input_delay_samples)
@@ -241,8 +246,7 @@ def _descended(
 
 def _simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
     """Sum of squares of the residuals, each record's less its mean."""
-    residuals = [record.output[:, 0] - found.motion(record)[0] for record in records]
-    return float(sum(residual.size * np.var(residual) for residual in residuals))
+    return float(sum(np.sum(found.residual(record) ** 2) for record in records))
 
 
 def _least_squares(

@@ -138,7 +138,7 @@ def identify_records(
         if friction is None:
             posterior, tests = _posterior(used, found, noise_order)
         else:
-            white = whiteness_test(found.residuals).passed
+            white = whiteness_test([friction.residual(record) for record in measured]).passed
             behind = behind_friction(
                 measured,
                 friction,
@@ -146,7 +146,7 @@ def identify_records(
                 EmbeddingOptions(coloured_noise=not white, max_ar_order=noise_order or _NOISE_ORDERS[0]),
             )
             linear = posterior = behind.response
-            tests = residual_tests(posterior, used)
+            tests = residual_tests(posterior, measured, behind.friction)
             if promised.promise != "without friction":
                 rng = np.random.default_rng(0)
                 equivalent = equivalent_friction(friction, measured, rng, promised.amplitudes)

@@ -22,7 +22,6 @@ from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
 from ident.friction import (
-    BehindFriction,
     EquivalentFriction,
     FrictionFit,
     at_amplitudes,
@@ -71,19 +70,24 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
         stage.progress.update("uncertainty", done / len(order), channel.label)
         with naming(f"channel {channel.label!r}"):
             friction = stage.results.identify.friction if channel.uncertainty.friction_identified else None
-            poles, behind = result.model.poles, None
+            poles, tests = result.model.poles, None
             if friction is None:
                 linear = posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
             else:
-                measured = [item.record for item in stage.results.records.of_role("estimation")]
-                behind = behind_friction(channel, measured, friction, result.model, shaft=k == control)
+                measured = [
+                    item.record.siso(channel.input, channel.output)
+                    for item in stage.results.records.of_role("estimation")
+                ]
+                find = without_friction if k == control else other_output_without_friction
+                behind = find(measured, friction, result.model, channel.uncertainty)
                 linear = posterior = behind.response
+                if k == control:
+                    tests = residual_tests(linear, measured, behind.friction)
                 if channel.uncertainty.promise != "without friction":
                     promise, rng = channel.uncertainty.promise, stage.rng("uncertainty", channel.label)
                     if promise not in equivalents:
-                        siso = [record.siso(channel.input, channel.output) for record in measured]
                         equivalents[promise] = equivalent_friction(
-                            friction, siso, rng, channel.uncertainty.amplitudes
+                            friction, measured, rng, channel.uncertainty.amplitudes
                         )
                     posterior, poles = at_amplitudes(
                         behind, equivalents[promise], rng, channel.uncertainty.level
@@ -99,21 +103,12 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                     nominal_grid(omega, result.data_band_rad_s),
                     poles=poles,
                     linear=linear,
+                    tests=tests,
                     repeat_scatter=scatter_of(channel, result, records, bands_of(omega), friction),
                 )
             )
     in_order = tuple(found for _, found in sorted(zip(order, channels, strict=True), key=itemgetter(0)))
     return UncertaintyResult(in_order, next(iter(equivalents.values()), None))
-
-
-def behind_friction(
-    channel: Channel, measured: Sequence[Record], friction: FrictionFit, model: GobfModel, *, shaft: bool
-) -> BehindFriction:
-    """What the records (estimation, as measured) say of the channel's arm and its friction; shaft: its output
-    is the position that the friction acts on."""
-    records = [record.siso(channel.input, channel.output) for record in measured]
-    find = without_friction if shaft else other_output_without_friction
-    return find(records, friction, model, channel.uncertainty)
 
 
 def uncertain_channel(
@@ -242,18 +237,25 @@ def agreement_of(
     )
 
 
-def residual_tests(posterior: ResponsePosterior, records: Sequence[Record]) -> Tests:
+def residual_tests(
+    posterior: ResponsePosterior, records: Sequence[Record], friction: FrictionFit | None = None
+) -> Tests:
     """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
 
-    Where the bounds have a noise model, whiteness is that of the residuals behind it: they rest on those.
+    friction: records of the shaft's position as measured are held against its simulation instead, which has
+    the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
+    residuals behind it: they rest on those.
     """
     colour = () if posterior.report is None else posterior.report.ar_coefficients
     filter_of_noise = np.array([1.0, *colour])
-    fits = [fit_on_fresh_data(posterior, record) for record in records]
-    whitened = [lfilter(filter_of_noise, np.ones(1), fit.residual)[len(colour) :] for fit in fits]
+    residuals = [
+        fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)
+        for record in records
+    ]
+    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
     delay = posterior.input_delay_samples
     inputs = [record.input[: record.n_samples - delay, 0] for record in records]
-    driven = [fit.residual[delay:] for fit in fits]
+    driven = [residual[delay:] for residual in residuals]
     return whiteness_test(whitened), independence_test(inputs, driven)
 
 
