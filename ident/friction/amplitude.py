@@ -33,6 +33,7 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray
+from ident.data.distortion import period_of
 from ident.data.record import Record
 from ident.friction.arm import FASTEST_POLE
 from ident.friction.fit import FrictionFit
@@ -241,12 +242,14 @@ def _at_amplitude(
 
 
 def _power_spectrum(records: Sequence[Record]) -> RealArray:
-    """(F,) amplitudes of the lines of the longest record (of an even number of samples), all records weighed
-    alike."""
-    longest = max(record.n_samples for record in records) // 2 * 2
+    """(F,) amplitudes of the lines of a period, or of a whole record where its input does not repeat; of the
+    longest one (of an even number of samples), all records weighed alike."""
+    inputs = [record.input[:, 0] for record in records]
+    inputs = [u if (period := period_of(u)) is None else u[-period:] for u in inputs]
+    longest = max(u.size for u in inputs) // 2 * 2
     grid, power = np.linspace(0, 1, longest // 2 + 1), np.zeros(longest // 2 + 1)
-    for record in records:
-        own = np.abs(np.fft.rfft(record.input[:, 0])) ** 2
+    for u in inputs:
+        own = np.abs(np.fft.rfft(u)) ** 2
         power += np.interp(grid, np.linspace(0, 1, own.size), own / own.sum())
     power[0] = power[-1] = 0.0
     return np.sqrt(power)
