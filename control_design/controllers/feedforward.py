@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from control_design.plants.ellipses import Real
 
@@ -46,10 +47,6 @@ class FrictionFeedforward:
 
     def signal(self, reference: Real, dt_s: float) -> Real:
         """What joins the command, (T,), for a reference (T,) that rested at zero before."""
-        share, turn, last, smoothed = self.share(dt_s), self.turn(dt_s), 0.0, 0.0
-        added = np.empty(reference.size)
-        for k, wanted in enumerate(reference.tolist()):
-            smoothed += share * (min(max((wanted - last) / turn, -1.0), 1.0) - smoothed)
-            last = wanted
-            added[k] = self.level * smoothed
-        return added
+        share = self.share(dt_s)
+        sign = np.clip(np.diff(reference, prepend=0.0) / self.turn(dt_s), -1.0, 1.0)
+        return np.asarray(self.level * lfilter([share], [1.0, share - 1.0], sign))
