@@ -28,7 +28,8 @@ def draw_excitation(found: PlannedExperiment) -> Figure:
         axes[0].axhline(sign * found.limits.peak_V, **style.LIMIT_LINE, label="voltage limit")
     lead_in_s = found.plan.lead_in_samples * found.limits.dt_s
     axes[0].axvspan(0, lead_in_s, color=style.MEASURED, alpha=0.2, lw=0, label="lead-in")
-    axes[0].set(xlabel="time [s]", ylabel="voltage [V]")
+    cut = "" if shown.all() else f", first {_TIME_S:g} s"
+    axes[0].set(xlabel=f"time [s]{cut}", ylabel="voltage [V]")
     axes[0].set_title(f"First record at {rms[loudest]:g} V rms")
     for value, shade in zip(rms, np.linspace(1.0, 0.45, rms.size), strict=True):
         line_V = np.full(found.lines_Hz.size, value * np.sqrt(2 / found.lines_Hz.size))
