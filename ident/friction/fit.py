@@ -188,7 +188,7 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
             for record, sign in zip(records, signs, strict=True)
         ]
         model = untested_model(less, options)
-        undelayed = GobfModel(model.poles, model.coefficients, model.dt_s, integrators=model.integrators)
+        undelayed = replace(model, input_delay_samples=0)
         blocks = [
             np.column_stack([_basis(model.poles.doubled(), record, options), -undelayed.simulate(sign)])
             for record, sign in zip(less, signs, strict=True)
