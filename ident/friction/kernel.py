@@ -10,6 +10,11 @@ element needs no shorter step). A sample has 32 steps: the friction turns round 
 microseconds where the pre-sliding is ten microradians, and at 32 steps of 5 ms the position is right to a
 hundredth of a milliradian. Half a sample over which the shaft slips on in one direction is taken at once: the
 force is constant there.
+
+A force that changes within a sample is more than its mean to whoever sees it through another output: the
+friction is told as the held force that moves a slow arm just as far. With M the first moment of the force
+about the middle of its sample, that is the mean plus (M of the sample before - M of the sample after) / 2, to
+first order in the part of a sample by which the force comes early or late.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ import numba
 import numpy as np
 
 _STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
+_ALL = _STRIDES * _STEPS
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -56,7 +62,10 @@ def advance(
     level: float,
     presliding: float,
 ) -> Any:
-    """One sample: position, deflection of the friction and its mean force; state (N,) is changed in place."""
+    """One sample: position, deflection of the friction, mean and first moment (in samples) of its force.
+
+    state (N,) is changed in place.
+    """
     n = rates.size
     tried = np.empty(n, dtype=np.complex128)
     decay, onto, carried = moves[0, 0], moves[0, 1], moves[0, 2]
@@ -65,8 +74,8 @@ def advance(
     for j in range(n):
         gain += (weights[j] * onto[j]).real
     gain = max(gain, _TINY)
-    stiffness, total = level / presliding, 0.0
-    for _ in range(_STRIDES):
+    stiffness, total, moment = level / presliding, 0.0, 0.0
+    for stride in range(_STRIDES):
         if abs(deflection) == presliding:
             force = level if deflection > 0 else -level
             new, speed = 0.0, 0.0
@@ -81,8 +90,9 @@ def advance(
                 state[:] = tried
                 shaft = new
                 total += _STEPS * force
+                moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * _ALL)
                 continue
-        for _ in range(_STEPS):
+        for step in range(_STEPS):
             free = gain * drive
             for j in range(n - 1, -1, -1):
                 state[j] *= decay[j]
@@ -92,12 +102,13 @@ def advance(
             force = stiffness * (deflection + 0.5 * (free - shaft)) / (1 + 0.5 * stiffness * gain)
             force = min(max(force, -level), level)
             total += force
+            moment += force * (_STEPS * stride + step + 0.5 - 0.5 * _ALL)
             new = free - gain * force
             deflection = min(max(deflection + new - shaft, -presliding), presliding)
             shaft = new
             for j in range(n):
                 state[j] += onto[j] * (drive - force)
-    return shaft, deflection, total / (_STRIDES * _STEPS)
+    return shaft, deflection, total / _ALL, moment / _ALL**2
 
 
 @numba.njit(cache=True)
@@ -112,11 +123,14 @@ def step_through(
     position: Any,
     friction: Any,
 ) -> None:
-    """Fill position (T,) and the mean friction of every sample (T,) for a drive (T,) held over each."""
+    """Fill position (T,) and the friction (T,), held over every sample, for a drive (T,) held over each."""
+    moments = np.empty(drive.size)
     moves = transitions(rates, chain, dt_s)
     state, deflection, shaft = np.zeros(rates.size, dtype=np.complex128), 0.0, 0.0
     for k in range(drive.size):
         position[k] = shaft
-        shaft, deflection, friction[k] = advance(
+        shaft, deflection, friction[k], moments[k] = advance(
             drive[k], state, shaft, deflection, moves, rates, chain, weights, level, presliding
         )
+    for k in range(1, drive.size - 1):
+        friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])

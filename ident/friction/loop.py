@@ -72,6 +72,6 @@ def loop_through(
         measured[k], command[k], limited[k] = y, u, last != wanted
         waiting[k % (input_delay + 1)] = u
         applied = waiting[(k + 1) % (input_delay + 1)]
-        shaft, deflection, _ = advance(
+        shaft, deflection, _, _ = advance(
             applied, state, shaft, deflection, moves, rates, chain, weights, level, presliding
         )

@@ -28,6 +28,7 @@ from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
     RegressionBlock,
+    alternating_factor,
     averaged_posterior,
     embedding_report,
     exponential_factor,
@@ -54,6 +55,9 @@ from ident.uncertainty.undetected_mode import (
 _DEFAULT_FIR_LENGTH = 150
 # The same for a measured frequency response, as far as the frequencies can carry it.
 _FRF_FIR_LENGTH = 60
+# Slow, alike over frequency, near the Nyquist frequency: what is left out stands anywhere (kernels of the
+# diagonal/correlated family, Chen, Ohlsson and Ljung, Automatica 48(8), 2012).
+_SHAPES = (tc_factor, exponential_factor, alternating_factor)
 # Modes that the order selection missed and the embedding adds: coloured noise hides them from a search that
 # takes it for white, and whitening brings them out.
 _MOST_ADDED = 5
@@ -247,7 +251,7 @@ def embed_response(
     nothing = np.zeros((data.n_rows, 0))
     block = RegressionBlock(nothing, regressors[measured], data.whiten(taps)[measured], data.y[measured])
     reduced = reduce_regression([block])
-    grid = kernel_grid(reduced, tc_factor)
+    grid = kernel_grid(reduced, _SHAPES)
     kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
     mean, factor = joint_factor(reduced, kernel)
     widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
@@ -320,7 +324,7 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     n_added = 0
     while True:
         reduced = reduce_regression(rows.blocks())
-        grid = kernel_grid(reduced, tc_factor)
+        grid = kernel_grid(reduced, _SHAPES)
         kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
@@ -337,7 +341,7 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
 
 def _solve_classical(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     reduced = reduce_regression(rows.blocks())
-    return _Solved(rows, reduced, prior_posterior(kernel_grid(reduced, exponential_factor)))
+    return _Solved(rows, reduced, prior_posterior(kernel_grid(reduced, [exponential_factor])))
 
 
 def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:

@@ -19,15 +19,17 @@ from scipy.linalg import lapack, qr, solve_triangular, svd
 from ident.basis.posterior import EmbeddingReport
 from ident.data.arrays import RealArray
 
-# Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
 # Columns of the QR decomposition that are done at a time.
 _PANEL = 32
+# Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
 _NUISANCE_RANK = 1e-10
 # A diagonal entry of R11 (columns of unit length) below this says that these records cannot tell the column
 # from the earlier ones.
 _EXCITATION = 1e-10
 # Share of the largest prior variance below which a tap is none: rounding, even ten orders above the noise.
 _DIED_OUT = 1e-17
+# Scales of a remainder up to what an order selection keeps, probability of more, and the largest energy.
+_SCALES, _VISIBLE_SHARE, _LARGEST_ENERGY = 6, 0.1, 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +187,14 @@ def tc_factor(lam: float, length: int) -> RealArray:
     return np.asarray(np.triu(np.ones((length, length))) * np.sqrt(step))
 
 
+def alternating_factor(lam: float, length: int) -> RealArray:
+    """The same for taps of alternating sign: a remainder near the Nyquist frequency, where `tc_factor` has
+    least."""
+    return np.asarray((-1.0) ** np.arange(length)[:, None] * tc_factor(lam, length))
+
+
 def exponential_factor(lam: float, length: int) -> RealArray:
-    """B (L,L) with B B^T = diag(lam^k), k = 1..L: the prior of the classical recipe."""
+    """B (L,L) with B B^T = diag(lam^k), k = 1..L: the prior of the classical recipe, alike over frequency."""
     return np.diag(np.sqrt(lam ** np.arange(1, length + 1, dtype=np.float64)))
 
 
@@ -241,6 +249,7 @@ class KernelGrid:
     """Weights of all (lam, alpha) pairs and of alpha = 0, given the data."""
 
     spectra: tuple[KernelSpectrum, ...]
+    prior: RealArray  # (A,), the same for all lam: K times its sum is 1
     alpha: RealArray  # (K, A)
     noise_variance: RealArray  # (K, A)
     log_likelihood: RealArray  # (K, A)
@@ -248,20 +257,35 @@ class KernelGrid:
     log_likelihood_none: float
 
 
-def evaluate_grid(
-    reduced: ReducedRegression, spectra: Iterable[KernelSpectrum], relative_alpha: RealArray
-) -> KernelGrid:
-    """Restricted likelihood over kernel shapes and alpha = relative_alpha / d_max^2.
+def remainder_energies(degrees_of_freedom: int) -> tuple[RealArray, RealArray]:
+    """Expected energies (A,) of what the poles leave out of the output, in noise variances, and their prior
+    (A,).
 
-    Scaled by the largest singular value, a relative alpha of 1 is a remainder just as strong as the noise in
-    its best-excited direction, so that the grid fits any units of input and output.
+    Log-uniform from invisible to what an order selection would have kept (4 ln nu, design 4.3), and one tenth
+    of the probability beyond, for models whose order was not chosen from the data.
+    """
+    edge = 4 * np.log(degrees_of_freedom)
+    n = int(np.ceil(np.log(_LARGEST_ENERGY) / np.log(edge) * _SCALES))
+    energy = edge ** (np.arange(n + 1) / _SCALES)
+    visible = np.arange(n + 1) > _SCALES
+    return energy, np.where(visible, _VISIBLE_SHARE / (n - _SCALES), (1 - _VISIBLE_SHARE) / (_SCALES + 1))
+
+
+def evaluate_grid(
+    reduced: ReducedRegression, spectra: Iterable[KernelSpectrum], energy: RealArray, prior: RealArray
+) -> KernelGrid:
+    """Restricted likelihood over kernel shapes, all alike, and alpha = energy / trace(R22 B B^T R22^T).
+
+    energy (A,) is that of the remainder in the output, in noise variances, so that the grid fits any units of
+    input and output; prior (A,) of the scales.
     """
     spectra = tuple(spectra)
-    alpha = np.stack([relative_alpha / max(float(s.singular[0]) ** 2, 1e-300) for s in spectra])
+    alpha = np.stack([energy / max(float(s.singular @ s.singular), 1e-300) for s in spectra])
     values = [restricted_log_likelihood(reduced, s, a) for s, a in zip(spectra, alpha, strict=True)]
     none, s2_none = restricted_log_likelihood(reduced, spectra[0], np.zeros(1))
     return KernelGrid(
         spectra=spectra,
+        prior=prior / len(spectra),
         alpha=alpha,
         log_likelihood=np.stack([value[0] for value in values]),
         noise_variance=np.stack([value[1] for value in values]),
@@ -270,31 +294,27 @@ def evaluate_grid(
     )
 
 
-def kernel_grid(reduced: ReducedRegression, factor: Callable[[float, int], RealArray]) -> KernelGrid:
-    """`evaluate_grid` over twelve decays and 49 scales of a shape (`tc_factor`, `exponential_factor`)."""
+def kernel_grid(
+    reduced: ReducedRegression, shapes: Iterable[Callable[[float, int], RealArray]]
+) -> KernelGrid:
+    """`evaluate_grid` over twelve decays of every shape, and the scales of `remainder_energies`."""
     length = reduced.fir_length
     # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
-    decay_samples = np.geomspace(0.7, max(length / 6.0, 1.0), 12)
-    # From a remainder far below the noise to one a hundred thousand times its amplitude.
-    relative_alpha = np.geomspace(1e-2, 1e10, 49)
-    spectra = [
-        kernel_spectrum(reduced, lam, factor(lam, length)) for lam in np.exp(-1.0 / decay_samples).tolist()
-    ]
-    return evaluate_grid(reduced, spectra, relative_alpha)
+    decays = np.exp(-1.0 / np.geomspace(0.7, max(length / 6.0, 1.0), 12)).tolist()
+    spectra = [kernel_spectrum(reduced, lam, shape(lam, length)) for shape in shapes for lam in decays]
+    return evaluate_grid(reduced, spectra, *remainder_energies(reduced.degrees_of_freedom))
 
 
 def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:
     """log of the likelihood averaged over the prior of `grid_weights`."""
-    n = grid.log_likelihood.size
     top = max(float(grid.log_likelihood.max()), grid.log_likelihood_none)
-    mean = (1 - prior_no_remainder) * float(np.sum(np.exp(grid.log_likelihood - top))) / n
+    mean = (1 - prior_no_remainder) * float(np.sum(grid.prior * np.exp(grid.log_likelihood - top)))
     return top + float(np.log(mean + prior_no_remainder * np.exp(grid.log_likelihood_none - top)))
 
 
 def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray, float]:
-    """Posterior weights (K,A) of the grid points and of alpha = 0; the prior is flat over the grid."""
-    n = grid.log_likelihood.size
-    log_grid = grid.log_likelihood + np.log((1 - prior_no_remainder) / n)
+    """Posterior weights (K,A) of the grid points and of alpha = 0."""
+    log_grid = grid.log_likelihood + np.log((1 - prior_no_remainder) * grid.prior)
     log_none = grid.log_likelihood_none + (np.log(prior_no_remainder) if prior_no_remainder > 0 else -np.inf)
     top = max(float(log_grid.max()), log_none)
     weights, none = np.exp(log_grid - top), float(np.exp(log_none - top))

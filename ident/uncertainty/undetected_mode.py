@@ -31,6 +31,7 @@ from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
     nuisance_basis,
+    remainder_energies,
     symmetric_factor,
 )
 from ident.uncertainty.embedding_rows import Rows
@@ -45,11 +46,6 @@ _FEWEST_PERIODS = 6.0
 _HIGHEST = 0.9 * np.pi
 # Neighbours in frequency are this many half bandwidths apart: a mode half way loses a tenth of its energy.
 _SPACING = 1.5
-# Prior of the missed mode's expected energy in the output, in noise variances: log-uniform from invisible to
-# what the order selection would have kept (4 ln nu, design 4.3), one tenth of the probability beyond, for
-# models whose order was not chosen from the data.
-_VISIBLE_SHARE = 0.1
-_LARGEST_ENERGY = 1e6
 # A missed mode around a frequency is averaged over from this probability on (the level of the confidence
 # regions that it could belong to); of the pairs that stand for it at most so many are kept.
 _LEAST_PROBABILITY = 0.05
@@ -226,8 +222,7 @@ def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEv
     is the expression for the kernel with X in the place of Psi; kappa = energy / largest eigenvalue of G.
     """
     nu = degrees_of_freedom
-    edge = 4 * np.log(nu)
-    energy = np.concatenate([np.geomspace(1.0, edge, 6), np.geomspace(4 * edge, _LARGEST_ENERGY, 6)])
+    energy, prior = remainder_energies(nu)
     values, vectors, along = statistics.axes()
     kappa = energy / values[:, 1:]
     precision = values[:, None, :] + 1 / kappa[:, :, None]
@@ -238,7 +233,7 @@ def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEv
     return PairEvidence(
         log_likelihood=np.where(statistics.distinguishable()[:, None], log_likelihood, -np.inf),
         energy=energy,
-        prior=np.repeat([(1 - _VISIBLE_SHARE) / 6, _VISIBLE_SHARE / 6], 6),
+        prior=prior,
         mean=np.einsum("jki,jai->jak", vectors, along[:, None, :] / precision),
         covariance=s2[:, :, None, None] * np.einsum("jki,jai,jli->jakl", vectors, 1 / precision, vectors),
         noise_variance=s2,

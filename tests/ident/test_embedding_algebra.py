@@ -69,7 +69,7 @@ def test_reduced_posterior_and_likelihood_equal_the_dense_ones(shape, lam):
     alpha = 0.37
     spectrum = kernel_spectrum(reduced, lam, shape(lam, L))
     assert (spectrum.singular.size < L) == (lam == 0.01)
-    grid = evaluate_grid(reduced, [spectrum], np.array([alpha * spectrum.singular[0] ** 2]))
+    grid = evaluate_grid(reduced, [spectrum], np.array([alpha * np.sum(spectrum.singular**2)]), np.ones(1))
     posterior = conditional_posterior(grid, np.ones((1, 1)), 0.0)
     mean, factor = joint_factor(reduced, posterior)
 
@@ -116,7 +116,7 @@ def test_one_block_or_two_halves_give_the_same_reduction():
 def test_averaging_two_kernels_gives_the_moments_of_the_mixture():
     reduced = reduce_regression(problem(3))
     spectra = [kernel_spectrum(reduced, lam, tc_factor(lam, L)) for lam in (0.5, 0.9)]
-    grid = evaluate_grid(reduced, spectra, np.array([1.0, 100.0]))
+    grid = evaluate_grid(reduced, spectra, np.array([1.0, 100.0]), np.array([0.7, 0.3]))
     weights, none = grid_weights(grid, 0.5)
     assert weights.sum() + none == pytest.approx(1.0, rel=1e-12)
     mixed = conditional_posterior(grid, weights, none)
@@ -139,7 +139,7 @@ def test_averaging_two_kernels_gives_the_moments_of_the_mixture():
 def test_all_weight_on_no_remainder_is_ordinary_least_squares():
     blocks = problem(4)
     reduced = reduce_regression(blocks)
-    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.8, tc_factor(0.8, L))], np.ones(1))
+    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.8, tc_factor(0.8, L))], np.ones(1), np.ones(1))
     mean, factor = joint_factor(reduced, conditional_posterior(grid, np.zeros((1, 1)), 1.0))
     nuisance, regressors, _, y = stacked(blocks)
     columns = np.hstack([nuisance, regressors])
@@ -156,6 +156,7 @@ def test_classical_posterior_keeps_the_prior_of_the_kernel():
         reduced,
         [kernel_spectrum(reduced, lam, exponential_factor(lam, L)) for lam in (0.6, 0.9)],
         np.geomspace(0.01, 100, 9),
+        np.full(9, 1 / 9),
     )
     prior = prior_posterior(grid)
     expected = prior.noise_variance * prior.alpha * prior.lam ** np.arange(1, L + 1)
@@ -197,7 +198,9 @@ def test_a_column_given_twice_is_left_out_and_nothing_else_changes():
 
     def solve(regressors):
         reduced = reduce_regression([RegressionBlock(block.nuisance, regressors, block.kernel, block.output)])
-        grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.8, tc_factor(0.8, L))], np.ones(1))
+        grid = evaluate_grid(
+            reduced, [kernel_spectrum(reduced, 0.8, tc_factor(0.8, L))], np.ones(1), np.ones(1)
+        )
         return joint_factor(reduced, conditional_posterior(grid, np.ones((1, 1)), 0.0))
 
     (mean, factor), (mean_twice, factor_twice) = solve(block.regressors), solve(twice)
