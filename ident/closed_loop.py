@@ -11,9 +11,9 @@ from ident.basis.options import IdentOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.ellipses import factor_matrices
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, finding
 from ident.identify import Identification, identify
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 

@@ -26,8 +26,8 @@ from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, finding
 from ident.fit.regression import thinned
 from ident.identification import Identification
 from ident.uncertainty.autoregression import fit_autoregression

@@ -14,8 +14,8 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import pairs_outside
 from ident.data.arrays import RealArray, lock
+from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.finding import Finding, FindingKind, distinct, finding
 from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
 from ident.fit.refinement import pole_system
 from ident.identify import in_order

@@ -12,7 +12,7 @@ from ident.basis.miso_model import MisoModel
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock, readonly_real
-from ident.finding import Finding, PriorTest, distinct
+from ident.data.finding import Finding, PriorTest, distinct
 from ident.search.order_selection import OrderStep
 from ident.search.search_trace import SearchTrace
 

@@ -28,8 +28,8 @@ from ident.checks.prior_tests import (
 )
 from ident.coloured_noise import identify_in_noise
 from ident.data.arrays import RealArray
+from ident.data.finding import Finding, PriorTest
 from ident.data.record import Record
-from ident.finding import Finding, PriorTest
 from ident.fit.least_squares import Regression, fit
 from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned

@@ -16,8 +16,8 @@ from ident.basis.miso_model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.checks.input_checks import few_samples, least_independence, refuse_unusable
 from ident.data.arrays import RealArray
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, finding
 from ident.fit.regression import prepare_inputs
 from ident.identification import MisoIdentification
 from ident.identify import description, fitted_on_all, least_order, searched

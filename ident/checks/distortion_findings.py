@@ -8,9 +8,9 @@ import numpy as np
 
 from ident.checks.input_checks import clipped
 from ident.data.distortion import BandLevel, Distortion
+from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.nonparametric import coherence
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, Value, finding
 
 # Distortion above this share of the response is told where it is; a linear design need not mind less.
 _WORTH_TELLING = 0.01

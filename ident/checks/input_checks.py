@@ -15,8 +15,8 @@ from scipy.special import chdtri
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import pole_system
 from ident.fit.residual_colour import residual_colour

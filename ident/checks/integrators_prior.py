@@ -10,8 +10,8 @@ import numpy as np
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import ROUGH, judged, limit, statistic
+from ident.data.finding import FindingKind, PriorTest
 from ident.data.record import Record
-from ident.finding import FindingKind, PriorTest
 from ident.fit.least_squares import Regression
 from ident.fit.regression import prepare
 from ident.search.order_selection import OrderSelection

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from ident.finding import Finding, FindingKind, finding
+from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import free_optimality
 from ident.search.pole_search import Fitted

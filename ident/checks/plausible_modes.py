@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 
 from ident.basis.poles import Poles
-from ident.finding import Finding, FindingKind, finding
+from ident.data.finding import Finding, FindingKind, finding
 
 # Of fewer periods a record does not show that anything swings.
 FEWEST_PERIODS = 3.0

@@ -21,8 +21,8 @@ from scipy.stats import chi2
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
+from ident.data.finding import TEST_LEVEL, FindingKind, PriorTest, Value
 from ident.data.record import Record
-from ident.finding import TEST_LEVEL, FindingKind, PriorTest, Value
 from ident.fit.least_squares import Regression
 from ident.fit.refinement import Refined
 from ident.fit.regression import prepare

@@ -10,7 +10,7 @@ from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
 from ident.data.arrays import RealArray, lock
-from ident.finding import Finding, FindingKind, finding
+from ident.data.finding import Finding, FindingKind, finding
 
 
 @dataclass(frozen=True, eq=False)

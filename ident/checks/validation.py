@@ -15,9 +15,9 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, lock
 from ident.data.ellipses import chi2_radius
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.finding import Finding, FindingKind, finding
 
 
 class SimulatedModel(Protocol):

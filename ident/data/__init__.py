@@ -1,1 +1,1 @@
-"""Records, their readers, frequency data, ellipses and non-parametric estimates."""
+"""Records, their readers, frequency data, ellipses, non-parametric estimates, and what a check finds."""

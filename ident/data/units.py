@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.data.arrays import RealArray
-from ident.finding import Finding, FindingKind, finding
+from ident.data.finding import Finding, FindingKind, finding
 
 # Units per second, or seconds per unit. Both are integers, so that 2 [ms] becomes the very double that 0.002
 # is: division by an exact number is rounded once.

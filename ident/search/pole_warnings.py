@@ -6,7 +6,7 @@ import numpy as np
 
 from ident.basis.coordinates import ZETA_LIMIT
 from ident.basis.poles import Poles
-from ident.finding import Finding, FindingKind, finding
+from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.refinement import Bounds
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray, lock
-from ident.finding import Finding
+from ident.data.finding import Finding
 
 
 @dataclass(frozen=True, eq=False)

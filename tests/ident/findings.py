@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from ident.finding import Finding, FindingKind, Value
+from ident.data.finding import Finding, FindingKind, Value
 
 
 def kinds(found: Iterable[Finding]) -> set[FindingKind]:

@@ -11,7 +11,7 @@ from ident import IdentOptions, identify
 from ident.basis.poles import Poles
 from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair, pairs_outside
 from ident.coloured_noise import long_arx_filter, prewhitened
-from ident.finding import FindingKind
+from ident.data.finding import FindingKind
 from tests.ident.benchmark_plants import as_record, p1, p2
 from tests.ident.findings import kinds
 from workflow.config.run_config import built_in_config

@@ -8,7 +8,7 @@ import pytest
 from control_design.plants.plant_set import UncertainPlant
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.finding import FindingKind
+from ident.data.finding import FindingKind
 from ident.fit.frf_regression import fit_response, prepare_response
 from ident.fit.pole_unknowns import free_parameters, set_poles
 from ident.fit.refinement import pole_system

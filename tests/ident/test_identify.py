@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 from ident.basis.options import IdentOptions
-from ident.finding import FindingKind
+from ident.data.finding import FindingKind
 from ident.fit.residual_colour import residual_colour
 from ident.identify import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run

@@ -12,11 +12,11 @@ from ident.basis.functions import free_response
 from ident.basis.options import IdentOptions
 from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.closed_loop import two_stage
+from ident.data.finding import FindingKind
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited
-from ident.finding import FindingKind
 from ident.frequency_fit import identify_frf
 from ident.identify import identify
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from ident.checks.residual_tests import independence_test, residual_advice, whiteness_test
-from ident.finding import FindingKind, finding
+from ident.data.finding import FindingKind, finding
 
 
 def coloured(rng, n, pole):

@@ -10,8 +10,8 @@ from ident.basis.functions import free_response
 from ident.basis.miso_model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.data.finding import FindingKind
 from ident.data.record import Record
-from ident.finding import FindingKind
 from ident.fit.least_squares import fit, pole_sensitivities, project
 from ident.fit.regression import prepare_inputs
 from ident.identify import identify

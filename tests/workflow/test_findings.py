@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ident.finding import FindingKind, finding
+from ident.data.finding import FindingKind, finding
 from workflow.text.templates import words
 
 STORED = Path(__file__).parent / "data" / "findings.txt"

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 from control_design.analysis.certificate import certify
 from ident.basis.options import IdentOptions
+from ident.data.finding import FindingKind
 from ident.data.record import Record
-from ident.finding import FindingKind
 from ident.identify import identify
 from plant import linear_arm, parse_effect, simulate
 from plant.presets import paper_link

@@ -22,8 +22,8 @@ from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.data.distortion import Distortion, distortion_of
+from ident.data.finding import Finding
 from ident.data.record import Record
-from ident.finding import Finding
 from ident.friction import FrictionFit
 from workflow.config.run_config import Channel, RunConfig
 from workflow.figures.bands import Complex, Real

@@ -9,9 +9,9 @@ from ident.basis.options import IdentOptions
 from ident.checks.input_checks import clipped
 from ident.checks.validation import fit_on_fresh_data
 from ident.closed_loop import two_stage
+from ident.data.finding import Finding, FindingKind
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
-from ident.finding import Finding, FindingKind
 from ident.friction import FrictionFit, fit_friction, refuse_unrecorded
 from ident.identify import identify
 from ident.stabilisation import stabilisation

@@ -11,9 +11,9 @@ from ident.basis.options import IdentOptions
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import residual_advice, whiteness_test
 from ident.closed_loop import two_stage
+from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
-from ident.finding import Finding
 from ident.friction import (
     EquivalentFriction,
     FrictionFit,

@@ -27,8 +27,8 @@ from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
 from ident.checks.residual_tests import ResidualTest
 from ident.checks.validation import FreshFit, ScatterRow
+from ident.data.finding import Finding
 from ident.data.record import Record
-from ident.finding import Finding
 from ident.friction import EquivalentFriction, FrictionFit
 from ident.identification import Identification
 from ident.stabilisation import Stabilisation

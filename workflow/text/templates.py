@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ident.finding import Finding
+from ident.data.finding import Finding
 from workflow.text.formats import FILTERS, TESTS
 
 
