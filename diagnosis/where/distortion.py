@@ -20,34 +20,21 @@ from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import SENSORS, FrequencyResponseBand, LineGroup, PeriodicFinding
 from diagnosis.where.where_energy import band_edges_Hz
+from ident.data.distortion import period_of
 
 ComplexArray = npt.NDArray[np.complex128]
-_SHORTEST = 32
+_SHORTEST = 32  # samples of a period
 # Lines with less than this share of the largest one are rounding of the log, not excitation.
 _EXCITED = 1e-3
 _LEAST_LINES = 4
 
 
-def period_of(voltage_V: Real) -> int:
-    """Samples after which the voltage repeats itself to the end of the record; 0 if it does not.
-
-    A period is at least 32 samples long and comes at least twice; a signal that is constant has none.
-    """
-    voltage = np.asarray(voltage_V, dtype=np.float64)
-    size = float(np.max(np.abs(voltage)))
-    if np.ptp(voltage) <= 1e-9 * max(size, 1e-300):
-        return 0
-    for period in range(_SHORTEST, voltage.size // 2 + 1):
-        # Logs are rounded; a random binary input differs by much more somewhere.
-        if np.max(np.abs(voltage[period:] - voltage[:-period])) <= 1e-6 * size:
-            return period
-    return 0
-
-
 def periodic_findings(case: Case, residuals: Mapping[str, Real], level: float) -> tuple[PeriodicFinding, ...]:
     """One per experiment whose input repeats; together they raise a false alarm with the chance `level`."""
     periods = [(x, period_of(x.voltage_V)) for x in case.experiments if not x.closed_loop]
-    periodic = [(x, p) for x, p in periods if p]
+    # A shorter period has too few lines: several of them count as one.
+    whole = [(x, p * -(-_SHORTEST // p)) for x, p in periods if p is not None]
+    periodic = [(x, p) for x, p in whole if 2 * p <= x.voltage_V.size]
     return tuple(_finding(case, x, residuals[x.name], p, level / len(periodic)) for x, p in periodic)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.fft import dct
 
 from diagnosis import Case, Experiment, ResidualModel
-from diagnosis.where.distortion import period_of, periodic_findings
+from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.regimes import motions
 from diagnosis.where.where import subsystem_mass, where
 from diagnosis.where.where_energy import band_gaps, sensor_gaps
@@ -256,20 +256,6 @@ def test_even_and_odd_distortion_come_apart_on_an_odd_multisine():
     # Noise that does not repeat, measured without the rig file: 1 within its own 99.99 %.
     low, high = finding.unrepeated_interval
     assert all(abs(u - 1) < 2 * (high - low) for u in finding.unrepeated)
-
-
-@pytest.mark.parametrize(
-    ("signal", "period"),
-    [
-        (np.tile(np.sin(np.arange(50.0)), 4), 50),
-        (np.r_[np.tile(np.sin(np.arange(50.0)), 3), np.sin(np.arange(20.0))], 50),
-        (np.sin(np.arange(200.0) ** 1.5), 0),
-        (np.zeros(200), 0),
-        (np.ones(200), 0),
-    ],
-)
-def test_period_of_an_input(signal, period):
-    assert period_of(signal) == period
 
 
 def test_subsystem_mass_keeps_the_whole_probability():

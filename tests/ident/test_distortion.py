@@ -130,6 +130,7 @@ def test_period_is_found_where_there_is_one():
     assert period_of(slow) == 400
     assert period_of(np.tile(rng.standard_normal(150), 4)[37:]) == 150
     assert period_of(rng.standard_normal(500)) is None
+    assert period_of(np.ones(200)) is None
     assert period_of(np.sin(np.linspace(0, 9, 400) ** 2)) is None
     assert distortion_of([record(u, u) for u in rng.standard_normal((2, 300))]) == ()
 

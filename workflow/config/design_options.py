@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
+from numpy.polynomial.polynomial import polypow
 from pydantic import ConfigDict, Field, model_validator
 
 from control_design.convex.reference_filter import ReferenceFilterOptions
@@ -100,9 +101,5 @@ class ReferenceFilterSettings(ReferenceFilterOptions):
         if self.model is not None:
             return self.model
         assert self.corner_rad_s is not None
-        denominator = [1.0]
-        for _ in range(self.model_order):
-            # times (s/corner + 1)
-            scaled = [value / self.corner_rad_s for value in denominator] + [0.0]
-            denominator = [a + b for a, b in zip(scaled, [0.0, *denominator], strict=True)]
-        return RationalWeight(numerator=(1.0,), denominator=tuple(denominator))
+        denominator = polypow([1.0, 1 / self.corner_rad_s], self.model_order)[::-1]
+        return RationalWeight(numerator=(1.0,), denominator=tuple(denominator.tolist()))

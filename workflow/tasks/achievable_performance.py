@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from control_design.convex.youla import YoulaOptions, youla_bracket
+from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from workflow.config.design_options import AchievableOptions
@@ -34,9 +34,8 @@ def find_bracket(
     """The bracket, or why there is none."""
     if not options.compute:
         return AchievablePerformance(reason="not asked for (compute = false)")
-    youla = YoulaOptions(**options.model_dump(exclude={"compute"}))
     try:
-        bracket = youla_bracket(plants, specification, youla, progress=progress)
+        bracket = youla_bracket(plants, specification, options, progress=progress)
     except SpecificationError as impossible:
         return AchievablePerformance(reason=str(impossible))
     except (ValueError, ArithmeticError) as unfit:

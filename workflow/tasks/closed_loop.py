@@ -13,15 +13,15 @@ from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
-from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
+from workflow.config.run_config import SimulatedSource
 from workflow.engine.errors import naming
 from workflow.tasks.friction_check import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
 from workflow.tasks.reference_filter import model_answer
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm, rig_of
+from workflow.tasks.sampled_plant import simulate_draw
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of
 from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
@@ -93,7 +93,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             shown = None
             if tip is not None:
                 shown = tip, tip.sample(stage.rng("closed_loop", "performance"), options.draws)
-            achieved = run_on_draws(controller, (posterior, own), shown, trial, **_steps(options))
+            achieved = run_on_draws(controller, (posterior, own), shown, trial, **converter_steps(options))
         if options.sensitivity and results.identify.friction is not None:
             stage.progress.update("closed_loop", 0.95, "friction")
             friction = check_friction(stage, controller, trial.step, trial.half, sensitivity)
@@ -161,33 +161,18 @@ def make_trial(
 
 def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopRuns:
     """The nonlinear arm of the source with its extra effects; every run has its own noise and rig draw."""
-    config, source, options = stage.config, _simulated(stage), stage.config.closed_loop
-    measured = OUTPUT_NAMES.index(config.control_channel.output)
+    config, options = stage.config, stage.config.closed_loop
     shown = config.performance_index
     tip = None if shown is None else OUTPUT_NAMES.index(config.channels[shown].output)
-    nominal = rig_of(source)
+    nominal = rig_of(_simulated(stage))
     runs = []
     for draw in range(options.draws):
         stage.progress.update("closed_loop", 0.1 + 0.7 * draw / options.draws, "machine")
         # The first run is the nominal rig, the others as its tolerances allow (all alike where it has none).
         rig = nominal if draw == 0 else nominal.drawn(stage.rng("closed_loop", "rig", str(draw)))
-        arm = EncodedArm(source, options.effects, stage.rng("closed_loop", "noise", str(draw)), rig=rig)
-        runs.append(
-            simulate(
-                controller,
-                ClippedMachine(arm, FINITE),
-                trial.given,
-                measured_index=measured,
-                input_disturbance=trial.disturbance,
-                **_steps(options),
-            )
-        )
+        arm = loop_of_arm(config, stage.rng("closed_loop", "noise", str(draw)), options.effects, rig)
+        runs.append(simulate(controller, reference=trial.given, input_disturbance=trial.disturbance, **arm))
     return _loop_runs(runs, None if tip is None else [run.output[:, tip] for run in runs])
-
-
-def _steps(options: ClosedLoopOptions) -> dict[str, float]:
-    """Steps of the loop's converters, as `control_design.analysis.closed_loop` calls them."""
-    return {"measurement_step": options.measurement_step, "command_step": options.quantisation}
 
 
 def run_on_draws(

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from control_design.analysis.closed_loop import simulate
 from control_design.controllers.controller import Controller
 from ident.friction import FrictionFit
-from workflow.config.run_config import SimulatedSource
 from workflow.tasks.friction_loop import (
     FrictionLoop,
     Interval,
@@ -23,8 +22,7 @@ from workflow.tasks.friction_loop import (
 )
 from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples
 from workflow.tasks.results import FrictionCheck, SensitivityCheck, SlowSine
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
+from workflow.tasks.simulated_rig import converter_steps, loop_of_arm
 from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
@@ -47,14 +45,10 @@ def check_friction(
 ) -> FrictionCheck:
     """What friction does to the loop of this controller (without feed-forward), predicted and, where
     `sensitivity` was measured on the simulated arm, measured."""
-    found, certificate, options = (
-        stage.results.identify.friction,
-        stage.results.certify.certificate,
-        stage.config.closed_loop,
-    )
+    found, certificate = stage.results.identify.friction, stage.results.certify.certificate
     assert found is not None
     assert certificate is not None
-    steps = {"measurement_step": options.measurement_step, "command_step": options.quantisation}
+    steps = converter_steps(stage.config.closed_loop)
     loops = drawn(controller, found, stage.rng("closed_loop", "friction"), _DRAWS, **steps)
     plan = sensitivity_plan(stage, controller, transient_samples)
     names = ["0", "further 1", "1", "further 2", "further 3"]
@@ -131,16 +125,7 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
         law = replace(controller, feedforward=feedforward)
         noise = stage.rng("closed_loop", "slow sine")
         if on_arm:
-            source, options = stage.config.source, stage.config.closed_loop
-            assert isinstance(source, SimulatedSource)
-            run = simulate(
-                law,
-                ClippedMachine(EncodedArm(source, (), noise), FINITE),
-                reference,
-                measured_index=OUTPUT_NAMES.index(stage.config.control_channel.output),
-                measurement_step=options.measurement_step,
-                command_step=options.quantisation,
-            )
+            run = simulate(law, reference=reference, **loop_of_arm(stage.config, noise))
         else:
             run = FrictionLoop.of(law, found).run(reference, noise)
         errors.append((run.reference - run.measured)[period // 4 :])

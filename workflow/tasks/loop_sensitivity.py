@@ -12,10 +12,8 @@ import numpy.typing as npt
 from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
-from workflow.config.run_config import SimulatedSource
 from workflow.tasks.results import MeasuredPeak, SensitivityCheck
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
+from workflow.tasks.simulated_rig import loop_of_arm
 from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
@@ -148,16 +146,6 @@ def measured_on_arm(
     effects: Sequence[Mapping[str, Any]] = (),
 ) -> MeasuredSensitivity:
     """S on the simulated arm with further effects; the name tells its phases and its noise from others'."""
-    source, options = stage.config.source, stage.config.closed_loop
-    assert isinstance(source, SimulatedSource)
-    return measure_sensitivity(
-        controller,
-        ClippedMachine(
-            EncodedArm(source, effects, stage.rng("closed_loop", "sensitivity noise", name)), FINITE
-        ),
-        stage.rng("closed_loop", "sensitivity", name),
-        **excitation,
-        measured_index=OUTPUT_NAMES.index(stage.config.control_channel.output),
-        measurement_step=options.measurement_step,
-        command_step=options.quantisation,
-    )
+    arm = loop_of_arm(stage.config, stage.rng("closed_loop", "sensitivity noise", name), effects)
+    phases = stage.rng("closed_loop", "sensitivity", name)
+    return measure_sensitivity(controller, rng=phases, **excitation, **arm)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import scipy.signal
 
 from control_design.controllers.controller import Controller
-from control_design.convex.reference_filter import ReferenceFilterOptions, design_reference_filter
+from control_design.convex.reference_filter import design_reference_filter
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight
 from workflow.config.design_options import ReferenceFilterSettings
@@ -28,11 +28,9 @@ def find_filter(
     if settings is None:
         return ReferenceFilterResult()
     check_filter(settings, controller.dt_s)
-    own = {"corner_rad_s", "model_order", "model", "weight"}
-    options = ReferenceFilterOptions(**settings.model_dump(exclude=own))
     try:
         found = design_reference_filter(
-            controller, plants, settings.reference_model, options, weight=settings.error_weight
+            controller, plants, settings.reference_model, settings, weight=settings.error_weight
         )
     except ValueError as unfit:
         return ReferenceFilterResult(reason=f"no reference filter: {unfit}")

@@ -11,8 +11,9 @@ import numpy.typing as npt
 from ident.data.record import Record
 from plant import Rig, SampledArm, parse_effect, simulate
 from workflow.config.rig_settings import PRESETS
-from workflow.config.run_config import SimulatedRecord, SimulatedSource
+from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedRecord, SimulatedSource
 from workflow.engine.randomness import stage_rng
+from workflow.tasks.sampled_plant import FINITE, ClippedMachine
 
 INPUT_NAME = "voltage_V"
 OUTPUT_NAMES = SampledArm.output_names
@@ -94,3 +95,24 @@ class EncodedArm(SampledArm):
 
     def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
         super().advance(voltage_V, hub_torque_Nm, tip_force_N + next(self._forces, 0.0))
+
+
+def converter_steps(options: ClosedLoopOptions) -> dict[str, float]:
+    """Steps of the loop's converters, as `control_design.analysis.closed_loop` calls them."""
+    return {"measurement_step": options.measurement_step, "command_step": options.quantisation}
+
+
+def loop_of_arm(
+    config: RunConfig,
+    rng: np.random.Generator,
+    effects: Sequence[Mapping[str, Any]] = (),
+    rig: Rig | None = None,
+) -> dict[str, Any]:
+    """Keywords of `simulate` and `measure_sensitivity` for the simulated arm of a run: the machine with
+    further effects, which output is measured, and the steps of the converters."""
+    assert isinstance(config.source, SimulatedSource)  # or the configuration had been refused
+    return {
+        "machine": ClippedMachine(EncodedArm(config.source, effects, rng, rig=rig), FINITE),
+        "measured_index": OUTPUT_NAMES.index(config.control_channel.output),
+        **converter_steps(config.closed_loop),
+    }
