@@ -21,11 +21,11 @@ import numpy as np
 from benchmarks.harness import Print, main
 from ident import IdentOptions, Record
 from ident.checks.plausible_modes import PairKind, kind_of_pair
-from plant.modal import linear_arm
 from workflow.config.excitations import Multisine, Prbs
 from workflow.config.run_config import SimulatedRecord, SimulatedSource, built_in_config
 from workflow.tasks.log_identification import identify_records
-from workflow.tasks.simulated_rig import rig_of, simulate_record
+from workflow.tasks.simulated_rig import simulate_record
+from workflow.tasks.truth import truth_of
 
 EXPERIMENTS = (
     SimulatedRecord(
@@ -48,16 +48,6 @@ BANDS = (None, (30.0, 190.0), (10.0, 600.0))
 EXCITED_HZ = 50.0
 
 
-def true_modes_Hz(source: SimulatedSource) -> list[float]:
-    """Modes of the linear arm, the stated viscous friction added, below 50 Hz."""
-    rig = rig_of(source)
-    added = sum(float(str(e["coefficient_Nms"])) for e in source.effects if e["name"] == "viscous_friction")
-    hub = rig.hub.model_copy(update={"viscous_friction_Nms": rig.hub.viscous_friction_Nms + added})
-    poles = linear_arm(rig.model_copy(update={"hub": hub})).poles()
-    swinging = np.sort(np.abs(poles[(poles.imag > 0) & (-poles.real < 0.6 * np.abs(poles))])) / (2 * np.pi)
-    return [float(hertz) for hertz in swinging if hertz < EXCITED_HZ]
-
-
 def weak_records(source: SimulatedSource, seed: int) -> list[Record]:
     """Hub angle in both experiments."""
     return [simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad") for entry in EXPERIMENTS]
@@ -66,7 +56,8 @@ def weak_records(source: SimulatedSource, seed: int) -> list[Record]:
 def run(out: Print, *, seeds: int = 50) -> None:
     source = built_in_config()[0].source
     assert isinstance(source, SimulatedSource)
-    first, second = true_modes_Hz(source)
+    modes = truth_of(source).modes["hub_angle_rad"]
+    first, second = (mode.frequency_Hz for mode in modes if mode.frequency_Hz < EXCITED_HZ)
     experiments = [weak_records(source, seed) for seed in range(seeds)]
     longest_s = max(record.n_samples * record.dt_s for record in experiments[0])
     out(f"true modes {first:.2f} and {second:.2f} Hz; limit for the upper one within 2 %: about 0.85")

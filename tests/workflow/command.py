@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[2]
 FAST_ARM = Path(__file__).parent / "data" / "fast_arm.toml"
@@ -23,6 +24,11 @@ class Answer:
     code: int
     out: str
     err: str
+
+    def document(self, code: int = 0) -> Any:
+        """What `--json` printed; the exit code must be this one."""
+        assert self.code == code, self.err
+        return json.loads(self.out)
 
 
 def start_flexlink(*arguments: object, stdout: IO[bytes] | int = subprocess.PIPE) -> subprocess.Popen[bytes]:

@@ -26,6 +26,15 @@ label = "effects"
 values = [[], [{{ name = "tip_payload", mass_kg = 0.02 }}]]
 """
 
+# What every other study starts from: one draw of the fast arm, and nothing more.
+PLAIN = f"""
+[study]
+base = "{FAST_ARM}"
+[changes]
+"closed_loop.draws" = 1
+"closed_loop.conditions" = false
+"""
+
 
 def write_study(folder: Path, text: str = SMALL_STUDY) -> Path:
     """The study as a file in `folder`."""

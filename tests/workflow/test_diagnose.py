@@ -13,7 +13,7 @@ import pytest
 
 from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
-from plant.effects import GroundSpring
+from plant.effects.joint import GroundSpring
 from tests.workflow.command import finish, kill, start_flexlink, wait_until
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.config.run_config import SimulatedSource
@@ -314,8 +314,7 @@ def test_a_directory_of_something_else_is_left_alone(cases, tmp_path, here):
 def test_json_is_all_there_is_on_standard_output(cases, tmp_path, here, flexlink, monkeypatch):
     monkeypatch.setattr(command, "Engine", lambda: KnownAnswer((FRICTION,)))
     answer = flexlink("diagnose", *cases, "--out", tmp_path / "out", "--no-controller", "--json")
-    assert answer.code == 0, answer.err
-    printed = json.loads(answer.out)
+    printed = answer.document()
     assert [case["verdict"] for case in printed["cases"]] == ["effect", "effect"]
     assert printed["failed"] == []
 
@@ -355,8 +354,7 @@ def test_a_recorded_case_from_files_to_files(gap_cases, tmp_path, flexlink):
     truth = tomllib.loads((gap_cases / "labelled/tip_payload/answer.toml").read_text())
     out = tmp_path / "out"
     answer = flexlink("diagnose", gap_cases / "labelled/tip_payload", "--out", out, "--jobs", 1, "--json")
-    assert answer.code == 0, answer.err
-    (found,) = json.loads(answer.out)["cases"]
+    (found,) = answer.document()["cases"]
     assert found["verdict"] == "effect"
     assert found["combination"] == ["tip_payload"]
     (expected,) = truth["effects"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -42,20 +41,16 @@ def logs(tmp_path_factory) -> Path:
     return folder
 
 
+def identify_first(logs, **written):
+    fresh = [logs / "fresh.csv"]
+    return identify_logs([logs / "first.csv"], "u_V", "tip_m", time="t_s", validation=fresh, **written)
+
+
 @pytest.fixture(scope="module")
 def identified(logs):
     """The one-liner with everything it can write; document on standard output read back from the call."""
-    summary = identify_logs(
-        [logs / "first.csv"],
-        "u_V",
-        "tip_m",
-        time="t_s",
-        validation=[logs / "fresh.csv"],
-        report=logs / "page.html",
-        export=logs / "model.json",
-        out=logs / "model.npz",
-    )
-    return logs, summary.to_document()
+    written = {"report": logs / "page.html", "export": logs / "model.json", "out": logs / "model.npz"}
+    return logs, identify_first(logs, **written).to_document()
 
 
 def test_page_says_in_words_what_the_numbers_say(identified):
@@ -114,7 +109,7 @@ def test_json_is_only_json_and_names_the_files(flexlink, undrawn, logs, tmp_path
         *("identify", logs / "first.csv", *COLUMNS, "--real", 2, "--pairs", 3, "--json"),
         *("--report", tmp_path / "page.html", "--export", tmp_path / "m.json"),
     )
-    document = json.loads(answer.out)
+    document = answer.document()
     assert document["report"] == str(tmp_path / "page.html")
     assert document["numbers"]["model_file"] == str(tmp_path / "m.json")
     assert document["numbers"]["warnings"] == []
@@ -132,14 +127,7 @@ def test_json_is_only_json_and_names_the_files(flexlink, undrawn, logs, tmp_path
 
 def test_same_files_same_page(identified, tmp_path):
     logs, _ = identified
-    identify_logs(
-        [logs / "first.csv"],
-        "u_V",
-        "tip_m",
-        time="t_s",
-        validation=[logs / "fresh.csv"],
-        report=tmp_path / "b.html",
-    )
+    identify_first(logs, report=tmp_path / "b.html")
     assert (tmp_path / "b.html").read_bytes() == (logs / "page.html").read_bytes()
 
 
@@ -154,7 +142,7 @@ def test_what_to_do_stands_in_the_table_and_on_the_page(flexlink, undrawn, tmp_p
     answer = flexlink(
         "identify", log, *COLUMNS, "--real", 1, "--pairs", 1, "--report", tmp_path / "p.html", "--json"
     )
-    document = json.loads(answer.out)
+    document = answer.document()
     sentences = document["numbers"]["warnings"]
     assert any("saturated or clipped: lower the amplitude" in sentence for sentence in sentences)
     assert any("residuals" in sentence for sentence in sentences)
@@ -188,8 +176,7 @@ def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
         *("identify", log, *COLUMNS, "--reference", "r_V", "--real", 0, "--pairs", 1),
         *("--report", tmp_path / "page.html", "--json"),
     )
-    assert answer.code == 0, answer.err
-    numbers = json.loads(answer.out)["numbers"]
+    numbers = answer.document()["numbers"]
     assert any("error of the first stage" in sentence for sentence in numbers["warnings"])
     (mode,) = numbers["modes"]
     assert mode["omega_rad_s"] == pytest.approx(30.0, rel=0.02)
@@ -209,8 +196,7 @@ def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
         *("identify", log, *COLUMNS, "--real", 2, "--pairs", 2, "--band", 8, 300, "--json"),
         *("--report", tmp_path / "page.html"),
     )
-    assert answer.code == 0, answer.err
-    numbers = json.loads(answer.out)["numbers"]
+    numbers = answer.document()["numbers"]
     hertz = [mode["frequency_Hz"] for mode in numbers["modes"]]
     assert hertz == pytest.approx(P2_HZ[:2], rel=0.01)
     assert numbers["uncertainty"]["bands"][0]["from_rad_s"] >= 8
@@ -220,7 +206,7 @@ def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
 
     upper = 2 * np.pi * P2_HZ[1] / 1.1
     cut = flexlink("identify", log, *COLUMNS, "--real", 2, "--pairs", 2, "--band", 8, upper, "--json")
-    warnings = json.loads(cut.out)["numbers"]["warnings"]
+    warnings = cut.document()["numbers"]["warnings"]
     assert [sentence for sentence in warnings if "outside the band of the data" in sentence]
 
 
@@ -235,8 +221,7 @@ def test_friction_is_identified_from_logs_where_that_is_asked_for(flexlink, undr
     for promise in ("as recorded", "without friction", "this amplitude"):
         page = tmp_path / "page.html"
         answer = flexlink(*command, "--promise", promise, "--report", page)
-        assert answer.code == 0, answer.err
-        document = json.loads(answer.out)
+        document = answer.document()
         told[promise] = {row["label"]: row["value"] for row in document["table"]}
         text = Page(page.read_text(encoding="utf-8")).text
         assert ("Coulomb" in text) == (promise != "as recorded")
@@ -268,8 +253,7 @@ def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexli
             *("identify", log, "--input", "u_V", "--output", "tip_m", "--time", header, *more),
             *("--real", 2, "--pairs", 3, "--json", "--report", tmp_path / f"{name}.html"),
         )
-        assert answer.code == 0, answer.err
-        document = json.loads(answer.out)
+        document = answer.document()
         found[name] = {key: document["numbers"][key] for key in ("modes", "real_poles_z", "warnings")}
         told[name] = {row["label"]: row["value"] for row in document["table"]}
         assert told[name][name] in Page((tmp_path / f"{name}.html").read_text(encoding="utf-8")).text
@@ -287,11 +271,11 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
     (tmp_path / "log.csv").write_text("\n".join(lines))
     command = ("identify", tmp_path / "log.csv", "--input", "u", "--output", "y", "--time", "t")
     command = (*command, "--real", 2, "--pairs", 3, "--json")
-    document = json.loads(flexlink(*command).out)
+    document = flexlink(*command).document()
     assert "--time-unit ms" in document["numbers"]["warnings"][0]
     (said,) = [row["value"] for row in document["table"] if row["label"] == "log"]
     assert said == "time column 't': seconds (no unit stated), sampled every 5 s, 3000 s"
-    document = json.loads(flexlink(*command, "--time-unit", "s").out)
+    document = flexlink(*command, "--time-unit", "s").document()
     assert not any("--time-unit" in sentence for sentence in document["numbers"]["warnings"])
 
 

@@ -25,7 +25,7 @@ from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
 from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.report_examples import achievable, sampled_responses
-from tests.workflow.study_examples import assert_same_study, write_study
+from tests.workflow.study_examples import PLAIN, assert_same_study, write_study
 from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import StageError
@@ -265,12 +265,9 @@ def test_a_task_that_kills_its_process_fails_alone():
         assert "code of the worker" in found[index].reason
 
 
-SEARCH = f"""
-[study]
-base = "{FAST_ARM}"
-[changes]
-"closed_loop.draws" = 1
-"closed_loop.conditions" = false
+SEARCH = (
+    PLAIN
+    + """
 [search]
 method = "optuna"
 trials = 5
@@ -290,6 +287,7 @@ to = 2
 key = "specification.modulus_margin"
 values = [0.4, 0.5]
 """
+)
 
 
 @pytest.mark.slow
