@@ -9,7 +9,7 @@ import numpy as np
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
-from plant.effects import Quantisation
+from plant.effects.sensor import Quantisation
 
 _TIP = 1
 

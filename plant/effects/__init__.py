@@ -10,59 +10,23 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from plant.effects.actuator import ActuatorDeadZone, ActuatorGain, ActuatorLag, ActuatorSaturation, InputDelay
-from plant.effects.base import EFFECTS, LOOK_ALIKES, Effect, register
-from plant.effects.joint import (
-    Backlash,
-    BaseCompliance,
-    CoulombFriction,
-    GroundSpring,
-    HardeningSpring,
-    HubInertia,
-    JointCompliance,
-    PeriodicDisturbance,
-    StribeckFriction,
-    TorqueRipple,
-    ViscousFriction,
-)
-from plant.effects.link import Gravity, LinkStiffness, StructuralDamping, TipPayload
-from plant.effects.sensor import Quantisation, SensorDrift, SensorGain, SensorLag
+from plant.effects import actuator, joint, link, sensor
+from plant.effects.base import EFFECTS, LOOK_ALIKES, Effect
 from plant.machine import Machine
 from plant.rig import Rig, one_line
 
 __all__ = [
     "EFFECTS",
     "LOOK_ALIKES",
-    "ActuatorDeadZone",
-    "ActuatorGain",
-    "ActuatorLag",
-    "ActuatorSaturation",
-    "Backlash",
-    "BaseCompliance",
-    "CoulombFriction",
     "Effect",
-    "Gravity",
-    "GroundSpring",
-    "HardeningSpring",
-    "HubInertia",
-    "InputDelay",
-    "JointCompliance",
-    "LinkStiffness",
-    "PeriodicDisturbance",
-    "Quantisation",
-    "SensorDrift",
-    "SensorGain",
-    "SensorLag",
-    "StribeckFriction",
-    "StructuralDamping",
-    "TipPayload",
-    "TorqueRipple",
-    "ViscousFriction",
+    "actuator",
     "in_words",
+    "joint",
+    "link",
     "make_machine",
     "parse_effect",
     "parse_effects",
-    "register",
+    "sensor",
 ]
 
 

@@ -20,14 +20,9 @@ from diagnosis.next_experiment.discrimination import (
 from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
 from plant import prbs, simulate
-from plant.effects import (
-    ActuatorLag,
-    ActuatorSaturation,
-    CoulombFriction,
-    InputDelay,
-    TipPayload,
-    ViscousFriction,
-)
+from plant.effects.actuator import ActuatorLag, ActuatorSaturation, InputDelay
+from plant.effects.joint import CoulombFriction, ViscousFriction
+from plant.effects.link import TipPayload
 from tests.diagnosis.synthetic_residuals import DT, NOISE, RIG, inputs, made, white
 
 TOLERANT = RIG.model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05, "motor.resistance_ohm": 0.03}})

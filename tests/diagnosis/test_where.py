@@ -13,15 +13,9 @@ from diagnosis.where.where import subsystem_mass, where
 from diagnosis.where.where_energy import band_gaps, sensor_gaps
 from diagnosis.where.where_trends import common_findings
 from plant import EFFECTS, multisine, multisine_lines, simulate
-from plant.effects import (
-    CoulombFriction,
-    HardeningSpring,
-    LinkStiffness,
-    PeriodicDisturbance,
-    Quantisation,
-    SensorGain,
-    TipPayload,
-)
+from plant.effects.joint import CoulombFriction, HardeningSpring, PeriodicDisturbance
+from plant.effects.link import LinkStiffness, TipPayload
+from plant.effects.sensor import Quantisation, SensorGain
 from tests.diagnosis.recorded import recorded_case
 from tests.diagnosis.synthetic_residuals import DT, MODEL, NOISE, PERIOD, RIG, inputs, made, white
 

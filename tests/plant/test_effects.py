@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs, simulate
-from plant.effects import CoulombFriction, register
-from plant.effects.base import RatioEffect
+from plant.effects.base import RatioEffect, register
+from plant.effects.joint import CoulombFriction
 from plant.machine import Machine
 
 RIG = paper_link()

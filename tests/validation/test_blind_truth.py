@@ -7,7 +7,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from plant.effects import EFFECTS, GroundSpring, parse_effects
+from plant.effects import EFFECTS, parse_effects
+from plant.effects.joint import GroundSpring
 from plant.rig import Rig
 from plant.simulate import simulate
 from validation.blind.beam import link_basis
