@@ -1,8 +1,10 @@
-"""What the levels of noise and distortion say: linear, and how far, or distorted, where and of which kind."""
+"""What the levels of noise and distortion say: linear, and how far, or distorted, where and of which kind;
+and what repeats at several amplitudes say of records without a period."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from ident.data.distortion import BandLevel, Distortion
 from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.nonparametric import coherence
 from ident.data.record import Record
+from ident.data.repeats import AmplitudeBand, Repeats
 
 # Distortion above this share of the response is told where it is; a linear design need not mind less.
 _WORTH_TELLING = 0.01
@@ -18,17 +21,23 @@ _WORTH_TELLING = 0.01
 _HIDDEN = 0.05
 # One kind is told where its power is this many times the other's; a trend where the level changes so much.
 _CLEARLY, _TREND = 4.0, 1.25
+# A change of the gain, or of resonances, is named where it explains this much of a difference.
+_NAMED = 0.3
 
 
-def distortion_findings(records: Sequence[Record], found: Sequence[Distortion]) -> list[Finding]:
-    """Verdicts about records with one input and output, from `distortion_of` them.
+def distortion_findings(
+    records: Sequence[Record], found: Sequence[Distortion], repeated: Sequence[Repeats] = ()
+) -> list[Finding]:
+    """Verdicts about records with one input and output, from `distortion_of` them and `repeats_of` them.
 
-    Of records that are not periodic: noise and distortion together, by their coherence.
+    Of records that are neither periodic nor repeats: noise and distortion together, by their coherence.
     """
     periodic = {name for levels in found for name in levels.names}
+    periodic |= {name for each in repeated for names in each.names for name in names}
     rest = [record for record in records if record.name not in periodic]
     unit = "".join(records[0].input_units[:1]) if records else ""
     told = [item for levels in found for item in _verdict(levels, found, unit)]
+    told += [item for each in repeated for item in _of_repeats(each)]
     if rest:
         omega, coherent = (np.concatenate(part) for part in zip(*(coherence([r]) for r in rest), strict=True))
         share = np.sqrt(1 / np.clip(coherent, 1e-12, 1.0) - 1)
@@ -38,6 +47,51 @@ def distortion_findings(records: Sequence[Record], found: Sequence[Distortion]) 
     if found:
         told += [item for item in clipped(records) if item.values["signal"] == "output"]
     return told
+
+
+def _of_repeats(repeats: Repeats) -> list[Finding]:
+    """What scatters, and what differs between the smallest and the largest amplitude."""
+    scatter = [100 * repeats.scatter(k) for k in range(len(repeats.rms))]
+    about: dict[str, Value] = {
+        "times": repeats.rms[-1] / repeats.rms[0],
+        "n_records": min(len(names) for names in repeats.names),
+        "n_amplitudes": len(repeats.rms),
+        "least_percent": min(scatter),
+        "most_percent": max(scatter),
+        "from_Hz": repeats.omega_rad_s[0] / (2 * np.pi),
+        "to_Hz": repeats.omega_rad_s[-1] / (2 * np.pi),
+    }
+    told = [finding(FindingKind.REPEATED, **about)]
+    effects = repeats.amplitude_effects
+    if effects:
+        most = max(effects, key=lambda band: band.difference)
+        values: dict[str, Value] = {
+            **about,
+            "from_Hz": effects[0].from_rad_s / (2 * np.pi),
+            "to_Hz": effects[-1].to_rad_s / (2 * np.pi),
+            "most_from_Hz": most.from_rad_s / (2 * np.pi),
+            "most_to_Hz": most.to_rad_s / (2 * np.pi),
+            "percent": 100 * most.difference,
+            "chance_percent": 100 * most.chance,
+        }
+        told.append(finding(FindingKind.AMPLITUDE_EFFECT, **values, **_looks(effects)))
+    elif len(repeats.rms) > 1:
+        told.append(finding(FindingKind.AMPLITUDE_HIDDEN, **about))
+    return told
+
+
+def _looks(effects: Sequence[AmplitudeBand]) -> dict[str, Value]:
+    """Where a shift of resonances, and where a change of the whole band, explains most; 0 where none does."""
+    named: dict[str, Value] = {}
+    for what, share in (("shift", attrgetter("shift_share")), ("gain", attrgetter("level_share"))):
+        like = [band for band in effects if share(band) > _NAMED]
+        band = max(like, key=lambda band: share(band) * band.difference / band.chance, default=None)
+        named |= {
+            f"{what}_percent": 0.0 if band is None else 100 * getattr(band, what),
+            f"{what}_from_Hz": 0.0 if band is None else band.from_rad_s / (2 * np.pi),
+            f"{what}_to_Hz": 0.0 if band is None else band.to_rad_s / (2 * np.pi),
+        }
+    return named
 
 
 def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) -> list[Finding]:

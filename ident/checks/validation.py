@@ -135,12 +135,12 @@ def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) 
 class ScatterRow:
     """One band of `repeat_scatter`; radii are RMS over the band, at one standard deviation, relative to |G|.
 
-    predicted: of one repeat's own covariance; measured: scatter of the repeats around their mean, unbiased;
-    ratio = measured / predicted, about 1 if the bounds are honest about noise: then it lies between ratio_low
-    and ratio_high in 95 % of experiments like this one (chi-square with degrees_of_freedom, which a few
-    repeats and neighbouring frequencies that move together keep small). between: distance of the groups'
-    means (RMS deviation, unbiased), between_ratio: the same over what noise alone would give; both NaN with
-    one group.
+    predicted: of one repeat by its covariance (`repeat_posteriors`: from the others); measured: scatter of
+    the repeats around their mean, unbiased; ratio = measured / predicted, about 1 if the prediction is
+    honest: then it lies between ratio_low and ratio_high in 95 % of experiments like this one (chi-square
+    with degrees_of_freedom, which a few repeats and neighbouring frequencies that move together keep small).
+    between: distance of the groups' means (RMS deviation, unbiased), between_ratio: the same over what noise
+    alone would give; both NaN with one group.
     """
 
     omega_low_rad_s: float
@@ -165,7 +165,7 @@ def repeat_scatter(
     """Predicted noise ellipses against the scatter between repeats, band by band.
 
     groups: one sequence per condition (amplitude, day) with the estimate of each repeat, all on one grid;
-    e.g. `record_posteriors(...)` evaluated with `.at(omega)`. posterior (of any one repeat) tells how the
+    e.g. `repeat_posteriors(...)` evaluated with `.at(omega)`. posterior (of any one repeat) tells how the
     errors of neighbouring frequencies move together, for the sampling interval of the ratio; without it they
     count as independent. Bands without a grid frequency are left out. Raises ValueError when a group has
     fewer than two repeats or the grids differ.

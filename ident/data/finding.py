@@ -69,6 +69,9 @@ class FindingKind(Enum):
     ONE_REALISATION = auto()
     ONE_PERIOD = auto()
     NOT_PERIODIC = auto()
+    REPEATED = auto()
+    AMPLITUDE_EFFECT = auto()
+    AMPLITUDE_HIDDEN = auto()
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ class FrfRepeats:
         for index in range(grid.size):
             points = self.response[group == index]
             if outlier_threshold is not None:
-                points = _inliers(points, outlier_threshold)
+                points = inliers(points, outlier_threshold)
             centre[index] = points.mean()
             deviation = points - centre[index]
             pair = np.stack([deviation.real, deviation.imag])
@@ -152,7 +152,7 @@ class FrfRepeats:
         )
 
 
-def _inliers(points: ComplexArray, threshold: float) -> ComplexArray:
+def inliers(points: ComplexArray, threshold: float) -> ComplexArray:
     """Points within `threshold` robust standard deviations of the median.
 
     In one pass: repeated on ten points or so, the spread shrinks by chance until good points fall.

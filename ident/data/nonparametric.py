@@ -42,7 +42,7 @@ def empirical_frf(
     as whole periods in steady state. Raises ValueError when the
     records do not fit together or leave fewer than three spectral lines per estimate.
     """
-    spectra = _spectra(records, periodic)
+    spectra = spectra_of(records, periodic)
     width = 2 * _half_width(half_width_lines, len(records)) + 1
     groups = _groups(spectra, width, omega_min_rad_s, omega_max_rad_s)
     centre, variance = _local_ratio(spectra, groups, level)
@@ -66,7 +66,7 @@ def coherence(
     Averaged over the same lines and records as `empirical_frf`. 1 minus it is the share of the output's power
     that no linear response to this input explains: noise, another input, or nonlinearity.
     """
-    spectra = _spectra(records, periodic)
+    spectra = spectra_of(records, periodic)
     groups = _groups(spectra, 2 * _half_width(half_width_lines, len(records)) + 1, None, None)
     u, y = spectra.input[:, groups], spectra.output[:, groups]
     cross = np.abs(np.sum(y * u.conj(), axis=(0, 2))) ** 2
@@ -76,7 +76,7 @@ def coherence(
 
 
 @dataclass(frozen=True, eq=False)
-class _Spectra:
+class Spectra:
     """(R, F) transforms of all records at omega (F,), the line at zero left out."""
 
     omega_rad_s: RealArray
@@ -86,7 +86,8 @@ class _Spectra:
     by_reference: bool
 
 
-def _spectra(records: Sequence[Record], periodic: bool) -> _Spectra:
+def spectra_of(records: Sequence[Record], periodic: bool) -> Spectra:
+    """Transforms of SISO records of one length, as `empirical_frf` takes them; else ValueError."""
     if not records:
         raise ValueError("need at least one record")
     first = records[0]
@@ -107,7 +108,7 @@ def _spectra(records: Sequence[Record], periodic: bool) -> _Spectra:
         return np.asarray(np.fft.rfft(stacked, axis=1)[:, 1:], dtype=np.complex128)
 
     u = transform([record.input[:, 0] for record in records])
-    return _Spectra(
+    return Spectra(
         omega_rad_s=2 * np.pi * np.arange(1, u.shape[1] + 1) / (first.n_samples * first.dt_s),
         input=u,
         output=transform([record.output[:, 0] for record in records]),
@@ -128,7 +129,7 @@ def _half_width(half_width_lines: int | None, n_records: int) -> int:
 
 
 def _groups(
-    spectra: _Spectra, width: int, omega_min: float | None, omega_max: float | None
+    spectra: Spectra, width: int, omega_min: float | None, omega_max: float | None
 ) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
     """(F, width) line indices of non-overlapping averaging widths inside the band."""
     low = 0.0 if omega_min is None else omega_min
@@ -141,7 +142,7 @@ def _groups(
 
 
 def _local_ratio(
-    spectra: _Spectra, groups: np.ndarray[tuple[int, int], np.dtype[np.int64]], level: float
+    spectra: Spectra, groups: np.ndarray[tuple[int, int], np.dtype[np.int64]], level: float
 ) -> tuple[ComplexArray, RealArray]:
     """Centre (F,) and widened variance E|G_hat - G|^2 (F,)."""
     u, y, w = spectra.input[:, groups], spectra.output[:, groups], spectra.instrument[:, groups]

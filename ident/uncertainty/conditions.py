@@ -3,6 +3,11 @@
 A linear response identified at one amplitude, day or payload is known to its noise ellipse, but the next
 condition has another response. Random effects: G_i = G + d_i, d_i ~ N(0, T), each measured with covariance
 P_i. The plant met next is G + d, whose covariance around the mean of K estimates is T + (T + mean P) / K.
+
+P_i from the residuals of one record is right for a linear arm in stationary noise. A swept arm with friction
+is neither: noise is another one while the sweep passes, what friction does in the same way in every sweep
+stands in the residuals and does not scatter, and the response itself differs from run to run. Where an
+experiment was repeated, `repeat_posteriors` takes the scatter of a record from the other repeats.
 """
 
 from __future__ import annotations
@@ -14,9 +19,15 @@ import numpy as np
 
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import RealArray
 from ident.data.ellipses import hotelling_widening
 from ident.data.record import Record
-from ident.uncertainty.embedding import EmbeddingOptions, common_fir_length, tangent
+from ident.uncertainty.embedding import EmbeddingOptions, common_fir_length, tangent, tangent_rows
+from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
+
+# Errors count together for as long as a response lasts: time constants of the slowest pole, and the longest
+# share of a record, so that enough windows are left.
+_TIME_CONSTANTS, _LONGEST_WINDOW = 3.0, 0.1
 
 
 def group_posteriors(
@@ -35,6 +46,79 @@ def record_posteriors(
 ) -> list[ResponsePosterior]:
     """`group_posteriors` with every record a group of its own."""
     return group_posteriors([[record] for record in records], model, options)
+
+
+def repeat_posteriors(
+    groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions | None = None
+) -> list[list[ResponsePosterior]]:
+    """`record_posteriors` of repeats, each with the covariance that the others of its group predict.
+
+    The estimate is linear in the output, so its error is a sum over time of the noise with known weights.
+    Noise: what the residuals of the other repeats around their common model differ by, distortion that
+    repeats taken off. Products of the summands are added up to three time constants of the slowest pole
+    apart, with weights that fall linearly (Newey and West, Econometrica 55(3), 1987), which needs no
+    stationarity; as long as the record, the window would give the sample covariance of the other estimates.
+    Groups of two keep the covariance of each record's own residuals: one other repeat differs from nothing.
+    """
+    flat = iter(record_posteriors([record for group in groups for record in group], model, options))
+    theirs = [[next(flat) for _ in group] for group in groups]
+    return [
+        _predicted_by_others(group, posteriors, model, options or EmbeddingOptions())
+        if len(group) > 2
+        else posteriors
+        for group, posteriors in zip(groups, theirs, strict=True)
+    ]
+
+
+def _predicted_by_others(
+    group: Sequence[Record],
+    posteriors: Sequence[ResponsePosterior],
+    model: GobfModel,
+    options: EmbeddingOptions,
+) -> list[ResponsePosterior]:
+    rows = [_linear_rows(*pair, model, options) for pair in zip(group, posteriors, strict=True)]
+    n_rows = min(output.size for _, output in rows)
+    columns, outputs = zip(*((x[-n_rows:], y[-n_rows:]) for x, y in rows), strict=True)
+    memory = -_TIME_CONSTANTS / np.log(max(float(np.abs(model.poles.values).max()), 0.1))
+    window = int(np.clip(memory, 1, _LONGEST_WINDOW * n_rows))
+    predicted = []
+    for k, posterior in enumerate(posteriors):
+        others = [j for j in range(len(group)) if j != k]
+        common = np.mean([posteriors[j].mean for j in others], axis=0)
+        residuals = np.stack([outputs[j] - columns[j] @ common for j in others])
+        noise = (residuals - residuals.mean(axis=0)) * np.sqrt(len(others) / (len(others) - 1))
+        factors = []
+        for j, differs in zip(others, noise, strict=True):
+            # Coefficients = mean + F F^T / s^2 X^T noise, F the factor of their covariance.
+            factor = posteriors[j].covariance_factor
+            report = posteriors[j].report
+            assert report is not None
+            summed = _window_sums((columns[j] @ factor) * differs[:, None], window)
+            weights = triangle_of(summed).T / (np.sqrt(window * len(others)) * report.noise_std**2)
+            factors.append(factor @ weights)
+        predicted.append(replace(posterior, covariance_factor=np.hstack(factors)))
+    return predicted
+
+
+def _linear_rows(
+    record: Record, posterior: ResponsePosterior, model: GobfModel, options: EmbeddingOptions
+) -> tuple[RealArray, RealArray]:
+    """Columns (T, P) of the posterior's coefficients and the output (T,), whitened, without the nuisance."""
+    assert posterior.report is not None
+    rows = tangent_rows([record], model, options.model_copy(update={"fir_length": posterior.fir_length}))
+    (block,) = rows.with_whitening(np.array([1.0, *posterior.report.ar_coefficients])).blocks()
+    both = np.column_stack([block.regressors, block.kernel, block.output])
+    nuisance = nuisance_basis(block.nuisance)
+    both = both - nuisance @ (nuisance.T @ both)
+    return both[:, :-1], both[:, -1]
+
+
+def _window_sums(summands: RealArray, window: int) -> RealArray:
+    """(T + window - 1, P): sums over every stretch of `window` rows, those that reach over the ends too."""
+    total = np.vstack([np.zeros((1, summands.shape[1])), np.cumsum(summands, axis=0)])
+    padded = np.vstack([total, np.repeat(total[-1:], window - 1, axis=0)])
+    padded[window:] -= total[:-1]
+    return np.asarray(padded[1:])
 
 
 def combine_posteriors(

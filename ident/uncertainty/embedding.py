@@ -168,6 +168,13 @@ def common_fir_length(records: Sequence[Record], poles: Poles, options: Embeddin
     return max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
 
 
+def tangent_rows(
+    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
+) -> EmbeddingRows:
+    """Rows of the regression behind `tangent`, not yet whitened, without modes that it would add."""
+    return _rows(records, model, model.poles.doubled(), options or EmbeddingOptions())
+
+
 def _embed(
     records: Sequence[Record],
     model: GobfModel,

@@ -82,6 +82,17 @@ VALUES = {
     "trend": "falls",
     "lines": 61,
     "n_records": 2,
+    "n_amplitudes": 2,
+    "times": 1.5,
+    "most_from_Hz": 16.2,
+    "most_to_Hz": 22.0,
+    "chance_percent": 0.81,
+    "shift_percent": -0.65,
+    "shift_from_Hz": 16.2,
+    "shift_to_Hz": 22.0,
+    "gain_percent": 4.86,
+    "gain_from_Hz": 2.2,
+    "gain_to_Hz": 2.9,
 }
 # Other values that lead to other words.
 OTHERWISE = {
@@ -99,6 +110,8 @@ OTHERWISE = {
     "DISTORTED": [{"trend": "grows"}, {"parity": "both", "trend": "unknown"}, {"parity": "unknown"}],
     "ONE_REALISATION": [{"lines": 0}],
     "NOT_PERIODIC": [{"from_Hz": 0.0, "to_Hz": 0.0}],
+    "REPEATED": [{"n_amplitudes": 1}],
+    "AMPLITUDE_EFFECT": [{"shift_percent": 0.65, "gain_percent": 0.0}, {"gain_percent": -5.6}],
     "INVALIDATION": [{"invalidated": True}, {"outside": 2}],
 }
 

@@ -22,7 +22,7 @@ def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
         raise ValueError("there is no band of repeat scatter to draw")
     figure, (upper, lower) = style.panels(4.4, 2, 1, sharex=True, height_ratios=[1.5, 1.0])
     for axes, field, factor, color, label in (
-        (upper, "predicted", 100, style.MODEL, "one repeat, predicted by the ellipses"),
+        (upper, "predicted", 100, style.MODEL, "one repeat, predicted"),
         (upper, "measured", 100, style.MEASURED, "measured between repeats"),
         (upper, "between", 100, style.HIGHLIGHT, "between conditions (amplitude, day)"),
         (lower, "ratio", 1, style.MEASURED, None),

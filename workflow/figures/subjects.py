@@ -24,6 +24,7 @@ from ident.checks.distortion_findings import distortion_findings
 from ident.data.distortion import Distortion, distortion_of
 from ident.data.finding import Finding
 from ident.data.record import Record
+from ident.data.repeats import repeats_of
 from ident.friction import FrictionFit
 from workflow.config.run_config import Channel, RunConfig
 from workflow.figures.bands import Complex, Real
@@ -66,7 +67,7 @@ class ChannelView:
             found = distortion_of(self.measured)
         except ValueError as error:
             return (), [], str(error)
-        return found, distortion_findings(self.measured, found), ""
+        return found, distortion_findings(self.measured, found, repeats_of(self.measured)), ""
 
     @property
     def light(self) -> list[tuple[int, ModelMode]]:

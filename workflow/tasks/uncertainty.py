@@ -30,7 +30,7 @@ from ident.friction import (
     without_friction,
 )
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
-from ident.uncertainty.conditions import combine_posteriors, group_posteriors, record_posteriors
+from ident.uncertainty.conditions import combine_posteriors, group_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import classical, tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
@@ -318,7 +318,8 @@ def scatter_of(
     bands: Sequence[tuple[float, float]],
     friction: FrictionFit | None,
 ) -> tuple[ScatterRow, ...] | None:
-    """Predicted ellipses of single records against the scatter of repeats, or None without repeats."""
+    """Scatter of repeats, by half decades of the data, against what the other repeats predict (what each
+    record's own noise does, where there are two), or None without repeats."""
     bounded = {record.name: record for record in result.bounded}
     groups: dict[str, list[Record]] = {}
     for item in records:
@@ -328,9 +329,9 @@ def scatter_of(
     repeated = [group for group in groups.values() if len(group) >= 2]
     if not repeated:
         return None
-    flat = record_posteriors(
-        [record for group in repeated for record in group], result.identification.model, channel.uncertainty
-    )
-    omega = np.geomspace(bands[0][0], bands[-1][1] * (1 - 1e-6), 20 * len(bands))
-    estimates = iter([posterior.at(omega, channel.uncertainty.level) for posterior in flat])
-    return tuple(repeat_scatter([[next(estimates) for _ in group] for group in repeated], bands))
+    posteriors = repeat_posteriors(repeated, result.identification.model, channel.uncertainty)
+    low, high = result.data_band_rad_s or (bands[0][0], bands[-1][1])
+    edges = np.geomspace(low, high * (1 - 1e-6), max(round(2 * np.log10(high / low)), 1) + 1)
+    omega = np.geomspace(low, high * (1 - 2e-6), 20 * len(edges))
+    estimates = [[each.at(omega, channel.uncertainty.level) for each in group] for group in posteriors]
+    return tuple(repeat_scatter(estimates, list(pairwise(edges.tolist()))))
