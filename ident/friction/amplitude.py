@@ -55,6 +55,7 @@ _THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
 _EXCITED = 1e-3
 _N_GRID = 300
+_HALF_WIDTHS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])
 
 
 def refuse_unrecorded(records: Sequence[Record], amplitudes: tuple[float, float] | None) -> None:
@@ -137,7 +138,8 @@ def at_amplitudes(
     takes to hold the response with probability `level`, averaged over the amplitudes of the range.
     """
     friction, arm = behind.friction, behind.friction.arm
-    omega = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
+    spaced = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
+    omega = _around_pairs(spaced, behind.response.poles, arm.dt_s)
     normals = rng.standard_normal((_DRAWS, behind.level_factor.size))
     coefficients, shaft = (
         part.mean + normals @ part.covariance_factor.T for part in (behind.response, behind.shaft)
@@ -162,10 +164,10 @@ def at_amplitudes(
 
     share = 0.0
     if len(centres) > 1:
-        flat = responses.reshape(-1, omega.size)
+        flat = responses[..., np.isin(omega, spaced)].reshape(-1, spaced.size)
 
         def missing(share: float) -> float:
-            ellipses = posterior(share).at(omega, level)
+            ellipses = posterior(share).at(spaced, level)
             return level - float(np.mean([ellipses.contains(one) for one in flat[::_THINNED]]))
 
         # Where the amplitudes differ by less than is known of each, nothing has to be added.
@@ -253,6 +255,14 @@ def _power_spectrum(records: Sequence[Record]) -> RealArray:
         power += np.interp(grid, np.linspace(0, 1, own.size), own / own.sum())
     power[0] = power[-1] = 0.0
     return np.sqrt(power)
+
+
+def _around_pairs(omega: RealArray, poles: Poles, dt_s: float) -> RealArray:
+    """The grid (F,) and points within and beside the half bandwidths of every pole pair: a mode that may have
+    been missed is narrower than the grid, and coefficients nobody looked at may have any size."""
+    pairs = poles.omega_rad_s(dt_s)
+    near = pairs[:, None] * (1 + poles.zeta()[:, None] * _HALF_WIDTHS)
+    return np.unique(np.concatenate([omega, near[(near > omega[0]) & (near < omega[-1])]]))
 
 
 def _on_poles(

@@ -10,6 +10,7 @@ import pytest
 from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
 from ident.data.arrays import ComplexArray, RealArray
 from ident.friction import (
+    EquivalentFriction,
     FrictionFit,
     at_amplitudes,
     equivalent_friction,
@@ -227,6 +228,39 @@ def test_friction_is_viscous_on_average_at_amplitudes_that_were_not_recorded() -
     assert np.all(np.diff(equivalent.damping) < 0)
     with pytest.raises(ValueError, match="an rms from 2 to 6"):
         equivalent_friction(found, records, rng, (1.0, 6.0))
+
+
+def test_modes_narrower_than_the_grid_stay_what_they_are(
+    rubbing: tuple[float, list[Record], FrictionFit],
+) -> None:
+    """G / (1 + j omega N G_shaft) also at and between the modes that may have been missed: several lightly
+    damped pairs side by side, for one."""
+    _, records, found = rubbing
+    behind = without_friction(records, found)
+    linear, dt_s, rng = behind.response, found.model.dt_s, np.random.default_rng(3)
+    z = np.exp((-0.01 + 1j) * np.geomspace(32.0, 37.0, 12) * dt_s)
+    at, count = linear.poles.order, 2 * z.size
+    # The all-pass of the missed modes comes last, so that the others are the same.
+    linear = replace(
+        linear,
+        poles=Poles(linear.poles.real, np.append(linear.poles.pairs, z)),
+        mean=np.insert(linear.mean, at, np.zeros(count)),
+        covariance_factor=np.insert(
+            linear.covariance_factor, [at], 2e-8 * rng.standard_normal((count, behind.level_factor.size)), 0
+        ),
+    )
+    n = np.array([0.04, 0.02])
+    mean = np.column_stack([n, np.zeros((2, 3))])
+    equivalent = EquivalentFriction(
+        found, np.array([2.0, 4.0]), np.array([1.0, 300.0]), mean, np.zeros((2, 4)), np.zeros((2, 4, 5))
+    )
+    posterior, _ = at_amplitudes(replace(behind, response=linear), equivalent, rng)
+    omega = np.linspace(20.0, 60.0, 4000)
+    speed = 1j * omega * behind.shaft.centre(omega)
+    expected = (linear.centre(omega) / (1 + n[:, None] * speed)).mean(axis=0)
+    # 400 draws leave a twentieth of a standard deviation of the mean open.
+    off = np.abs(posterior.centre(omega) - expected) / linear.at(omega).enclosing_radius()
+    assert np.max(off) < 0.25
 
 
 def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:
