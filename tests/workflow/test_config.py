@@ -144,6 +144,21 @@ def test_a_promise_that_cannot_be_kept_is_refused(tmp_path, channel, complaint):
         minimal(tmp_path, MINIMAL.replace("[[channels]]", f"[[channels]]\n{asked}"))
 
 
+def test_a_specification_over_amplitudes_is_the_promise_of_every_channel(tmp_path):
+    asked = MINIMAL.replace("[specification]", "[specification]\namplitudes = [0.5, 8.0]")
+    tip = '[[channels]]\ninput = "voltage_V"\noutput = "tip_m"\n%s\n[specification]'
+    config = minimal(tmp_path, asked.replace("[specification]", tip % ""))
+    assert [channel.uncertainty.amplitudes for channel in config.channels] == [(0.5, 8.0)] * 2
+    assert RunConfig.from_document(config.to_document(), source="document") == config
+    other = tip % "uncertainty = { promise = 'without friction' }"
+    with pytest.raises(InputError, match=r"0.5, 8\], but channel 'tip_m' says promise = 'without friction'"):
+        minimal(tmp_path, asked.replace("[specification]", other))
+    # Without a range in the specification the channels still have to agree on the one there is.
+    promised = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = { promise = 'this amplitude' }")
+    with pytest.raises(InputError, match="promise 'this amplitude' and 'without friction'"):
+        minimal(tmp_path, promised.replace("[specification]", other))
+
+
 def test_friction_is_fed_forward_only_where_it_is_identified(tmp_path):
     asked = "[closed_loop]\nfriction_feedforward = true\n"
     with pytest.raises(InputError, match="friction_feedforward = true needs an identified friction"):

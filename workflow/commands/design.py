@@ -96,7 +96,8 @@ def design_controller(
     files: list[Path] = []
     if out is not None and synthesis is not None and certificate is not None:
         found = done.reference_filter.filter
-        files = write_controller(out, synthesis.controller, found, certified=certified)
+        known = "; ".join(dict.fromkeys(source.certified_for for source in sources_found))
+        files = write_controller(out, synthesis.controller, found, certified=certified, about=known)
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None

@@ -11,6 +11,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import tomlkit
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -185,6 +186,11 @@ class UncertaintyOptions(EmbeddingOptions):
         return self.promise != "as recorded"
 
     @property
+    def about_amplitudes(self) -> bool:
+        """The ellipses hold at an amplitude, or over a range of them."""
+        return self.promise not in ("as recorded", "without friction")
+
+    @property
     def amplitudes(self) -> tuple[float, float] | None:
         """Smallest and largest rms of the input, where a range is promised."""
         ends = re.fullmatch(_RANGE, self.promise)
@@ -252,6 +258,29 @@ class Channel(Section):
     @property
     def label(self) -> str:
         return self.name or self.output
+
+    def over_amplitudes(self, low: float, high: float) -> Channel:
+        """The same, its ellipses over a range of amplitudes. Raises ValueError where it promises another
+        response."""
+        options = self.uncertainty
+        if "promise" in options.model_fields_set and options.amplitudes != (low, high):
+            raise ValueError(
+                f"specification.amplitudes = [{low:g}, {high:g}], but channel {self.label!r} says promise = "
+                f"{options.promise!r}: leave that out"
+            )
+        ends = [np.format_float_positional(end, trim="-") for end in (low, high)]
+        promised = {**dict(options), "promise": f"amplitudes from {ends[0]} to {ends[1]}"}
+        return Channel(**{**dict(self), "uncertainty": UncertaintyOptions(**promised)})
+
+
+class RunSpecification(Specification):
+    """[specification] of a run: what the loop has to do, and over which amplitudes."""
+
+    amplitudes: tuple[float, float] | None = Field(
+        None,
+        description="smallest and largest rms of the input, in its unit, between which all of it is to hold "
+        "on the arm with its friction: sets the promise of every channel; none: as the channels promise",
+    )
 
 
 class ClosedLoopData(Section):
@@ -323,7 +352,7 @@ class RunConfig(Section):
     source: Source
     channels: tuple[Channel, ...] = Field(min_length=1)
     closed_loop_data: ClosedLoopData = Field(default_factory=ClosedLoopData)
-    specification: Specification
+    specification: RunSpecification
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
     certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
     achievable_performance: AchievableOptions = Field(
@@ -334,6 +363,20 @@ class RunConfig(Section):
     )
     closed_loop: ClosedLoopOptions = Field(default_factory=ClosedLoopOptions)
     notes: Notes = Field(default_factory=Notes)
+
+    @model_validator(mode="after")
+    def _specified_over_amplitudes(self) -> Self:
+        asked = self.specification.amplitudes
+        if asked is not None:
+            channels = tuple(channel.over_amplitudes(*asked) for channel in self.channels)
+            object.__setattr__(self, "channels", channels)
+        promises = [channel.uncertainty for channel in self.channels]
+        if any(one.about_amplitudes for one in promises) and len({one.promise for one in promises}) > 1:
+            raise ValueError(
+                "a certificate holds at one amplitude or over one range: the channels promise "
+                + " and ".join(dict.fromkeys(repr(one.promise) for one in promises))
+            )
+        return self
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:

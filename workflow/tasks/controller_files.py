@@ -85,10 +85,19 @@ def targets(out: Path) -> list[Path]:
 
 
 def write_controller(
-    out: Path, controller: Controller, reference_filter: ReferenceFilter | None, *, certified: bool
+    out: Path,
+    controller: Controller,
+    reference_filter: ReferenceFilter | None,
+    *,
+    certified: bool,
+    about: str = "",
 ) -> list[Path]:
-    """Write the `targets` of `out` where their content is not there already; the files there are now."""
-    law = controller if certified else replace(controller, name=f"{controller.name} (NOT CERTIFIED)")
+    """Write the `targets` of `out` where their content is not there already; the files there are now.
+
+    about: what it is certified for.
+    """
+    known = f", certified for {about}" if about else ""
+    law = replace(controller, name=controller.name + (known if certified else " (NOT CERTIFIED)"))
     content = {path: _CONTROLLER[path.suffix.lower()](law) for path in targets(out)}
     if reference_filter is not None:
         content |= {filter_file(path): filter_bytes(reference_filter, path.suffix) for path in targets(out)}

@@ -36,7 +36,7 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.model_files import read_model
-from workflow.tasks.pipeline import config_of
+from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import words
@@ -154,6 +154,8 @@ def read_design_file(path: Path) -> DesignFile:
         wishes = {key: document.pop(key) for key in document.keys() - known}
         document["specification"] = wishes
     elif "channels" in document:
+        # Which amplitudes the ellipses are about is up to whoever made them.
+        document["specification"].pop("amplitudes", None)
         document = {key: value for key, value in document.items() if key in known}
     found = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})
     found._name = str(path)
@@ -163,12 +165,13 @@ def read_design_file(path: Path) -> DesignFile:
 @dataclass(frozen=True, eq=False)
 class DesignSource:
     """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
-    options (`config`)."""
+    options (`config`), and knows what a certificate is about (`certified_for`)."""
 
     plant: UncertainPlant
     origin: str
     remarks: tuple[str, ...] = ()
     config: RunConfig | None = None
+    certified_for: str = ""
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
@@ -204,7 +207,10 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
     if path.is_dir():
         run = RunDirectory.open(path)
         config = config_of(run)
-        return DesignSource(RunResults(run).uncertainty.plant(config), "run directory", config=config)
+        results = RunResults(run)
+        about = certified_for(results, config)
+        plant = results.uncertainty.plant(config)
+        return DesignSource(plant, "run directory", (f"about {about}",), config, about)
     if path.suffix.lower() == ".csv":
         return _measured(path, design)
     document = _read_document(path)

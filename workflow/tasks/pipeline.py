@@ -17,6 +17,7 @@ from workflow.tasks.results import RecordsResult, RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import RunSummary, summarise
+from workflow.text.templates import said
 
 
 def run_pipeline(
@@ -68,7 +69,7 @@ def run_pipeline(
             for stage in stages:
                 before = (ready, ready_s) if stage is first else None
                 _perform(stage, config, results, progress, inputs, before)
-            _keep_controller(results)
+            _keep_controller(results, config)
             summary = summarise(results, config)
         except KeyboardInterrupt:
             run.record_status("interrupted")
@@ -87,6 +88,13 @@ def rebuild_page(run: RunDirectory, page: Stage) -> RunSummary:
     with run.locked():
         _perform(page, config, results, Progress(), {}, None, always=True)
     return summarise(results, config)
+
+
+def certified_for(results: RunResults, config: RunConfig) -> str:
+    """What a certificate of the plant that was identified is about."""
+    channel = config.control_channel
+    unit = results.records.unit(channel.input)
+    return said("certified_for", channel.uncertainty, results.uncertainty.equivalent, unit)
 
 
 def config_of(run: RunDirectory) -> RunConfig:
@@ -142,14 +150,17 @@ def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs:
     )
 
 
-def _keep_controller(results: RunResults) -> None:
+def _keep_controller(results: RunResults, config: RunConfig) -> None:
     """controller.json, .c and .h in the run directory; none of an earlier design stay."""
     design, certify = results.design, results.certify
     written: list[Path] = []
     if design.synthesis is not None and certify.certificate is not None:
         second = results.reference_filter
         law = second.law(design.synthesis.controller)
-        written = write_controller(results.run.path, law, second.filter, certified=certify.certified)
+        about = certified_for(results, config)
+        written = write_controller(
+            results.run.path, law, second.filter, certified=certify.certified, about=about
+        )
     for name in CONTROLLER_FILES:
         if results.run.path / name not in written:
             (results.run.path / name).unlink(missing_ok=True)

@@ -240,7 +240,8 @@ class UncertainChannel:
 
     nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
     display grid; empirical: response without a model, where the records allow one; tests: whiteness and
-    independence of the residuals on the estimation records; repeat_scatter: None without repeats; intervals:
+    independence of the residuals on the estimation records; behind_friction: the linear arm, where the
+    ellipses are about amplitudes; repeat_scatter: None without repeats; intervals:
     None where the method has none.
     """
 
@@ -254,6 +255,7 @@ class UncertainChannel:
     bands: tuple[Band, ...]
     tests: Tests
     agreement: NominalAgreement
+    behind_friction: IdentifiedPlant | None = None
     intervals: Intervals | None = None
     repeat_scatter: tuple[ScatterRow, ...] | None = None
 
@@ -271,21 +273,28 @@ class UncertaintyResult:
     channels: tuple[UncertainChannel, ...]
     equivalent: EquivalentFriction | None = None
 
-    def plant(self, config: RunConfig) -> UncertainPlant:
-        """What the controller is designed for: control channel and first performance channel."""
-        key = config.control_index, config.performance_index
+    def plant(self, config: RunConfig, *, behind_friction: bool = False) -> UncertainPlant:
+        """What the controller is designed for: control channel and first performance channel; or the linear
+        arm behind its friction, where the ellipses are about amplitudes."""
+        key = config.control_index, config.performance_index, behind_friction
         if key not in self._plants:
             self._plants[key] = self._plant(*key, config.control_channel.label)
         return self._plants[key]
 
     @cached_property
-    def _plants(self) -> dict[tuple[int, int | None], UncertainPlant]:
+    def _plants(self) -> dict[tuple[int, int | None, bool], UncertainPlant]:
         return {}
 
-    def _plant(self, control_index: int, performance: int | None, name: str) -> UncertainPlant:
+    def _plant(
+        self, control_index: int, performance: int | None, behind_friction: bool, name: str
+    ) -> UncertainPlant:
         def channel(index: int) -> PlantChannel:
             found = self.channels[index]
-            return PlantChannel(found.nominal.to_control(), found.posterior, found.level)
+            behind = found.behind_friction if behind_friction else None
+            model, posterior = (
+                (found.nominal, found.posterior) if behind is None else (behind.model, behind.posterior)
+            )
+            return PlantChannel(model.to_control(), posterior, found.level)
 
         control = channel(control_index)
         return UncertainPlant(
@@ -355,6 +364,21 @@ class CertifyResult:
     certified: bool
     reason: str
     sampled: SampledResponses = SampledResponses()
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeCost:
+    """The same specification for the arm behind its friction; empty where no amplitudes are promised.
+
+    design, behind: controller and certificate for that arm; carried_over: certificate of the same controller
+    over the amplitudes. left_by_unit: output that a unit of constant disturbance at the plant's input leaves,
+    with the run's own controller and with this one.
+    """
+
+    design: DesignResult | None = None
+    behind: Certificate | None = None
+    carried_over: Certificate | None = None
+    left_by_unit: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -581,6 +605,7 @@ class RunResults:
     design = _Stage(DesignResult)
     achievable_performance = _Stage(AchievablePerformance)
     certify = _Stage(CertifyResult)
+    amplitude_cost = _Stage(AmplitudeCost)
     reference_filter = _Stage(ReferenceFilterResult)
     closed_loop = _Stage(ClosedLoopResult)
 

@@ -10,6 +10,7 @@ from functools import partial
 
 from workflow.engine.errors import naming
 from workflow.tasks.achievable_performance import UNKNOWN_TO_BRACKET, find_bracket
+from workflow.tasks.amplitude_cost import find_amplitude_cost
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import certify_asked, find_design
 from workflow.tasks.friction_loop import friction_feedforward
@@ -108,6 +109,13 @@ STAGES: tuple[Stage, ...] = (
         except_for={"specification": set(UNKNOWN_TO_BRACKET)},
     ),
     Stage("certify", (*_PLANT, "design"), certify_controller, 1.0, uses={"certificate": True}),
+    Stage(
+        "amplitude_cost",
+        (*_PLANT, "design", "certify"),
+        find_amplitude_cost,
+        0.1,
+        uses={"specification": True, "synthesis": True, "certificate": {"calibrate"}},
+    ),
     Stage(
         "reference_filter",
         (*_PLANT, "design", "certify"),

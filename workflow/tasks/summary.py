@@ -12,6 +12,7 @@ from workflow.tasks.achievable_performance import bracket_numbers
 from workflow.tasks.design import joint_numbers
 from workflow.tasks.results import (
     AchievablePerformance,
+    AmplitudeCost,
     CertifyResult,
     ClosedLoopResult,
     DesignResult,
@@ -69,6 +70,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             "certificate": codec.plain(certify.certificate),
             "achievable_performance": bracket_numbers(achievable, design.gamma),
             "sampled_responses": shares,
+            "amplitude_cost": cost_numbers(results.amplitude_cost),
             "reference_filter": codec.plain(results.reference_filter.filter),
             "closed_loop": loop_numbers(loop),
         },
@@ -125,7 +127,7 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
 def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
     """The same of its ellipses, arrays left out."""
     found: dict[str, Any] = codec.plain(spread, arrays=False)
-    for unwanted in ("posterior", "nominal", "frequency", "empirical"):
+    for unwanted in ("posterior", "nominal", "frequency", "empirical", "behind_friction"):
         found.pop(unwanted)
     if spread.intervals is not None:
         for row, known in zip(found["intervals"]["modes"], spread.intervals.modes, strict=True):
@@ -151,6 +153,11 @@ def design_numbers(design: DesignResult) -> dict[str, Any]:
         "outcome": "IMPOSSIBLE" if found is None else found.outcome.name,
         "blocking": [] if found is None else codec.plain(found.blocking),
     }
+
+
+def cost_numbers(cost: AmplitudeCost) -> dict[str, Any] | None:
+    """What holding over amplitudes costs, without the controller."""
+    return None if cost.design is None else {**codec.plain(cost), "design": design_numbers(cost.design)}
 
 
 def loop_numbers(loop: ClosedLoopResult) -> dict[str, Any]:

@@ -40,6 +40,7 @@ from workflow.tasks.identification import as_bounded
 from workflow.tasks.results import (
     Band,
     IdentifiedChannel,
+    IdentifiedPlant,
     Intervals,
     ModeInterval,
     NominalAgreement,
@@ -127,7 +128,10 @@ def uncertain_channel(
     """Everything said about a posterior. omega (F,): shown; nominal_omega (F,): where the nominal has to be
     right; poles: of the nominal, where they are not the model's; linear: posterior of the model, where that
     is another one; tests: of the residuals, where they are known already."""
-    model, linear = result.model, linear or posterior
+    model, behind = result.model, None
+    if linear is not None and linear is not posterior:
+        behind = IdentifiedPlant(nominal_of(linear, model.poles, nominal_omega), linear, level)
+    linear = linear or posterior
     frequency = posterior.at(omega, level)
     nominal = nominal_of(posterior, poles or model.poles, nominal_omega)
     return UncertainChannel(
@@ -146,6 +150,7 @@ def uncertain_channel(
         bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
         tests=residual_tests(linear, result.bounded) if tests is None else tests,
         agreement=agreement_of(posterior.at(nominal_omega, level), nominal.frequency_response),
+        behind_friction=behind,
         intervals=intervals_of(linear, model.poles, level),
         repeat_scatter=repeat_scatter,
     )
