@@ -143,6 +143,10 @@ class Record:
             )
         return self.each(lambda signal: signal[start:stop])
 
+    def limited(self, limit: float) -> Record:
+        """The record with an input cut off at a limit, both signs: what an amplifier makes of commands."""
+        return replace(self, input=np.clip(self.input, -limit, limit))
+
     def each(self, change: Callable[[RealArray], RealArray]) -> Record:
         """The record with its input, output and reference, (T, .) each, changed alike."""
         reference = None if self.reference is None else change(self.reference)

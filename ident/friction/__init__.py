@@ -2,6 +2,7 @@
 
 from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, refuse_unrecorded
 from ident.friction.fit import FrictionFit, fit_friction
+from ident.friction.observable import refuse_unseen_shaft
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
 __all__ = [
@@ -13,5 +14,6 @@ __all__ = [
     "fit_friction",
     "other_output_without_friction",
     "refuse_unrecorded",
+    "refuse_unseen_shaft",
     "without_friction",
 ]

@@ -16,6 +16,7 @@ from ident.friction import (
     equivalent_friction,
     fit_friction,
     other_output_without_friction,
+    refuse_unseen_shaft,
     without_friction,
 )
 from ident.friction.amplitude import damped_poles
@@ -269,3 +270,26 @@ def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:
         fit_friction([replace(record, output=np.zeros_like(record.output))], OPTIONS)
     with pytest.raises(ValueError, match="at most one integrator and no direct term"):
         fit_friction([record], OPTIONS.model_copy(update={"integrators": 2}))
+
+
+def test_a_shaft_that_the_records_do_not_show_is_refused(
+    rubbing: tuple[float, list[Record], FrictionFit],
+) -> None:
+    torque_Nm, records, found = rubbing
+    refuse_unseen_shaft(found, records)
+    steps = np.ptp(records[0].output) / 8
+    coarse = [replace(record, output=steps * np.round(record.output / steps)) for record in records]
+    with pytest.raises(ValueError, match=r"takes 9 different values only.*promise = 'as recorded'"):
+        refuse_unseen_shaft(found, coarse)
+    stuck = [
+        replace(record, input=record.input / 1000, output=record.output - found.motion(record)[0][:, None])
+        for record in records
+    ]
+    with pytest.raises(ValueError, match="is lost in its noise"):
+        refuse_unseen_shaft(fit_friction(stuck, OPTIONS), stuck)
+    for elsewhere in (
+        recorded(torque_Nm, 5, output=1),
+        [replace(record, output=-record.output) for record in records],
+    ):
+        with pytest.raises(ValueError, match=r"'y' is no position of the driven shaft, or .* degrees"):
+            refuse_unseen_shaft(fit_friction(elsewhere, OPTIONS), elsewhere)

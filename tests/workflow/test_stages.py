@@ -27,13 +27,15 @@ from workflow.tasks.amplitude_cost import find_amplitude_cost
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
-from workflow.tasks.records import read_record, with_common_sampling_time
+from workflow.tasks.records import make_records, read_record, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant, RunRecord, RunResults, UncertaintyResult
 from workflow.tasks.simulated_rig import EncodedArm, rig_of
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import STAGES, design_filter
 from workflow.tasks.uncertainty import posterior_of
 from workflow.text.templates import said
+
+_IN_OUT = "voltage_V", "hub_angle_rad"
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,33 @@ def test_records_are_the_simulated_arm_and_its_sensor_noise(run):
     np.testing.assert_allclose(
         noise.std(axis=0), [sensors.hub_angle_noise_rad, sensors.tip_noise_m], rtol=0.14
     )
+
+
+def test_commands_beyond_what_the_amplifier_gives_are_taken_as_that(run):
+    """The arm behind it is then the same: not, by a tenth, where the commands are believed."""
+    source = config_of(run.run).source
+    entry = source.records[0]
+    effects = (
+        *source.effects,
+        {"name": "actuator_saturation", "limit_V": 0.7 * entry.excitation.amplitude_V},
+    )
+    loud = config_of(run.run).model_copy(update={"source": source.model_copy(update={"effects": effects})})
+    first = make_records(StageInput(loud, None, Progress())).records[0]
+    commanded = run.records.records[0].record
+    assert first.cut == commanded.n_samples
+    np.testing.assert_allclose(first.record.input, 0.7 * commanded.input, rtol=1e-12)
+    omega = np.geomspace(5.0, 60.0, 40)
+    options = loud.channels[0].identification
+    error = [
+        np.median(
+            np.abs(identify([record], options).model.frequency_response(omega) / true_response(omega) - 1)
+        )
+        for record in (
+            one.siso(*_IN_OUT) for one in (first.record, replace(first.record, input=commanded.input))
+        )
+    ]
+    assert error[0] < 0.03
+    assert error[1] > 0.25
 
 
 def test_ellipses_hold_the_true_response(run):

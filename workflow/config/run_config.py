@@ -73,6 +73,12 @@ class SimulatedSource(Section):
             raise ValueError("there is nothing to simulate: give [source.plan] or [[source.records]]")
         return self
 
+    @property
+    def input_limit(self) -> float | None:
+        """What the amplifier gives at most, V: a number of its data sheet, like the rig's."""
+        limits = [effect["limit_V"] for effect in self.effects if effect["name"] == "actuator_saturation"]
+        return min(limits, default=None)
+
 
 def _planned(plan: ExperimentPlan) -> tuple[SimulatedRecord, ...]:
     """The records of a plan, named by amplitude and realisation."""
@@ -121,6 +127,11 @@ class FileSource(Section):
     references: tuple[str, ...] = Field((), description="reference columns of logs made in closed loop")
     units: Mapping[str, str] = Field(
         default_factory=dict, description="unit of a column, for axes: {theta_rad = 'rad'}"
+    )
+    input_limit: float | None = Field(
+        None,
+        gt=0,
+        description="what the amplifier gives at most: larger commands in the logs are taken as that",
     )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 

@@ -12,7 +12,7 @@ from ident.closed_loop import two_stage
 from ident.data.finding import Finding, FindingKind
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
-from ident.friction import FrictionFit, fit_friction, refuse_unrecorded
+from ident.friction import FrictionFit, fit_friction, refuse_unrecorded, refuse_unseen_shaft
 from ident.identify import identify
 from ident.stabilisation import stabilisation
 from workflow.config.run_config import Channel, Role
@@ -73,8 +73,10 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 report,
                 two_stage=finding,
             )
-            if known is not None:
-                found = clipped_as_measured(found, [r.siso(channel.input, channel.output) for r in measured])
+            limited = any(item.cut for item in records.records)
+            if known is not None or limited:
+                as_measured = [record.siso(channel.input, channel.output) for record in measured]
+                found = clipped_as_measured(found, as_measured, limited=limited)
             channels.append(
                 replace(
                     found,
@@ -87,11 +89,17 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     return IdentifyResult(tuple(channels), friction)
 
 
-def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
-    """What stands at its limit is seen in what was measured, not in what taking the friction off has left."""
+def clipped_as_measured(
+    found: IdentifiedChannel, measured: Sequence[Record], *, limited: bool = False
+) -> IdentifiedChannel:
+    """What stands at its limit is seen in what was measured, not in what taking the friction off has left.
+
+    limited: the input stands at the amplifier's limit, which is known; that is no doubt.
+    """
     search = found.identification.search
     others = tuple(warning for warning in search.warnings if warning.kind is not FindingKind.CLIPPED)
-    search = replace(search, warnings=(*others, *clipped(measured)))
+    doubts = [one for one in clipped(measured) if not (limited and one.values["signal"] == "input")]
+    search = replace(search, warnings=(*others, *doubts))
     return replace(found, identification=replace(found.identification, search=search))
 
 
@@ -102,11 +110,13 @@ def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:
         at_shaft = [record.siso(channel.input, channel.output) for record in measured]
         for other in stage.config.channels:
             refuse_unrecorded(at_shaft, other.uncertainty.amplitudes)
-        return fit_friction(
+        found = fit_friction(
             at_shaft,
             channel.identification,
             progress=lambda done, what: stage.progress.update("identify", 0.0, what),
         )
+        refuse_unseen_shaft(found, at_shaft)
+        return found
 
 
 def identified_channel(

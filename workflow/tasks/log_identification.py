@@ -21,6 +21,7 @@ from ident.friction import (
     equivalent_friction,
     fit_friction,
     refuse_unrecorded,
+    refuse_unseen_shaft,
 )
 from ident.friction import without_friction as behind_friction
 from ident.identification import Identification
@@ -90,6 +91,7 @@ def identify_records(
                 )
             refuse_unrecorded(used, promised.amplitudes)
             friction = fit_friction(used, options, progress=update)
+            refuse_unseen_shaft(friction, used)
             used, fresh_records = (
                 [friction.taken_off(record) for record in part] for part in (used, fresh_records)
             )

@@ -49,7 +49,7 @@ T = TypeVar("T")
 class RunRecord:
     """A record of the run and what the configuration says about it.
 
-    kind: of the excitation, or "file".
+    kind: of the excitation, or "file". cut: samples of the commanded input beyond what the amplifier gives.
     """
 
     record: Record
@@ -57,6 +57,7 @@ class RunRecord:
     condition: str | None
     remark: str
     kind: str = "file"
+    cut: int = 0
 
     @property
     def name(self) -> str:
