@@ -1,6 +1,7 @@
 """Dry friction identified with the linear arm: the response behind it, and what it makes of it."""
 
 from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, refuse_unrecorded
+from ident.friction.arm import FrictionLaw
 from ident.friction.fit import FrictionFit, fit_friction
 from ident.friction.observable import refuse_unseen_shaft
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
@@ -9,6 +10,7 @@ __all__ = [
     "BehindFriction",
     "EquivalentFriction",
     "FrictionFit",
+    "FrictionLaw",
     "at_amplitudes",
     "equivalent_friction",
     "fit_friction",

@@ -216,7 +216,7 @@ def _at_amplitude(
         """(R, F) friction over input, line by line in steady state."""
         ratios = np.empty((_REALISATIONS, lines.size), dtype=np.complex128)
         for row, u in zip(ratios, inputs, strict=True):
-            force = arm.run(friction.coefficients, u, level, friction.presliding)[1]
+            force = arm.run(friction.coefficients, u, replace(friction.law, level=level))[1]
             row[:] = np.fft.rfft(force[-period:])[lines] / np.fft.rfft(u[-period:])[lines]
         return ratios
 

@@ -1,4 +1,4 @@
-"""A linear arm on given poles, stepped between the samples with dry friction at its shaft."""
+"""Dry friction, and a linear arm on given poles stepped between the samples with it at its shaft."""
 
 from __future__ import annotations
 
@@ -16,6 +16,39 @@ from ident.friction.kernel import step_through
 
 # A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped.
 FASTEST_POLE = 2e-3
+
+
+# Ten microradians: what a stiff bearing or gear deflects before it slips.
+PRESLIDING = 1e-5
+
+
+@dataclass(frozen=True)
+class FrictionLaw:
+    """Dry friction at a shaft: level + excess exp(-|speed| / fall) while it slips.
+
+    level: Coulomb friction in units of the arm's input. presliding: deflection before slipping, in units of
+    the position. excess: how much more it takes to break away (Stribeck), which is gone at speeds, in units
+    of the position per second, well above fall. Raises ValueError for what no friction has.
+    """
+
+    level: float
+    presliding: float = PRESLIDING
+    excess: float = 0.0
+    fall: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not (self.level >= 0 and self.presliding > 0 and self.breakaway >= 0 and self.fall > 0):
+            raise ValueError(f"no dry friction is like {self}")
+
+    @property
+    def breakaway(self) -> float:
+        """What it takes to move from rest."""
+        return self.level + self.excess
+
+    @property
+    def array(self) -> RealArray:
+        """(4,) for the kernel."""
+        return np.array([self.level, self.presliding, self.excess, self.fall])
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +104,9 @@ class SteppedArm:
         return cls(poles, structure, dt_s, rates, chain, weights)
 
     def run(
-        self, coefficients: RealArray, voltage: RealArray, level: float, presliding: float
+        self, coefficients: RealArray, voltage: RealArray, law: FrictionLaw
     ) -> tuple[RealArray, RealArray]:
-        """Position (T,) and mean friction per sample (T,), in units of the input (T,), from rest."""
+        """Position (T,) and friction held over each sample (T,), in units of the input (T,), from rest."""
         weights = self.weights @ coefficients
         position, friction = np.empty(voltage.size), np.empty(voltage.size)
         step_through(
@@ -82,8 +115,7 @@ class SteppedArm:
             self.chain,
             weights,
             self.dt_s,
-            level,
-            presliding,
+            law.array,
             position,
             friction,
         )

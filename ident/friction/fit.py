@@ -1,15 +1,18 @@
-"""Coulomb friction and the linear arm behind it from records of the shaft's own position.
+"""Dry friction and the linear arm behind it from records of the shaft's own position.
 
 Friction acts where the motor's torque does, so that the position is G (u - f) with f set by the motion itself
 (Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30(7), 1994). Given the arm, the motion under
-friction is simulated between the samples, and everything is one least-squares problem in the level of the
+friction is simulated between the samples, and everything is one least-squares problem in the law of the
 friction and the coefficients of the arm on its poles, each taken twice: Gauss-Newton steps from derivatives
 of the simulation, in which a change of the arm also changes the friction. The poles come from the search of
 `ident.identify` on the records with the friction taken off their input; both are repeated until the residual
-no longer falls.
+no longer falls. Friction that falls with speed (Stribeck) is tried afterwards, and stays where it lowers the
+residual by more than an order criterion asks for. Viscous friction is part of the arm and its poles.
 
-Neglected: a level that depends on speed, position or load; the deflection before slipping is taken as known;
-records start at rest.
+The level need not be the same in every record: how much it differs is estimated from the records, and never
+taken to be less than a thousandth.
+
+Neglected: a level that depends on position or load; records start at rest.
 """
 
 from __future__ import annotations
@@ -28,12 +31,16 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.friction.arm import SteppedArm, less_friction
+from ident.friction.arm import PRESLIDING, FrictionLaw, SteppedArm, less_friction
 from ident.identify import untested_model
 from ident.uncertainty.embedding_algebra import triangle_of
 
-# Ten microradians: what a stiff bearing or gear deflects before it slips.
-PRESLIDING = 1e-5
+# Standard deviation of the logarithm of the pre-sliding deflection before records speak of it.
+STD_PRESLIDING = 1.5
+# How well a joint's friction repeats from record to record at best, as a share of its level.
+_REPEATS = 1e-3
+# Speeds over which friction may fall, in units of the rms speed, and the first guess of what it falls by.
+_FALLS, _EXCESS = (0.03, 0.1, 0.3), 0.1
 # The start takes the sign of the measured speed, smoothed below this share of the Nyquist frequency; speeds
 # below a fiftieth of the usual one count as part of the turn.
 _SMOOTHING, _SLOW = 0.15, 0.02
@@ -43,29 +50,43 @@ _LENGTHS = (1.0, 0.5, 0.25, 0.1)
 # A residual sum of squares that falls by less than this many noise variances is at its end.
 _WORTH = 0.5
 # Sizes of the changes that derivatives are taken from, relative to the motion and to the level.
-_CHANGE, _CHANGE_OF_LEVEL = 1e-3, 2e-3
+_CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG = 1e-3, 2e-3, 0.02
 
 Report = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionFit:
-    """A linear arm with Coulomb friction, fitted to records of its shaft's position.
+    """A linear arm with dry friction, fitted to records of its shaft's position.
 
-    level: Coulomb friction in units of the input (times the motor's torque per unit of input: N m), level_std
-    its standard deviation. model: the arm without friction, each pole once. arm, coefficients (P,): the same
-    on each pole taken twice, as they were fitted. covariance_factor (P+1, P+1): of (coefficients, level).
-    noise_std: of the residual, in output units. presliding: deflection before slipping, in output units.
+    law: in units of the input (times the motor's torque per unit of input: N m). model: the arm without
+    friction, each pole once. arm, coefficients (P,): the same on each pole taken twice, as they were fitted.
+    covariance_factor (P + Q, .): of the coefficients and the Q `parameters` of the law. noise_std: of the
+    residual, in output units. between: standard deviation of the level from record to record.
     """
 
-    level: float
-    level_std: float
+    law: FrictionLaw
     model: GobfModel
     arm: SteppedArm
     coefficients: RealArray
     covariance_factor: RealArray
     noise_std: float
-    presliding: float
+    between: float
+
+    @property
+    def level(self) -> float:
+        """Coulomb friction in units of the input."""
+        return self.law.level
+
+    @property
+    def level_std(self) -> float:
+        """Standard deviation of the level that the records have in common."""
+        return float(np.linalg.norm(self.covariance_factor[self.coefficients.size]))
+
+    def moved(self, change: RealArray) -> tuple[RealArray, FrictionLaw]:
+        """Coefficients and law after a change (P + Q,), no parameter below zero."""
+        n = self.coefficients.size
+        return self.coefficients + change[:n], _law_of(_parameters(self.law) + change[n:])
 
     @property
     def significant(self) -> bool:
@@ -74,7 +95,7 @@ class FrictionFit:
 
     def motion(self, record: Record) -> tuple[RealArray, RealArray]:
         """Simulated position (T,) and friction in units of the input (T,), mean of each sample."""
-        return self.arm.run(self.coefficients, record.input[:, 0], self.level, self.presliding)
+        return self.arm.run(self.coefficients, record.input[:, 0], self.law)
 
     def residual(self, record: Record) -> RealArray:
         """(T,) what the simulation leaves of the position, less its mean."""
@@ -88,39 +109,59 @@ class FrictionFit:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """The simulation of one record to first order in (coefficients, level).
+    """The simulation of one record to first order in the coefficients and the parameters of the law.
 
-    position, friction (T,) as simulated; by_coefficients (T, P), by_level (T,) derivatives of the position,
-    friction_by (T, P + 1) those of the friction.
+    position, friction (T,) as simulated; by_coefficients (T, P), by_law (T, Q) derivatives of the position,
+    friction_by (T, P + Q) those of the friction.
     """
 
     position: RealArray
     friction: RealArray
     by_coefficients: RealArray
-    by_level: RealArray
+    by_law: RealArray
     friction_by: RealArray
 
 
-def linearised(
-    arm: SteppedArm, coefficients: RealArray, level: float, presliding: float, u: RealArray
-) -> Linearised:
+def _parameters(law: FrictionLaw) -> RealArray:
+    """(Q,) level and logarithm of the pre-sliding deflection; with Stribeck friction its excess and the
+    logarithm of the speed that it falls over."""
+    plain = [law.level, np.log(law.presliding)]
+    return np.array([*plain, law.excess, np.log(law.fall)] if np.isfinite(law.fall) else plain)
+
+
+def _law_of(parameters: RealArray) -> FrictionLaw:
+    level, presliding, *falling = parameters.tolist()
+    law = FrictionLaw(max(level, 0.0), float(np.exp(presliding)))
+    return replace(law, excess=max(falling[0], 0.0), fall=float(np.exp(falling[1]))) if falling else law
+
+
+def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
     """Central differences of the simulation with input u (T,): the friction follows every change."""
-    position, friction = arm.run(coefficients, u, level, presliding)
+    position, friction = arm.run(coefficients, u, law)
     structure = arm.structure
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
     columns = regressor(arm.poles.doubled(), filter_input(effort, structure.integrators, 0))
     speed = float(np.std(np.diff(position)))
-    by, friction_by = np.empty_like(columns), np.empty((u.size, columns.shape[1] + 1))
+    parameters = _parameters(law)
+    by = np.empty((u.size, columns.shape[1] + parameters.size))
+    friction_by = np.empty_like(by)
     for j, column in enumerate(columns.T):
         size = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
         change = np.zeros(coefficients.size)
         change[j] = size
-        ends = [arm.run(coefficients + sign * change, u, level, presliding) for sign in (1, -1)]
+        ends = [arm.run(coefficients + sign * change, u, law) for sign in (1, -1)]
         by[:, j], friction_by[:, j] = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
-    size = _CHANGE_OF_LEVEL * level
-    ends = [arm.run(coefficients, u, level + sign * size, presliding) for sign in (1, -1)]
-    by_level, friction_by[:, -1] = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
-    return Linearised(position, friction, by, by_level, friction_by)
+    for k in range(parameters.size):
+        change = np.zeros(parameters.size)
+        # An excess has no size of its own before it is known, and cannot be negative.
+        change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * law.level
+        below = _law_of(parameters - change)
+        size += float((parameters - _parameters(below))[k])
+        ends = [arm.run(coefficients, u, one) for one in (_law_of(parameters + change), below)]
+        j = columns.shape[1] + k
+        by[:, j], friction_by[:, j] = ((a - b) / size for a, b in zip(*ends, strict=True))
+    n = columns.shape[1]
+    return Linearised(position, friction, by[:, :n], by[:, n:], friction_by)
 
 
 def fit_friction(
@@ -130,11 +171,11 @@ def fit_friction(
     presliding: float = PRESLIDING,
     progress: Report | None = None,
 ) -> FrictionFit:
-    """Level of the Coulomb friction and the arm behind it.
+    """Law of the friction and the arm behind it.
 
     records: one input, and the position of the shaft that the friction acts on as the one output; at rest at
-    their first sample. options: of the search for the arm's poles; integrators at most 1. presliding in
-    output units.
+    their first sample. options: of the search for the arm's poles; integrators at most 1. presliding: what is
+    expected, in output units, within a factor of twenty.
 
     Raises ValueError where the shaft does not move, there is more than one integrator or a direct term, or
     `identify` refuses the records.
@@ -151,20 +192,24 @@ def fit_friction(
     best: FrictionFit | None = None
     for search in range(_MOST_SEARCHES):
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
-        found = _descended(records, model, structure, max(level, least), presliding, least)
+        law = FrictionLaw(max(level, least), presliding) if best is None else best.law
+        found = _descended(records, model, structure, law, presliding, least)
         if best is not None and not _rss(found, records) < _rss(best, records) - _WORTH * found.noise_std**2:
             break
-        best, level = found, found.level
+        best = found
         # The poles may have been led astray by friction that was not yet right: search for them again.
         model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
+    if best.significant:
+        best = _with_stribeck(best, records, presliding, least)
     report(1.0, "friction identified")
     return best
 
 
 def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:
     """The same fit on the poles of another model of the arm, near those it was made with."""
-    return _descended(records, model, found.arm.structure, found.level, found.presliding, 0.1 * found.level)
+    structure = found.arm.structure
+    return _descended(records, model, structure, found.law, found.law.presliding, 0.1 * found.level)
 
 
 def _rss(found: FrictionFit, records: Sequence[Record]) -> float:
@@ -193,20 +238,56 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
             np.column_stack([_basis(model.poles.doubled(), record, options), -undelayed.simulate(sign)])
             for record, sign in zip(less, signs, strict=True)
         ]
+        targets, nothing = [r.output[:, 0] for r in less], np.zeros((0, blocks[0].shape[1] + 1))
         before, level = (
             level,
-            max(level + float(_least_squares(blocks, [r.output[:, 0] for r in less])[0][-1]), 0.0),
+            max(level + float(_least_squares(blocks, targets, nothing)[0][-1]), 0.0),
         )
         if abs(level - before) < 0.02 * level:
             break
     return level, model
 
 
+def _with_stribeck(
+    found: FrictionFit, records: Sequence[Record], presliding: float, least: float
+) -> FrictionFit:
+    """The same with friction that falls with speed, where that is worth its two parameters."""
+    speed = float(np.sqrt(np.mean([np.mean(np.diff(r.output[:, 0]) ** 2) for r in records]))) / found.arm.dt_s
+    blocks, targets = _equations(found, records)
+    nothing = np.zeros((0, blocks[0].shape[1] + 2))
+
+    def left(law: FrictionLaw) -> float:
+        """What the fit would leave to first order in an excess of this law."""
+        columns = [
+            (found.arm.run(found.coefficients, r.input[:, 0], law)[0] - found.motion(r)[0]) for r in records
+        ]
+        more = [np.column_stack(pair) for pair in zip(blocks, columns, strict=True)]
+        return _least_squares(more, targets, nothing)[3]
+
+    laws = [FrictionLaw(found.level, presliding, _EXCESS * found.level, share * speed) for share in _FALLS]
+    rests = [left(law) for law in laws]
+    k, rss = int(np.argmin(rests)), _rss(found, records)
+    worth = 2 * np.log(sum(record.n_samples for record in records)) * found.noise_std**2
+    if rests[k] > rss - worth:
+        return found
+    tried = _descended(records, found.model, found.arm.structure, laws[k], presliding, least)
+    return tried if _rss(tried, records) < rss - worth else found
+
+
+def _equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
+    """Of every record the derivatives (T, P + Q) of the simulated position, and what it leaves (T,)."""
+    local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
+    return (
+        [np.column_stack([part.by_coefficients, part.by_law]) for part in local],
+        [record.output[:, 0] - part.position for record, part in zip(records, local, strict=True)],
+    )
+
+
 def _descended(
     records: Sequence[Record],
     model: GobfModel,
     structure: Structure,
-    level: float,
+    law: FrictionLaw,
     presliding: float,
     least: float,
 ) -> FrictionFit:
@@ -214,34 +295,65 @@ def _descended(
     arm = SteppedArm.of(model.poles, structure, model.dt_s)
     coefficients = _on_doubled(arm.poles, model)
     n = sum(record.n_samples for record in records)
-    for _ in range(_LOCAL_STEPS):
-        local = [linearised(arm, coefficients, level, presliding, record.input[:, 0]) for record in records]
-        blocks = [np.column_stack([part.by_coefficients, part.by_level]) for part in local]
-        change, triangle, rss, rest = _least_squares(
-            blocks, [record.output[:, 0] - part.position for record, part in zip(records, local, strict=True)]
-        )
-        scale = np.linalg.norm(triangle, axis=0)
-        # The covariance is that of the noise, not of a residual that another step would still lower.
-        factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
-        found = FrictionFit(
-            level=level,
-            level_std=float(np.linalg.norm(factor[-1])),
-            model=model,
-            arm=arm,
-            coefficients=coefficients,
-            covariance_factor=factor,
-            noise_std=float(np.sqrt(rss / n)),
-            presliding=presliding,
-        )
-        for length in _LENGTHS:
-            coefficients = found.coefficients + length * change[:-1]
-            level = float(np.clip(found.level + length * change[-1], max(0.6 * found.level, least), None))
-            there = replace(found, coefficients=coefficients, level=level)
-            if _simulated_rss(there, records) < rss - _WORTH * found.noise_std**2:
+    p, q = coefficients.size, _parameters(law).size
+    found = FrictionFit(law, model, arm, coefficients, np.zeros((p + q, 1)), 0.0, 0.0)
+    noise = np.sqrt(_simulated_rss(found, records) / n)
+    for left in reversed(range(_LOCAL_STEPS)):
+        blocks, targets = _equations(found, records)
+        # What is expected of the pre-sliding deflection is one more measurement, of its logarithm.
+        known = np.zeros((1, p + q + 1))
+        known[0, p + 1], known[0, -1] = 1.0, np.log(presliding / found.law.presliding)
+        change, _, rss, rest = _least_squares(blocks, targets, known * noise / STD_PRESLIDING)
+        noise = np.sqrt(rest / n)
+        for length in _LENGTHS if left else ():
+            step = length * change
+            step[p] = max(step[p], max(0.6 * found.level, least) - found.level)
+            step[p + 1 :: 2] = np.clip(step[p + 1 :: 2], -1, 1)
+            coefficients, law = found.moved(step)
+            there = replace(found, coefficients=coefficients, law=law)
+            off = np.log(law.presliding / presliding) / STD_PRESLIDING
+            if _simulated_rss(there, records) + (noise * off) ** 2 < rss - _WORTH * noise**2:
+                found = there
                 break
         else:
             break
-    return found
+    between = _between_records(blocks, targets, p, _REPEATS * found.level)
+    own = [np.outer(between * block[:, p], np.arange(len(records)) == k) for k, block in enumerate(blocks)]
+    known = noise * np.eye(1 + len(records), p + q + 1 + len(records), p + q - 1)
+    known[0] = 0.0
+    known[0, p + 1] = noise / STD_PRESLIDING
+    _, triangle, rss, rest = _least_squares(
+        [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
+    )
+    scale = np.linalg.norm(triangle, axis=0)
+    # The covariance is that of the noise, not of a residual that another step would still lower.
+    factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
+    factor = np.asarray(np.linalg.qr(factor[: p + q].T, mode="r")).T
+    return replace(found, covariance_factor=factor, noise_std=float(np.sqrt(rss / n)), between=between)
+
+
+def _between_records(
+    blocks: Sequence[RealArray], targets: Sequence[RealArray], p: int, least: float
+) -> float:
+    """Standard deviation of the level (column p) from record to record, not below least (DerSimonian and
+    Laird, Controlled Clinical Trials 7, 1986)."""
+    count = len(blocks)
+    if count == 1:
+        return least
+    own = [
+        np.hstack([np.delete(block, p, axis=1), np.outer(block[:, p], np.arange(count) == k)])
+        for k, block in enumerate(blocks)
+    ]
+    n = sum(target.size for target in targets)
+    change, triangle, _, rest = _least_squares(own, targets, np.zeros((0, own[0].shape[1] + 1)))
+    scale = np.linalg.norm(triangle, axis=0)
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv(triangle / scale)[-count:] / scale[-count:, None]
+    weight = n / rest / np.sum(inverse**2, axis=1)
+    levels = change[-count:]
+    spread = float(np.sum(weight * (levels - np.average(levels, weights=weight)) ** 2))
+    excess = (spread - (count - 1)) / (weight.sum() - np.sum(weight**2) / weight.sum())
+    return float(np.sqrt(max(excess, least**2)))
 
 
 def _simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
@@ -250,13 +362,13 @@ def _simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
 
 
 def _least_squares(
-    blocks: Sequence[RealArray], targets: Sequence[RealArray]
+    blocks: Sequence[RealArray], targets: Sequence[RealArray], known: RealArray
 ) -> tuple[RealArray, RealArray, float, float]:
-    """Solution of the stacked rows, each record less its mean; the triangle R, the sum of squares of the
-    targets and what the solution leaves of it.
+    """Solution of the stacked rows, each record less its mean, and of known (., P + 1), rows and target, as
+    they are; the triangle R, the sum of squares of the targets and what the solution leaves of it.
     """
-    a = np.vstack([block - block.mean(axis=0) for block in blocks])
-    b = np.concatenate([target - target.mean() for target in targets])
+    a = np.vstack([*(block - block.mean(axis=0) for block in blocks), known[:, :-1]])
+    b = np.concatenate([*(target - target.mean() for target in targets), known[:, -1]])
     length = np.linalg.norm(a, axis=0)
     length[length == 0] = 1.0
     triangle = triangle_of(np.column_stack([a / length, b]))

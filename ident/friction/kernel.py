@@ -4,12 +4,13 @@ The arm is a sum of states: a state j with rate s_j (1/s) obeys x' = s_j x + e, 
 x' = s_j x + x_before with x_before the state before it (a pole taken twice); e = drive - friction, and the
 position is the real part of sum weights_j x_j.
 
-Friction is an elastic element whose force is limited to `level`: it deflects by `presliding` before it slips.
-Its mean force over a step follows from the deflection in the middle of the step (implicit, so that a stiff
-element needs no shorter step). A sample has 32 steps: the friction turns round within a few hundred
-microseconds where the pre-sliding is ten microradians, and at 32 steps of 5 ms the position is right to a
-hundredth of a milliradian. Half a sample over which the shaft slips on in one direction is taken at once: the
-force is constant there.
+Friction is an elastic element whose force is limited: at standstill to level + excess, after a deflection by
+`presliding`; at speed v to level + excess exp(-|v| / fall) (Stribeck), the limit of a step being that of the
+speed before it. law is the array (level, presliding, excess, fall). The mean force over a step follows from
+the deflection in the middle of the step (implicit, so that a stiff element needs no shorter step). A sample
+has 32 steps: the friction turns round within a few hundred microseconds where the pre-sliding is ten
+microradians, and at 32 steps of 5 ms the position is right to a hundredth of a milliradian. Half a sample
+over which the shaft slips on in one direction is taken at once, where the force is constant.
 
 A force that changes within a sample is more than its mean to whoever sees it through another output: the
 friction is told as the held force that moves a slow arm just as far. With M the first moment of the force
@@ -26,6 +27,7 @@ import numpy as np
 
 _STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
 _ALL = _STRIDES * _STEPS
+_OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -53,18 +55,17 @@ def transitions(rates: Any, chain: Any, dt_s: float) -> Any:
 def advance(
     drive: float,
     state: Any,
-    shaft: float,
-    deflection: float,
+    shaft: Any,
     moves: Any,
     rates: Any,
     chain: Any,
     weights: Any,
-    level: float,
-    presliding: float,
+    dt_s: float,
+    law: Any,
 ) -> Any:
-    """One sample: position, deflection of the friction, mean and first moment (in samples) of its force.
+    """One sample: mean and first moment (in samples) of the friction.
 
-    state (N,) is changed in place.
+    state (N,) and shaft (3,), its position, deflection and speed, are changed in place.
     """
     n = rates.size
     tried = np.empty(n, dtype=np.complex128)
@@ -74,9 +75,15 @@ def advance(
     for j in range(n):
         gain += (weights[j] * onto[j]).real
     gain = max(gain, _TINY)
-    stiffness, total, moment = level / presliding, 0.0, 0.0
+    level, presliding, excess, fall = law[0], law[1], law[2], law[3]
+    position, deflection, speed = shaft[0], shaft[1], shaft[2]
+    breakaway = max(level + excess, _TINY)
+    stiffness, limit, step_s = breakaway / presliding, level, dt_s / _ALL
+    most = presliding * max(limit, _TINY) / breakaway
+    total, moment = 0.0, 0.0
     for stride in range(_STRIDES):
-        if abs(deflection) == presliding:
+        constant = excess == 0 or abs(speed) > _OVER * fall
+        if constant and abs(deflection) >= presliding * max(level, _TINY) / breakaway:
             force = level if deflection > 0 else -level
             new, speed = 0.0, 0.0
             for j in range(n):
@@ -86,29 +93,39 @@ def advance(
                     tried[j] += moves[1, 2, j] * state[j - 1]
                 new += (weights[j] * tried[j]).real
                 speed += (weights[j] * (rates[j] * tried[j] + pushed)).real
-            if (new - shaft) * deflection > 0 and speed * deflection > 0:
+            still = excess == 0 or abs(speed) > _OVER * fall
+            if (new - position) * deflection > 0 and speed * deflection > 0 and still:
                 state[:] = tried
-                shaft = new
+                position = new
                 total += _STEPS * force
                 moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * _ALL)
                 continue
+            speed = 0.0
+            for j in range(n):
+                pushed = state[j - 1] if chain[j] else drive - force + 0j
+                speed += (weights[j] * (rates[j] * state[j] + pushed)).real
         for step in range(_STEPS):
+            if excess != 0:
+                limit = max(level + excess * np.exp(-abs(speed) / fall), 0.0)
+                most = presliding * max(limit, _TINY) / breakaway
             free = gain * drive
             for j in range(n - 1, -1, -1):
                 state[j] *= decay[j]
                 if chain[j]:
                     state[j] += carried[j] * state[j - 1]
                 free += (weights[j] * state[j]).real
-            force = stiffness * (deflection + 0.5 * (free - shaft)) / (1 + 0.5 * stiffness * gain)
-            force = min(max(force, -level), level)
+            force = stiffness * (deflection + 0.5 * (free - position)) / (1 + 0.5 * stiffness * gain)
+            force = min(max(force, -limit), limit)
             total += force
             moment += force * (_STEPS * stride + step + 0.5 - 0.5 * _ALL)
             new = free - gain * force
-            deflection = min(max(deflection + new - shaft, -presliding), presliding)
-            shaft = new
+            deflection = min(max(deflection + new - position, -most), most)
+            speed = (new - position) / step_s
+            position = new
             for j in range(n):
                 state[j] += onto[j] * (drive - force)
-    return shaft, deflection, total / _ALL, moment / _ALL**2
+    shaft[0], shaft[1], shaft[2] = position, deflection, speed
+    return total / _ALL, moment / _ALL**2
 
 
 @numba.njit(cache=True)
@@ -118,19 +135,16 @@ def step_through(
     chain: Any,
     weights: Any,
     dt_s: float,
-    level: float,
-    presliding: float,
+    law: Any,
     position: Any,
     friction: Any,
 ) -> None:
     """Fill position (T,) and the friction (T,), held over every sample, for a drive (T,) held over each."""
     moments = np.empty(drive.size)
     moves = transitions(rates, chain, dt_s)
-    state, deflection, shaft = np.zeros(rates.size, dtype=np.complex128), 0.0, 0.0
+    state, shaft = np.zeros(rates.size, dtype=np.complex128), np.zeros(3)
     for k in range(drive.size):
-        position[k] = shaft
-        shaft, deflection, friction[k], moments[k] = advance(
-            drive[k], state, shaft, deflection, moves, rates, chain, weights, level, presliding
-        )
+        position[k] = shaft[0]
+        friction[k], moments[k] = advance(drive[k], state, shaft, moves, rates, chain, weights, dt_s, law)
     for k in range(1, drive.size - 1):
         friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])

@@ -29,8 +29,7 @@ def loop_through(
     chain: Any,
     weights: Any,
     dt_s: float,
-    level: float,
-    presliding: float,
+    law_of_friction: Any,
     measured: Any,
     command: Any,
     limited: Any,
@@ -47,10 +46,10 @@ def loop_through(
     order = law.shape[0] - 1
     moves = transitions(rates, chain, dt_s)
     state, x, later = np.zeros(rates.size, dtype=np.complex128), np.zeros(order), np.zeros(order)
-    deflection, shaft, last = 0.0, 0.0, 0.0
+    shaft, last = np.zeros(3), 0.0
     queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
     for k in range(reference.size):
-        y = shaft + noise[k]
+        y = shaft[0] + noise[k]
         if steps[0] > 0:
             y = steps[0] * np.round(y / steps[0])
         error = reference[k] - y
@@ -72,6 +71,4 @@ def loop_through(
         measured[k], command[k], limited[k] = y, u, last != wanted
         waiting[k % (input_delay + 1)] = u
         applied = waiting[(k + 1) % (input_delay + 1)]
-        shaft, deflection, _, _ = advance(
-            applied, state, shaft, deflection, moves, rates, chain, weights, level, presliding
-        )
+        advance(applied, state, shaft, moves, rates, chain, weights, dt_s, law_of_friction)

@@ -17,7 +17,7 @@ from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
-from ident.friction.fit import FrictionFit, linearised, moved_to
+from ident.friction.fit import STD_PRESLIDING, FrictionFit, linearised, moved_to
 from ident.uncertainty.embedding import EmbeddingOptions, tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
@@ -53,14 +53,20 @@ def without_friction(
     if model is not None:
         found = moved_to(found, records, model)
     corrected, beside = [], []
-    for record in records:
-        local = linearised(found.arm, found.coefficients, found.level, found.presliding, record.input[:, 0])
+    for k, record in enumerate(records):
+        local = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
         # To first order y = y0 + D (c - c0) + d (level - level0): rows for the coefficients c themselves.
         target = record.output[:, 0] - local.position + local.by_coefficients @ found.coefficients
         less = less_friction(record, local.friction, found.arm.structure.input_delay_samples)
         corrected.append(replace(less, output=target[:, None]))
-        beside.append(Beside(local.by_coefficients, local.by_level[:, None]))
-    response, change, factor = tangent_beside(corrected, found.model, beside, options)
+        # Known beforehand, to one: the logarithm of the deflection, and how far this record's level is off.
+        level, deflection, *falling = local.by_law.T
+        own = np.outer(found.between * level, np.arange(len(records)) == k)
+        columns = np.column_stack([level, *falling, STD_PRESLIDING * deflection, own])
+        beside.append(Beside(local.by_coefficients, columns))
+    response, change, factor = tangent_beside(
+        corrected, found.model, beside, options, n_known=1 + len(records)
+    )
     return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
 
 
@@ -76,21 +82,24 @@ def other_output_without_friction(
     fit to the shaft's position; what is not known about it is what that fit does not know.
     """
     undelayed = replace(model, input_delay_samples=0)
-    less, beside = [], []
-    for record in records:
-        local = linearised(found.arm, found.coefficients, found.level, found.presliding, record.input[:, 0])
+    less, beside, n = list[Record](), list[Beside](), found.coefficients.size
+    for k, record in enumerate(records):
+        local = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
         less.append(less_friction(record, local.friction, found.arm.structure.input_delay_samples))
         columns = -local.friction_by @ found.covariance_factor
+        columns = np.column_stack([columns, -found.between * local.friction_by[:, n]])
         driven = np.column_stack([undelayed.simulate(column) for column in columns.T])
-        beside.append(Beside(np.zeros((record.n_samples, 0)), driven))
-    response, mean, factor = tangent_beside(less, model, beside, options, known_to_one=True)
+        own = np.outer(driven[:, -1], np.arange(len(records)) == k)
+        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([driven[:, :-1], own])))
+    shared = found.covariance_factor.shape[1]
+    response, mean, factor = tangent_beside(less, model, beside, options, n_known=shared + len(records))
+    moved, spread = (found.covariance_factor @ part[:shared] for part in (mean, factor))
     shaft = ResponsePosterior(
         found.arm.poles.doubled(),
-        found.coefficients + found.covariance_factor[:-1] @ mean,
-        found.covariance_factor[:-1] @ factor,
+        found.coefficients + moved[:n],
+        spread[:n],
         model.dt_s,
         integrators=found.arm.structure.integrators,
         input_delay_samples=found.arm.structure.input_delay_samples,
     )
-    level = found.level + float(found.covariance_factor[-1] @ mean)
-    return BehindFriction(response, shaft, level, found.covariance_factor[-1] @ factor, found)
+    return BehindFriction(response, shaft, found.level + float(moved[n]), spread[n], found)

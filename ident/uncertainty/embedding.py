@@ -129,13 +129,13 @@ def tangent_beside(
     beside: Sequence[Beside],
     options: EmbeddingOptions | None = None,
     *,
-    known_to_one: bool = False,
+    n_known: int = 0,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
     """The tangent posterior with q columns beside the basis functions, in every record, and their
     coefficients: mean (q,) and factor (q, P') on the same unit normals as the response's covariance_factor.
 
-    The coefficients are estimated freely or (known_to_one) as independent unknowns of zero mean and unit
-    variance. Arguments and errors otherwise as `tangent`.
+    The coefficients are estimated freely, the last n_known of them as independent unknowns of zero mean and
+    unit variance. Arguments and errors otherwise as `tangent`.
     """
     return _embed(
         records,
@@ -144,7 +144,7 @@ def tangent_beside(
         options or EmbeddingOptions(),
         classical_recipe=False,
         beside=beside,
-        known_to_one=known_to_one,
+        n_known=n_known,
     )
 
 
@@ -183,10 +183,10 @@ def _embed(
     *,
     classical_recipe: bool,
     beside: Sequence[Beside] = (),
-    known_to_one: bool = False,
+    n_known: int = 0,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
-    rows = replace(_rows(records, model, poles, options), beside=tuple(beside))
-    if known_to_one:
+    rows = replace(_rows(records, model, poles, options), beside=tuple(beside), n_known=n_known)
+    if n_known:
         rows = replace(rows, known_std=_noise_std(rows))
     solve = _solve_classical if classical_recipe else _solve
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
@@ -197,7 +197,7 @@ def _embed(
             residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
             whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
             behind = solved.rows.with_whitening(whitening)
-            solved = solve(replace(behind, known_std=_noise_std(behind)) if known_to_one else behind, options)
+            solved = solve(replace(behind, known_std=_noise_std(behind)) if n_known else behind, options)
     poles = solved.rows.poles
     reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
     if missed is not None and missed.poles.size:

@@ -51,8 +51,9 @@ class EmbeddingRows:
     """How to make the matrices; made anew for each pass, so that only one record's are in memory.
 
     poles are those of the regressors (doubled for the tangent method), fir_length that of the kernel,
-    whitening the coefficients of A(q), [1] for white noise. beside: one per record, or none; known_std, where
-    their columns have coefficients known to one: standard deviation of the (whitened) noise, as far as known.
+    whitening the coefficients of A(q), [1] for white noise. beside: one per record, or none, of whose columns
+    the last n_known have coefficients known to one; known_std: standard deviation of the (whitened) noise, as
+    far as known.
     """
 
     records: tuple[Record, ...]
@@ -61,6 +62,7 @@ class EmbeddingRows:
     fir_length: int
     whitening: RealArray
     beside: tuple[Beside, ...] = ()
+    n_known: int = 0
     known_std: float | None = None
 
     @property
@@ -92,8 +94,8 @@ class EmbeddingRows:
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel[used], rows.output[used])
         if self.known_std is not None:
             # What is known of the shared coefficients: as many measurements of them, each off by one.
-            q = self.n_beside
-            known = np.zeros((q, self.poles.order + int(self.structure.feedthrough) + q))
+            q = self.n_known
+            known = np.zeros((q, self.poles.order + int(self.structure.feedthrough) + self.n_beside))
             known[:, -q:] = self.known_std * np.eye(q)
             yield RegressionBlock(np.zeros((q, 0)), known, np.zeros((q, self.fir_length)), np.zeros(q))
 

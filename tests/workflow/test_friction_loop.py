@@ -11,7 +11,7 @@ from control_design import Controller, simulate
 from control_design.analysis.closed_loop import measure_sensitivity
 from control_design.controllers.feedforward import FrictionFeedforward
 from ident import GobfModel, IdentOptions, Poles, Record, Structure
-from ident.friction import FrictionFit, fit_friction
+from ident.friction import FrictionFit, FrictionLaw, fit_friction
 from ident.friction.arm import SteppedArm
 from plant import SampledArm, parse_effect
 from plant.presets import paper_link
@@ -34,9 +34,9 @@ def fit(level: float = 0.04, level_std: float = 0.0) -> FrictionFit:
     wanted = GobfModel(POLES, model.coefficients, DT_S).frequency_response(np.angle(z) / DT_S)
     stacked = np.vstack([rows.real, rows.imag]), np.append(wanted.real, wanted.imag)
     coefficients = np.linalg.lstsq(*stacked, rcond=None)[0]
-    factor = np.zeros((7, 7))
-    factor[-1, -1] = level_std
-    return FrictionFit(level, level_std, model, arm, coefficients, factor, 1e-3, 1e-5)
+    factor = np.zeros((8, 8))
+    factor[6, 6] = level_std
+    return FrictionFit(FrictionLaw(level), model, arm, coefficients, factor, 1e-3, 0.0)
 
 
 def controller(**fields) -> Controller:
@@ -51,7 +51,9 @@ def test_without_friction_it_is_the_linear_loop():
     """|S| on the lines is 1 / (1 + G K), to what the doubled poles span (a few parts in a million)."""
     found = replace(fit(), noise_std=0.0)
     rng = np.random.default_rng(1)
-    seen = FrictionLoop(controller(), found, found.coefficients, 0.0).sensitivity(rng, rng, **EXCITATION)
+    seen = FrictionLoop(controller(), found, found.coefficients, FrictionLaw(0.0)).sensitivity(
+        rng, rng, **EXCITATION
+    )
     omega = seen.omega_rad_s
     expected = 1 / (1 + found.model.frequency_response(omega) * controller().response(omega))
     np.testing.assert_allclose(seen.response, expected, rtol=0, atol=2e-5)
@@ -79,7 +81,9 @@ def test_sticking_grows_with_the_level_and_needs_friction():
 
 
 def test_draws_spread_as_the_level_is_known():
-    levels = [loop.level for loop in drawn(controller(), fit(0.04, 0.002), np.random.default_rng(2), 400)]
+    levels = [
+        loop.friction.level for loop in drawn(controller(), fit(0.04, 0.002), np.random.default_rng(2), 400)
+    ]
     assert np.mean(levels) == pytest.approx(0.04, abs=4 * 0.002 / 20)
     assert np.std(levels) == pytest.approx(0.002, rel=0.15)
 
@@ -146,9 +150,12 @@ def test_feedforward_is_as_late_as_the_loop_follows_a_ramp():
     """Velocity error of a type-1 loop: behind a ramp by its speed over Kv, that is, late by 1 / Kv."""
     found = replace(fit(), noise_std=0.0)
     ramp = 0.1 * np.arange(4000) * DT_S
-    behind = ramp[-1] - FrictionLoop(controller(), found, found.coefficients, 0.0).run(ramp).measured[-1]
+    behind = (
+        ramp[-1]
+        - FrictionLoop(controller(), found, found.coefficients, FrictionLaw(0.0)).run(ramp).measured[-1]
+    )
     given = friction_feedforward(controller(), found)
-    assert (given.level, given.width) == (found.level, found.presliding)
+    assert (given.level, given.width) == (found.level, found.law.presliding)
     assert given.lag_s == pytest.approx(behind / 0.1, rel=1e-3)
 
 
@@ -170,10 +177,10 @@ def test_predicted_response_is_that_of_the_nonlinear_arm():
     excitation = EXCITATION | {"rms": 0.02}
     truth = measure_sensitivity(law, arm, np.random.default_rng(5), **excitation).response
     seen, linear = (
-        FrictionLoop(law, found, found.coefficients, level)
+        FrictionLoop(law, found, found.coefficients, friction)
         .sensitivity(np.random.default_rng(5), rng, **excitation)
         .response
-        for level in (found.level, 0.0)
+        for friction in (found.law, FrictionLaw(0.0))
     )
     away, linear_away = (np.sqrt(np.mean(np.abs(one - truth) ** 2)) for one in (seen, linear))
     assert linear_away > 0.05

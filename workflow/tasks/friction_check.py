@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from control_design.analysis.closed_loop import simulate
 from control_design.controllers.controller import Controller
-from ident.friction import FrictionFit
+from ident.friction import FrictionFit, FrictionLaw
 from workflow.tasks.friction_loop import (
     FrictionLoop,
     Interval,
@@ -73,7 +73,7 @@ def check_friction(
     return FrictionCheck(
         level=found.level,
         level_interval=_around(found.level, found),
-        presliding=found.presliding,
+        presliding=found.law.presliding,
         sizes=sizes,
         low=low,
         high=high,
@@ -129,7 +129,7 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
         else:
             run = FrictionLoop.of(law, found).run(reference, noise)
         errors.append((run.reference - run.measured)[period // 4 :])
-    linear = FrictionLoop(controller, found, found.coefficients, 0.0).run(reference)
+    linear = FrictionLoop(controller, found, found.coefficients, FrictionLaw(0.0)).run(reference)
     rest = (linear.reference - linear.measured)[period // 4 :]
     return SlowSine(
         amplitude=amplitude,

@@ -15,7 +15,7 @@ from scipy.stats import t as student
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, MeasuredSensitivity, sensitivity_of
 from control_design.controllers.controller import Controller
 from control_design.controllers.feedforward import FrictionFeedforward
-from ident.friction import FrictionFit
+from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.loop import loop_through
 
 Real = npt.NDArray[np.float64]
@@ -29,21 +29,21 @@ _SHARE, _APART = 0.01, 10.0
 class FrictionLoop:
     """A controller, with its limits and feed-forward, around one arm of a fit.
 
-    coefficients (P,) and level: of the arm and its friction; the steps as of
+    coefficients (P,) and friction: of the arm; the steps as of
     `control_design.analysis.closed_loop.simulate`. Neglected: limits other than the controller's own.
     """
 
     controller: Controller
     found: FrictionFit
     coefficients: Real
-    level: float
+    friction: FrictionLaw
     measurement_step: float = 0.0
     command_step: float = 0.0
 
     @classmethod
     def of(cls, controller: Controller, found: FrictionFit, **steps: float) -> FrictionLoop:
         """On the arm as it was fitted."""
-        return cls(controller, found, found.coefficients, found.level, **steps)
+        return cls(controller, found, found.coefficients, found.law, **steps)
 
     def run(self, reference: Real, noise: np.random.Generator | None = None) -> ClosedLoopTrajectory:
         """From rest, reference (T,); noise: white, of the size of the fit's residual (sensor and encoder)."""
@@ -63,8 +63,7 @@ class FrictionLoop:
             arm.chain,
             arm.weights @ self.coefficients,
             arm.dt_s,
-            self.level,
-            self.found.presliding,
+            self.friction.array,
             measured,
             command,
             limited,
@@ -93,14 +92,15 @@ class FrictionLoop:
 
         def sticks(size: float) -> bool:
             moved = self.run(np.full(samples, size)).measured
-            return bool(np.max(np.abs(moved)) <= self.found.presliding)
+            return bool(np.max(np.abs(moved)) <= self.friction.presliding)
 
         # While the shaft stands, the command is the controller's answer to a constant error.
         law = self.controller
         answer = control.step_response(law.to_control(), np.arange(samples) * law.dt_s).outputs
         reach = float(np.max(np.abs(answer)))
-        low, high = self.level / reach / _APART, self.level / reach * _APART
-        if not (self.level > 0 and sticks(low)):
+        size = self.friction.breakaway / reach
+        low, high = size / _APART, size * _APART
+        if not (size > 0 and sticks(low)):
             return 0.0
         while high > (1 + _SHARE) * low:
             middle = float(np.sqrt(low * high))
@@ -114,7 +114,7 @@ class FrictionLoop:
         # A millionth of the Nyquist frequency: there an integrator is as good as infinite.
         omega = np.array([1e-6 * np.pi / self.controller.dt_s])
         gain = self.controller.response(omega) + 1 / self.found.model.frequency_response(omega)
-        return self.level / float(np.abs(gain[0]))
+        return self.friction.breakaway / float(np.abs(gain[0]))
 
 
 def drawn(
@@ -123,9 +123,9 @@ def drawn(
     """Loops on arms drawn from the covariance of the fit."""
     loops = []
     for _ in range(draws):
-        moved = found.covariance_factor @ rng.standard_normal(found.covariance_factor.shape[1])
-        level = max(found.level + float(moved[-1]), 0.0)
-        loops.append(FrictionLoop(controller, found, found.coefficients + moved[:-1], level, **steps))
+        change = found.covariance_factor @ rng.standard_normal(found.covariance_factor.shape[1])
+        coefficients, friction = found.moved(change)
+        loops.append(FrictionLoop(controller, found, coefficients, friction, **steps))
     return loops
 
 
@@ -145,7 +145,7 @@ def friction_feedforward(controller: Controller, found: FrictionFit) -> Friction
     omega = np.array([1e-5 * np.pi / controller.dt_s])
     loop = controller.response(omega) * found.model.frequency_response(omega)
     delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
-    return FrictionFeedforward(found.level, found.presliding, max(delay_s, controller.dt_s))
+    return FrictionFeedforward(found.level, found.law.presliding, max(delay_s, controller.dt_s))
 
 
 def interval_of(values: Sequence[float], level: float = 0.95) -> Interval:
