@@ -13,7 +13,7 @@ from ident.data.distortion import BandLevel, Distortion
 from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.nonparametric import coherence
 from ident.data.record import Record
-from ident.data.repeats import AmplitudeBand, Repeats
+from ident.data.repeats import AmplitudeBand, Repeats, repeats_of
 
 # Distortion above this share of the response is told where it is; a linear design need not mind less.
 _WORTH_TELLING = 0.01
@@ -47,6 +47,12 @@ def distortion_findings(
     if found:
         told += [item for item in clipped(records) if item.values["signal"] == "output"]
     return told
+
+
+def amplitude_effects(records: Sequence[Record]) -> list[Finding]:
+    """What a linear model of records at several amplitudes is not: for those who look at no distortion."""
+    told = (item for each in repeats_of(records) for item in _of_repeats(each))
+    return [item for item in told if item.kind is FindingKind.AMPLITUDE_EFFECT]
 
 
 def _of_repeats(repeats: Repeats) -> list[Finding]:

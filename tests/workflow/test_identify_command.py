@@ -185,6 +185,23 @@ def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
     assert "The reference explains" in Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
 
 
+def test_repeats_that_differ_between_amplitudes_are_warned_of(flexlink, undrawn, tmp_path):
+    """Gain 5 % higher at twice the input, and the same records of an arm that keeps its gain."""
+    rng = np.random.default_rng(7)
+    swept = np.sin(np.pi * 0.3 / 1500 * np.arange(1500) ** 2 / 2)
+    for gain, warned in ((1.05, True), (1.0, False)):
+        logs = []
+        for size, factor in ((1.0, 1.0), (2.0, gain)):
+            for k in range(3):
+                y = scipy.signal.lfilter([0.0, 0.1 * factor], [1.0, -0.9], size * swept)
+                y += 0.003 * rng.standard_normal(y.size)
+                logs.append(write_log(tmp_path / f"{gain}_{size}_{k}.csv", size * swept, y))
+        answer = flexlink("identify", *logs, *COLUMNS, "--real", 1, "--pairs", 0, "--json")
+        said = [w for w in answer.document()["numbers"]["warnings"] if "depends on the amplitude" in w]
+        assert len(said) == warned
+        assert not warned or "% higher at the larger amplitude, as under dry friction" in said[0]
+
+
 def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
     """A random walk on the output: its power is at low frequency, below the band."""
     truth = p2(4)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from ident.basis.options import IdentOptions
+from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.input_checks import clipped
 from ident.checks.validation import fit_on_fresh_data
 from ident.closed_loop import two_stage
@@ -73,10 +74,11 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 report,
                 two_stage=finding,
             )
+            as_measured = [record.siso(channel.input, channel.output) for record in measured]
             limited = any(item.cut for item in records.records)
             if known is not None or limited:
-                as_measured = [record.siso(channel.input, channel.output) for record in measured]
                 found = clipped_as_measured(found, as_measured, limited=limited)
+            found = with_warnings(found, amplitude_effects(as_measured))
             channels.append(
                 replace(
                     found,
@@ -89,6 +91,13 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     return IdentifyResult(tuple(channels), friction)
 
 
+def with_warnings(found: IdentifiedChannel, more: Sequence[Finding]) -> IdentifiedChannel:
+    """The channel with what else is doubtful of its model."""
+    search = found.identification.search
+    search = replace(search, warnings=(*search.warnings, *more))
+    return replace(found, identification=replace(found.identification, search=search))
+
+
 def clipped_as_measured(
     found: IdentifiedChannel, measured: Sequence[Record], *, limited: bool = False
 ) -> IdentifiedChannel:
@@ -99,8 +108,8 @@ def clipped_as_measured(
     search = found.identification.search
     others = tuple(warning for warning in search.warnings if warning.kind is not FindingKind.CLIPPED)
     doubts = [one for one in clipped(measured) if not (limited and one.values["signal"] == "input")]
-    search = replace(search, warnings=(*others, *doubts))
-    return replace(found, identification=replace(found.identification, search=search))
+    search = replace(search, warnings=others)
+    return with_warnings(replace(found, identification=replace(found.identification, search=search)), doubts)
 
 
 def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.basis.options import IdentOptions
+from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import residual_advice, whiteness_test
 from ident.closed_loop import two_stage
@@ -171,6 +172,7 @@ def identify_records(
         spread=spread,
         careful=(
             *_doubts([*measured, *logs_to_validate]),
+            *amplitude_effects(measured),
             *found.warnings,
             *residual_advice(*spread.tests, noise_order=spread.noise_order),
             *_beyond(found, options, band_rad_s),
