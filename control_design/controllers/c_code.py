@@ -59,14 +59,18 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     def vector(values: Real) -> str:
         return "{" + ", ".join(literal(value) for value in (values if values.size else [0.0])) + "}"
 
-    constants, limits, given = "", "", controller.feedforward
+    constants, limits, strength, given = "", "", "LEVEL", controller.feedforward
     if given is not None:
         named = {
             "LEVEL": given.level,
             "TURN": given.turn(controller.dt_s),
             "SHARE": given.share(controller.dt_s),
         }
-        constants = "".join(
+        if given.excess > 0:
+            named |= {"EXCESS": given.excess, "FALL": given.fall * controller.dt_s}
+            strength = f"(LEVEL + EXCESS * exp{suffix}(-fabs{suffix}(moved) / FALL))"
+            constants = "#include <math.h>\n"
+        constants += "".join(
             f"static const {number} {name} = {literal(value)};\n" for name, value in named.items()
         )
     if controller.input_limit is not None:
@@ -85,7 +89,9 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         M=vector(controller.anti_windup_gain[:, 0]),
         constants=constants,
         limits=limits,
-        feedforward="" if given is None else _template("feedforward.c.in").substitute(number=number),
+        feedforward=""
+        if given is None
+        else _template("feedforward.c.in").substitute(number=number, strength=strength),
         at_rest="" if given is None else "    state->reference = state->smoothed = 0;\n",
         **_names(controller, prefix, number),
     )
@@ -101,7 +107,7 @@ def _names(controller: Controller, prefix: str, number: Number) -> dict[str, Any
         "size": max(controller.order, 1),
         "reference": f", {number} reference" if given else "",
         "friction": " + friction feed-forward" if given else "",
-        "moving": f"    {number} reference, smoothed;  /* previous one, sign of its speed */\n"
+        "moving": f"    {number} reference, smoothed;  /* previous one, friction at its speed */\n"
         if given
         else "",
     }

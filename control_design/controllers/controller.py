@@ -92,7 +92,9 @@ class Controller(Law):
         try:
             made = None if given is None else FrictionFeedforward(**given)
         except TypeError as error:
-            raise ValueError(f"feedforward needs level, width and lag_s; got {given}") from error
+            raise ValueError(
+                f"feedforward needs level, width, lag_s, excess and fall; got {given}"
+            ) from error
         return super().from_dict({**data, "feedforward": made})
 
     def stepper(self) -> ControllerStepper:
@@ -136,10 +138,7 @@ class ControllerStepper:
         self._limit = np.inf if controller.input_limit is None else controller.input_limit
         rate = np.inf if controller.rate_limit is None else controller.rate_limit
         self._change = rate * controller.dt_s
-        self._level, self._share, self._turn = 0.0, 0.0, 1.0
-        if (given := controller.feedforward) is not None:
-            self._level, self._share = given.level, given.share(controller.dt_s)
-            self._turn = given.turn(controller.dt_s)
+        self._given = controller.feedforward
         self.reset()
 
     def reset(self) -> None:
@@ -154,10 +153,12 @@ class ControllerStepper:
 
         reference: the set point, which the feed-forward (if any) looks at; it rested at zero before.
         """
-        sign = min(max((reference - self._reference) / self._turn, -1.0), 1.0)
-        self._smoothed += self._share * (sign - self._smoothed)
+        if (given := self._given) is not None:
+            dt_s = self._controller.dt_s
+            friction = float(given.friction(np.asarray(reference - self._reference), dt_s))
+            self._smoothed += given.share(dt_s) * (friction - self._smoothed)
         self._reference = reference
-        wanted = float(self._c @ self._x) + self._d * error + self._level * self._smoothed
+        wanted = float(self._c @ self._x) + self._d * error + self._smoothed
         command = min(max(wanted, self._last - self._change), self._last + self._change)
         command = min(max(command, -self._limit), self._limit)
         self.limited = command != wanted

@@ -80,9 +80,10 @@ def test_a_closed_loop_run_with_saturation_agrees_to_1e_12(tmp_path, order, limi
 
 
 @needs_compiler
-def test_friction_feedforward_agrees_to_1e_12_and_ends_with_the_reference(tmp_path):
-    """A move, a rest and a move back: full level of either sign, and nothing at rest."""
-    given = FrictionFeedforward(0.04, 1e-5, 0.1)
+@pytest.mark.parametrize("excess", [0.0, 0.02])
+def test_friction_feedforward_agrees_to_1e_12_and_ends_with_the_reference(tmp_path, excess):
+    """A move, a rest and a move back: friction of either sign at the reference's speed, and none at rest."""
+    given = FrictionFeedforward(0.04, 1e-5, 0.1, excess=excess, fall=0.3)
     controller = _controller(3, input_limit=0.5, feedforward=given)
     step, reset = _compiled(controller, tmp_path)
     reset()
@@ -97,7 +98,8 @@ def test_friction_feedforward_agrees_to_1e_12_and_ends_with_the_reference(tmp_pa
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
     assert np.sum(np.abs(expected) == 0.5) > 20, "the run must saturate to mean anything"
     signal = given.signal(reference, _DT)
-    np.testing.assert_allclose(signal[[199, 999]], [0.04, -0.04], rtol=1e-4)
+    friction = 0.04 + excess * np.exp(-0.3 / 199 / _DT / 0.3)
+    np.testing.assert_allclose(signal[[199, 999]], [friction, -friction], rtol=1e-4)
     assert max(abs(signal[790]), abs(signal[-1])) < 1e-6 * given.level
 
 

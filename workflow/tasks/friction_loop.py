@@ -141,11 +141,15 @@ def predicted_peak(
 
 
 def friction_feedforward(controller: Controller, found: FrictionFit) -> FrictionFeedforward:
-    """Of the identified level, as late as T = G K / (1 + G K) is towards standstill."""
+    """Of the identified friction, as late as T = G K / (1 + G K) is towards standstill."""
     omega = np.array([1e-5 * np.pi / controller.dt_s])
     loop = controller.response(omega) * found.model.frequency_response(omega)
     delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
-    return FrictionFeedforward(found.level, found.law.presliding, max(delay_s, controller.dt_s))
+    law = found.law
+    fall = law.fall if law.excess > 0 else 1.0
+    return FrictionFeedforward(
+        law.level, law.presliding, max(delay_s, controller.dt_s), excess=law.excess, fall=fall
+    )
 
 
 def interval_of(values: Sequence[float], level: float = 0.95) -> Interval:
