@@ -36,7 +36,7 @@ from ident.data.arrays import ComplexArray, RealArray
 from ident.data.distortion import period_of
 from ident.data.record import Record
 from ident.friction.arm import FASTEST_POLE
-from ident.friction.fit import FrictionFit
+from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction
 
 _TERMS = 4

@@ -8,7 +8,7 @@ import numpy as np
 
 from ident.basis.model import GobfModel
 from ident.data.record import Record
-from ident.friction.fit import FrictionFit
+from ident.friction.gauss_newton import FrictionFit
 
 # Of different values that the position takes: with 21 the level of the default arm's friction came out within
 # its standard deviation (7 %), with 11 a third too low.

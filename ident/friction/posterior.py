@@ -17,7 +17,8 @@ from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
-from ident.friction.fit import STD_PRESLIDING, FrictionFit, linearised, moved_to
+from ident.friction.fit import moved_to
+from ident.friction.gauss_newton import STD_PRESLIDING, FrictionFit, linearised
 from ident.uncertainty.embedding import EmbeddingOptions, tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 

@@ -21,7 +21,7 @@ from ident.friction import (
 )
 from ident.friction.amplitude import damped_poles
 from ident.friction.arm import FrictionLaw, SteppedArm
-from ident.friction.fit import linearised
+from ident.friction.gauss_newton import linearised
 from ident.uncertainty.embedding import tangent
 from plant import parse_effect, simulate
 from plant.excitation import multisine, multisine_lines

@@ -1,0 +1,256 @@
+"""A linear arm and its dry friction as least squares: derivatives, Gauss-Newton steps, covariance.
+
+The simulation of `ident.friction.arm` is differentiated with respect to the coefficients of the arm on its
+doubled poles and to the parameters of the friction's law; the poles themselves stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from ident.basis.functions import basis_response, regressor
+from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.basis.structure import Structure, filter_input
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
+from ident.uncertainty.embedding_algebra import triangle_of
+
+# Standard deviation of the logarithm of the pre-sliding deflection before records speak of it.
+STD_PRESLIDING = 1.5
+# How well a joint's friction repeats from record to record at best, as a share of its level.
+_REPEATS = 1e-3
+# Gauss-Newton steps at most; a step, and its parts where the whole does not lower the residual.
+_STEPS, _LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
+# A residual sum of squares that falls by less than this many noise variances is at its end.
+WORTH = 0.5
+# Sizes of the changes that derivatives are taken from, relative to the motion and to the level.
+_CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG = 1e-3, 2e-3, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionFit:
+    """A linear arm with dry friction, fitted to records of its shaft's position.
+
+    law: in units of the input (times the motor's torque per unit of input: N m). model: the arm without
+    friction, each pole once. arm, coefficients (P,): the same on each pole taken twice, as they were fitted.
+    covariance_factor (P + Q, .): of the coefficients and the Q `parameters` of the law. noise_std: of the
+    residual, in output units. between: standard deviation of the level from record to record.
+    """
+
+    law: FrictionLaw
+    model: GobfModel
+    arm: SteppedArm
+    coefficients: RealArray
+    covariance_factor: RealArray
+    noise_std: float
+    between: float
+
+    @property
+    def level(self) -> float:
+        """Coulomb friction in units of the input."""
+        return self.law.level
+
+    @property
+    def level_std(self) -> float:
+        """Standard deviation of the level that the records have in common."""
+        return float(np.linalg.norm(self.covariance_factor[self.coefficients.size]))
+
+    def moved(self, change: RealArray) -> tuple[RealArray, FrictionLaw]:
+        """Coefficients and law after a change (P + Q,), no parameter below zero."""
+        n = self.coefficients.size
+        return self.coefficients + change[:n], _law_of(_parameters(self.law) + change[n:])
+
+    @property
+    def significant(self) -> bool:
+        """The level is more than three of its standard deviations above zero."""
+        return self.level > 3 * self.level_std
+
+    def motion(self, record: Record) -> tuple[RealArray, RealArray]:
+        """Simulated position (T,) and friction in units of the input (T,), mean of each sample."""
+        return self.arm.run(self.coefficients, record.input[:, 0], self.law)
+
+    def residual(self, record: Record) -> RealArray:
+        """(T,) what the simulation leaves of the position, less its mean."""
+        left = record.output[:, 0] - self.motion(record)[0]
+        return np.asarray(left - left.mean())
+
+    def taken_off(self, record: Record) -> Record:
+        """The record (one input; any outputs) as if its input had been smaller by the friction."""
+        return less_friction(record, self.motion(record)[1], self.arm.structure.input_delay_samples)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """The simulation of one record to first order in the coefficients and the parameters of the law.
+
+    position, friction (T,) as simulated; by_coefficients (T, P), by_law (T, Q) derivatives of the position,
+    friction_by (T, P + Q) those of the friction.
+    """
+
+    position: RealArray
+    friction: RealArray
+    by_coefficients: RealArray
+    by_law: RealArray
+    friction_by: RealArray
+
+
+def _parameters(law: FrictionLaw) -> RealArray:
+    """(Q,) level and logarithm of the pre-sliding deflection; with Stribeck friction its excess and the
+    logarithm of the speed that it falls over."""
+    plain = [law.level, np.log(law.presliding)]
+    return np.array([*plain, law.excess, np.log(law.fall)] if np.isfinite(law.fall) else plain)
+
+
+def _law_of(parameters: RealArray) -> FrictionLaw:
+    level, presliding, *falling = parameters.tolist()
+    law = FrictionLaw(max(level, 0.0), float(np.exp(presliding)))
+    return replace(law, excess=max(falling[0], 0.0), fall=float(np.exp(falling[1]))) if falling else law
+
+
+def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
+    """Central differences of the simulation with input u (T,): the friction follows every change."""
+    position, friction = arm.run(coefficients, u, law)
+    structure = arm.structure
+    effort = filter_input(u, 0, structure.input_delay_samples) - friction
+    columns = regressor(arm.poles.doubled(), filter_input(effort, structure.integrators, 0))
+    speed = float(np.std(np.diff(position)))
+    parameters = _parameters(law)
+    by = np.empty((u.size, columns.shape[1] + parameters.size))
+    friction_by = np.empty_like(by)
+    for j, column in enumerate(columns.T):
+        size = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
+        change = np.zeros(coefficients.size)
+        change[j] = size
+        ends = [arm.run(coefficients + sign * change, u, law) for sign in (1, -1)]
+        by[:, j], friction_by[:, j] = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
+    for k in range(parameters.size):
+        change = np.zeros(parameters.size)
+        # An excess has no size of its own before it is known, and cannot be negative.
+        change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * law.level
+        below = _law_of(parameters - change)
+        size += float((parameters - _parameters(below))[k])
+        ends = [arm.run(coefficients, u, one) for one in (_law_of(parameters + change), below)]
+        j = columns.shape[1] + k
+        by[:, j], friction_by[:, j] = ((a - b) / size for a, b in zip(*ends, strict=True))
+    n = columns.shape[1]
+    return Linearised(position, friction, by[:, :n], by[:, n:], friction_by)
+
+
+def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
+    """Of every record the derivatives (T, P + Q) of the simulated position, and what it leaves (T,)."""
+    local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
+    return (
+        [np.column_stack([part.by_coefficients, part.by_law]) for part in local],
+        [record.output[:, 0] - part.position for record, part in zip(records, local, strict=True)],
+    )
+
+
+def descended(
+    records: Sequence[Record],
+    model: GobfModel,
+    structure: Structure,
+    law: FrictionLaw,
+    presliding: float,
+    least: float,
+) -> FrictionFit:
+    """Gauss-Newton steps on the poles of the model, as long as the residual falls."""
+    arm = SteppedArm.of(model.poles, structure, model.dt_s)
+    coefficients = _on_doubled(arm.poles, model)
+    n = sum(record.n_samples for record in records)
+    p, q = coefficients.size, _parameters(law).size
+    found = FrictionFit(law, model, arm, coefficients, np.zeros((p + q, 1)), 0.0, 0.0)
+    noise = np.sqrt(_simulated_rss(found, records) / n)
+    for left in reversed(range(_STEPS)):
+        blocks, targets = equations(found, records)
+        # What is expected of the pre-sliding deflection is one more measurement, of its logarithm.
+        known = np.zeros((1, p + q + 1))
+        known[0, p + 1], known[0, -1] = 1.0, np.log(presliding / found.law.presliding)
+        change, _, rss, rest = least_squares(blocks, targets, known * noise / STD_PRESLIDING)
+        noise = np.sqrt(rest / n)
+        for length in _LENGTHS if left else ():
+            step = length * change
+            step[p] = max(step[p], max(0.6 * found.level, least) - found.level)
+            step[p + 1 :: 2] = np.clip(step[p + 1 :: 2], -1, 1)
+            coefficients, law = found.moved(step)
+            there = replace(found, coefficients=coefficients, law=law)
+            off = np.log(law.presliding / presliding) / STD_PRESLIDING
+            if _simulated_rss(there, records) + (noise * off) ** 2 < rss - WORTH * noise**2:
+                found = there
+                break
+        else:
+            break
+    between = _between_records(blocks, targets, p, _REPEATS * found.level)
+    own = [np.outer(between * block[:, p], np.arange(len(records)) == k) for k, block in enumerate(blocks)]
+    known = noise * np.eye(1 + len(records), p + q + 1 + len(records), p + q - 1)
+    known[0] = 0.0
+    known[0, p + 1] = noise / STD_PRESLIDING
+    _, triangle, rss, rest = least_squares(
+        [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
+    )
+    scale = np.linalg.norm(triangle, axis=0)
+    # The covariance is that of the noise, not of a residual that another step would still lower.
+    factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
+    factor = np.asarray(np.linalg.qr(factor[: p + q].T, mode="r")).T
+    return replace(found, covariance_factor=factor, noise_std=float(np.sqrt(rss / n)), between=between)
+
+
+def _between_records(
+    blocks: Sequence[RealArray], targets: Sequence[RealArray], p: int, least: float
+) -> float:
+    """Standard deviation of the level (column p) from record to record, not below least (DerSimonian and
+    Laird, Controlled Clinical Trials 7, 1986)."""
+    count = len(blocks)
+    if count == 1:
+        return least
+    own = [
+        np.hstack([np.delete(block, p, axis=1), np.outer(block[:, p], np.arange(count) == k)])
+        for k, block in enumerate(blocks)
+    ]
+    n = sum(target.size for target in targets)
+    change, triangle, _, rest = least_squares(own, targets, np.zeros((0, own[0].shape[1] + 1)))
+    scale = np.linalg.norm(triangle, axis=0)
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv(triangle / scale)[-count:] / scale[-count:, None]
+    weight = n / rest / np.sum(inverse**2, axis=1)
+    levels = change[-count:]
+    spread = float(np.sum(weight * (levels - np.average(levels, weights=weight)) ** 2))
+    variance = (spread - (count - 1)) / (weight.sum() - np.sum(weight**2) / weight.sum())
+    return float(np.sqrt(max(variance, least**2)))
+
+
+def _simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
+    """Sum of squares of the residuals, each record's less its mean."""
+    return float(sum(np.sum(found.residual(record) ** 2) for record in records))
+
+
+def least_squares(
+    blocks: Sequence[RealArray], targets: Sequence[RealArray], known: RealArray
+) -> tuple[RealArray, RealArray, float, float]:
+    """Solution of the stacked rows, each record less its mean, and of known (., P + 1), rows and target, as
+    they are; the triangle R, the sum of squares of the targets and what the solution leaves of it.
+    """
+    a = np.vstack([*(block - block.mean(axis=0) for block in blocks), known[:, :-1]])
+    b = np.concatenate([*(target - target.mean() for target in targets), known[:, -1]])
+    length = np.linalg.norm(a, axis=0)
+    length[length == 0] = 1.0
+    triangle = triangle_of(np.column_stack([a / length, b]))
+    solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=1e-12)[0] / length
+    return solution, triangle[:-1, :-1] * length, float(b @ b), float(triangle[-1, -1] ** 2)
+
+
+def _on_doubled(poles: Poles, model: GobfModel) -> RealArray:
+    """Coefficients (2 order,) of the model's response on its poles taken twice."""
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 400))
+    basis = basis_response(poles.doubled(), z)
+    response = basis_response(model.poles, z) @ model.coefficients
+    return np.asarray(
+        np.linalg.lstsq(
+            np.vstack([basis.real, basis.imag]), np.concatenate([response.real, response.imag]), rcond=None
+        )[0]
+    )
