@@ -113,17 +113,19 @@ def independence_test(
 
 
 def residual_advice(
-    whiteness: ResidualTest, independence: ResidualTest, *, noise_order: int = 0
+    whiteness: ResidualTest, independence: ResidualTest, *, noise_order: int = 0, friction: bool = False
 ) -> list[Finding]:
     """What is wrong where a test fails; nothing where both pass.
 
-    noise_order: order of the noise model behind which whiteness was tested, 0 without one.
+    noise_order: order of the noise model behind which whiteness was tested, 0 without one. friction: nobody
+    has looked for it, and it could be identified with the arm.
     """
     found = []
     if not independence.passed:
         found.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
     if not whiteness.passed:
-        found.append(finding(FindingKind.NOT_WHITE, noise_order=noise_order, independent=independence.passed))
+        values = {"noise_order": noise_order, "independent": independence.passed, "friction": friction}
+        found.append(finding(FindingKind.NOT_WHITE, **values))
     return found
 
 

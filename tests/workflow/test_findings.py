@@ -59,6 +59,7 @@ VALUES = {
     "precedes_input": True,
     "noise_order": 0,
     "independent": True,
+    "friction": False,
     "chi_square": 222.22,
     "degrees_of_freedom": 224,
     "expected_low": 178.0,
@@ -105,7 +106,11 @@ OTHERWISE = {
     "INDEPENDENCE": [
         {"passed": True, "precedes_input": False, "probability": p} for p in (0.48, 0.9961, 1.0)
     ],
-    "NOT_WHITE": [{"independent": False}, {"noise_order": 8}, {"noise_order": 8, "independent": False}],
+    "NOT_WHITE": [
+        {"independent": False},
+        {"noise_order": 8},
+        {"noise_order": 8, "independent": False, "friction": True},
+    ],
     "CHI_SQUARE": [{"chi_square": 100.0}, {"chi_square": 400.0}],
     "DISTORTED": [{"trend": "grows"}, {"parity": "both", "trend": "unknown"}, {"parity": "unknown"}],
     "ONE_REALISATION": [{"lines": 0}],

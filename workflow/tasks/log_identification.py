@@ -174,7 +174,11 @@ def identify_records(
             *_doubts([*measured, *logs_to_validate]),
             *amplitude_effects(measured),
             *found.warnings,
-            *residual_advice(*spread.tests, noise_order=spread.noise_order),
+            *residual_advice(
+                *spread.tests,
+                noise_order=spread.noise_order,
+                friction=friction is None and band_rad_s is None and opened is None,
+            ),
             *_beyond(found, options, band_rad_s),
             *(opened.warnings(omega) if opened else ()),
         ),
