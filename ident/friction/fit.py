@@ -31,7 +31,7 @@ from ident.basis.structure import filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw, less_friction
-from ident.friction.gauss_newton import WORTH, FrictionFit, descended, equations, least_squares
+from ident.friction.gauss_newton import WORTH, FrictionFit, descended, equations, least_squares, started
 from ident.identify import untested_model
 
 # Speeds over which friction may fall, in units of the rms speed, and the first guess of what it falls by.
@@ -73,13 +73,14 @@ def fit_friction(
     for search in range(_MOST_SEARCHES):
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
         law = FrictionLaw(max(level, least), presliding) if best is None else best.law
-        found = descended(records, model, structure, law, presliding, least)
+        found = descended(started(model, structure, law), records, presliding, least)
         if best is not None and not _rss(found, records) < _rss(best, records) - WORTH * found.noise_std**2:
             break
         best = found
         # The poles may have been led astray by friction that was not yet right: search for them again.
         model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
+    best = descended(best, records, presliding, least, held=False)
     if best.significant:
         best = _with_stribeck(best, records, presliding, least)
     report(1.0, "friction identified")
@@ -88,8 +89,8 @@ def fit_friction(
 
 def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:
     """The same fit on the poles of another model of the arm, near those it was made with."""
-    structure = found.arm.structure
-    return descended(records, model, structure, found.law, found.law.presliding, 0.1 * found.level)
+    start = started(model, found.arm.structure, found.law)
+    return descended(start, records, found.law.presliding, 0.1 * found.level)
 
 
 def _rss(found: FrictionFit, records: Sequence[Record]) -> float:
@@ -142,13 +143,14 @@ def _with_stribeck(
         more = [np.column_stack(pair) for pair in zip(blocks, columns, strict=True)]
         return least_squares(more, targets, nothing)[3]
 
-    laws = [FrictionLaw(found.level, presliding, _EXCESS * found.level, share * speed) for share in _FALLS]
+    laws = [replace(found.law, excess=_EXCESS * found.level, fall=share * speed) for share in _FALLS]
     rests = [left(law) for law in laws]
     k, rss = int(np.argmin(rests)), _rss(found, records)
     worth = 2 * np.log(sum(record.n_samples for record in records)) * found.noise_std**2
     if rests[k] > rss - worth:
         return found
-    tried = descended(records, found.model, found.arm.structure, laws[k], presliding, least)
+    tried = descended(replace(found, law=laws[k]), records, presliding, least)
+    tried = descended(tried, records, presliding, least, held=False)
     return tried if _rss(tried, records) < rss - worth else found
 
 

@@ -21,8 +21,9 @@ from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
 from ident.uncertainty.embedding_algebra import triangle_of
 
-# Standard deviation of the logarithm of the pre-sliding deflection before records speak of it.
-STD_PRESLIDING = 1.5
+# Standard deviation of the logarithms in the law (pre-sliding deflection, Stribeck speed), a priori.
+STD_LOG = 1.5
+_HELD = 1e4
 # How well a joint's friction repeats from record to record at best, as a share of its level.
 _REPEATS = 1e-3
 # Gauss-Newton steps at most; a step, and its parts where the whole does not lower the residual.
@@ -151,45 +152,52 @@ def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealA
     )
 
 
-def descended(
-    records: Sequence[Record],
-    model: GobfModel,
-    structure: Structure,
-    law: FrictionLaw,
-    presliding: float,
-    least: float,
-) -> FrictionFit:
-    """Gauss-Newton steps on the poles of the model, as long as the residual falls."""
+def started(model: GobfModel, structure: Structure, law: FrictionLaw) -> FrictionFit:
+    """Where Gauss-Newton steps on the poles of a model begin; nothing is known of the noise yet."""
     arm = SteppedArm.of(model.poles, structure, model.dt_s)
     coefficients = _on_doubled(arm.poles, model)
+    nothing = np.zeros((coefficients.size + _parameters(law).size, 1))
+    return FrictionFit(law, model, arm, coefficients, nothing, 0.0, 0.0)
+
+
+def descended(
+    found: FrictionFit, records: Sequence[Record], presliding: float, least: float, *, held: bool = True
+) -> FrictionFit:
+    """Gauss-Newton steps from found, as long as the residual falls; the level stays above least.
+
+    held: logarithms in the law stay where they are. Far from the arm, what is wrong with it would be laid to
+    them. Otherwise the pre-sliding deflection is expected near presliding, a Stribeck speed where it begins.
+    """
     n = sum(record.n_samples for record in records)
-    p, q = coefficients.size, _parameters(law).size
-    found = FrictionFit(law, model, arm, coefficients, np.zeros((p + q, 1)), 0.0, 0.0)
+    expected = _parameters(found.law if held else replace(found.law, presliding=presliding))
+    p, q = found.coefficients.size, expected.size
+    logs, trust = np.arange(1, q, 2), _HELD if held else 1 / STD_LOG
     noise = np.sqrt(_simulated_rss(found, records) / n)
     for left in reversed(range(_STEPS)):
         blocks, targets = equations(found, records)
-        # What is expected of the pre-sliding deflection is one more measurement, of its logarithm.
-        known = np.zeros((1, p + q + 1))
-        known[0, p + 1], known[0, -1] = 1.0, np.log(presliding / found.law.presliding)
-        change, _, rss, rest = least_squares(blocks, targets, known * noise / STD_PRESLIDING)
+        # What is expected of a logarithm is one more measurement of it.
+        known = np.zeros((logs.size, p + q + 1))
+        known[:, p + logs] = np.eye(logs.size)
+        known[:, -1] = (expected - _parameters(found.law))[logs]
+        change, _, rss, rest = least_squares(blocks, targets, trust * noise * known)
         noise = np.sqrt(rest / n)
         for length in _LENGTHS if left else ():
             step = length * change
             step[p] = max(step[p], max(0.6 * found.level, least) - found.level)
-            step[p + 1 :: 2] = np.clip(step[p + 1 :: 2], -1, 1)
+            step[p + logs] = np.clip(step[p + logs], -1, 1)
             coefficients, law = found.moved(step)
             there = replace(found, coefficients=coefficients, law=law)
-            off = np.log(law.presliding / presliding) / STD_PRESLIDING
-            if _simulated_rss(there, records) + (noise * off) ** 2 < rss - WORTH * noise**2:
+            off = trust * noise * (_parameters(law) - expected)[logs]
+            if _simulated_rss(there, records) + off @ off < rss - WORTH * noise**2:
                 found = there
                 break
         else:
             break
     between = _between_records(blocks, targets, p, _REPEATS * found.level)
     own = [np.outer(between * block[:, p], np.arange(len(records)) == k) for k, block in enumerate(blocks)]
-    known = noise * np.eye(1 + len(records), p + q + 1 + len(records), p + q - 1)
-    known[0] = 0.0
-    known[0, p + 1] = noise / STD_PRESLIDING
+    known = np.zeros((logs.size + len(records), p + q + len(records) + 1))
+    known[: logs.size, p + logs] = noise / STD_LOG * np.eye(logs.size)
+    known[logs.size :, p + q : -1] = noise * np.eye(len(records))
     _, triangle, rss, rest = least_squares(
         [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
     )

@@ -18,7 +18,7 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
-from ident.friction.gauss_newton import STD_PRESLIDING, FrictionFit, linearised
+from ident.friction.gauss_newton import STD_LOG, FrictionFit, linearised
 from ident.uncertainty.embedding import EmbeddingOptions, tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
@@ -60,14 +60,13 @@ def without_friction(
         target = record.output[:, 0] - local.position + local.by_coefficients @ found.coefficients
         less = less_friction(record, local.friction, found.arm.structure.input_delay_samples)
         corrected.append(replace(less, output=target[:, None]))
-        # Known beforehand, to one: the logarithm of the deflection, and how far this record's level is off.
-        level, deflection, *falling = local.by_law.T
-        own = np.outer(found.between * level, np.arange(len(records)) == k)
-        columns = np.column_stack([level, *falling, STD_PRESLIDING * deflection, own])
+        # Known beforehand, to one: logarithms in the law, and how far this record's level is off.
+        plain, logs = local.by_law[:, ::2], STD_LOG * local.by_law[:, 1::2]
+        own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
+        columns = np.hstack([plain, logs, own])
         beside.append(Beside(local.by_coefficients, columns))
-    response, change, factor = tangent_beside(
-        corrected, found.model, beside, options, n_known=1 + len(records)
-    )
+    n_known = logs.shape[1] + len(records)
+    response, change, factor = tangent_beside(corrected, found.model, beside, options, n_known=n_known)
     return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
 
 
