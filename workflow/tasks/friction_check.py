@@ -71,8 +71,8 @@ def check_friction(
     sticking = [0.0 if radius > 1 - 1e-9 else loop.sticking_step(rest) for loop in (fitted, *loops)]
     tolerance = TOLERANCE_PERCENT / 100
     return FrictionCheck(
-        level=found.level,
-        level_interval=_around(found.level, found),
+        level=found.law.breakaway,
+        level_interval=_around(found.law.breakaway, found),
         presliding=found.law.presliding,
         sizes=sizes,
         low=low,

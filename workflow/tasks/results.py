@@ -475,13 +475,13 @@ class SlowSine:
 class FrictionCheck:
     """The loop on the identified arm with its dry friction.
 
-    level: in units of the command, with its interval; presliding: the deflection before slipping, taken as
-    known. sizes (N,): rms of the reference, falling; low, high (N,): 95 % interval of the peak of |S| as it
-    would be measured, measured (N,): the peak on the machine, None without one. certified_from: size from
-    which on, up to the largest, `high` exceeds the certified peak by at most tolerance_percent; linear_from:
-    from which on the middle of the interval is that near to the peak of the linear prediction; None where not
-    even at the largest. sticking_step: largest step after which the arm does not leave its pre-sliding;
-    error_at_rest: largest error with which it may rest.
+    level: at standstill, in units of the command, with its interval; presliding: the deflection before
+    slipping, as identified. sizes (N,): rms of the reference, falling; low, high (N,): 95 % interval of the
+    peak of |S| as it would be measured, measured (N,): the peak on the machine, None without one.
+    certified_from: size from which on, up to the largest, `high` exceeds the certified peak by at most
+    tolerance_percent; linear_from: from which on the middle of the interval is that near to the peak of the
+    linear prediction; None where not even at the largest. sticking_step: largest step after which the arm
+    does not leave its pre-sliding; error_at_rest: largest error with which it may rest.
     """
 
     level: float
