@@ -10,8 +10,8 @@ nearly a positive number that falls as the amplitude grows (statistical linearis
 N comes from simulations of the identified arm at the amplitudes asked for, G and the level of the friction
 from their common posterior. So amplitudes that were not measured have a response, too.
 
-A line that makes much of the motion itself meets more friction than the others (4 / pi against 2 / pi, were
-it alone). N as one smooth curve does not follow that: it is taken as uncertain by half of it.
+A line that makes much of the motion itself meets more friction than the others (twice as much, were it
+alone). N as one smooth curve does not follow that: it is taken as uncertain by half of it.
 
 Neglected: every other nonlinearity, and how N depends on the arm's coefficients (the speed of the shaft is
 known to parts in a thousand).
@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm, logm
 from scipy.optimize import brentq
+from scipy.special import ive
 
 from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
@@ -44,8 +45,6 @@ _REALISATIONS, _AMPLITUDES, _DRAWS = 128, 5, 400
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
 _CHANGE_OF_LEVEL = 0.02
-# How much more of N, relative to it, a line meets per share that it has in the power of the speed: simulated.
-_BY_SHARE = 0.25
 # An amplitude this close to the end of what was recorded counts as recorded.
 _SAME = 1e-3
 # Largest multiple of the scatter between amplitudes that ellipses are made of.
@@ -176,6 +175,15 @@ def at_amplitudes(
     return posterior(share), damped_poles(friction.model, float(np.sqrt(damping[0] * damping[-1])))
 
 
+def more_at_a_strong_line(share: float) -> float:
+    """How much larger N is at a line with this share (0 to 1) of the power of the speed than at the others,
+    relative to theirs: I1(h) / I0(h), h = share / (1 - share) / 2, for a sine among Gaussian motion through
+    the sign of their sum (two-input describing function; Gelb and Vander Velde, Multiple-Input Describing
+    Functions, 1968). A quarter of a small share; 1 for a line alone."""
+    half = 0.5 * share / max(1 - share, 1e-9)
+    return float(ive(1, half) / ive(0, half))
+
+
 def damped_poles(model: GobfModel, damping: float) -> Poles:
     """Poles of the model of a shaft's position with more viscous friction at the shaft (its input's units per
     speed), in continuous time behind the hold."""
@@ -234,7 +242,7 @@ def _at_amplitude(
     n, moves = solved(ratios)
     power = np.abs(speed * (delayed - ratios.mean(axis=0)) * spectrum[lines]) ** 2
     uneven = np.zeros((n.size, 1))
-    uneven[0] = 0.5 * _BY_SHARE * n[0] * power.max() / power.sum()
+    uneven[0] = 0.5 * more_at_a_strong_line(float(power.max() / power.sum())) * n[0]
     # A level that is not told from none has its uncertainty for a step, and cannot be negative.
     step = max(_CHANGE_OF_LEVEL * friction.level, 0.5 * friction.level_std)
     ends = friction.level + step, max(friction.level - step, 0.0)

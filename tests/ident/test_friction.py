@@ -19,7 +19,7 @@ from ident.friction import (
     refuse_unseen_shaft,
     without_friction,
 )
-from ident.friction.amplitude import damped_poles
+from ident.friction.amplitude import damped_poles, more_at_a_strong_line
 from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.gauss_newton import linearised
 from ident.uncertainty.embedding import tangent
@@ -249,6 +249,42 @@ def test_friction_is_viscous_on_average_at_amplitudes_that_were_not_recorded() -
     assert np.all(np.diff(equivalent.damping) < 0)
     with pytest.raises(ValueError, match="an rms from 2 to 6"):
         equivalent_friction(found, records, rng, (1.0, 6.0))
+
+
+@pytest.mark.parametrize("asked", [0.3, 0.7])
+def test_a_line_that_makes_much_of_the_motion_meets_more_friction(asked: float) -> None:
+    """Measured on the simulated arm, where no equivalent friction is known to any code: N from voltage over
+    angle with friction, less that of the linear arm."""
+    period, dt_s, count = 1000, RIG.sampling.dt_s, 48
+    lines, rng = multisine_lines(period, dt_s, (0.2, 60.0), "odd"), np.random.default_rng(0)
+    omega = 2 * np.pi * lines / (period * dt_s)
+    linear = true_response(omega)[0]
+    strong = int(np.argmin(np.abs(omega - 8.8)))
+    size, speed = np.ones(lines.size), np.abs(omega * linear)
+    size[strong] = np.sqrt(asked / (1 - asked) * (np.sum(speed**2) - speed[strong] ** 2)) / speed[strong]
+    ratios = np.empty((count, lines.size), dtype=np.complex128)
+    friction = [parse_effect({"name": "coulomb_friction", "torque_Nm": 0.02})]
+    for ratio in ratios:
+        spectrum = np.zeros(period // 2 + 1, dtype=np.complex128)
+        spectrum[lines] = size * np.exp(2j * np.pi * rng.random(lines.size))
+        u = np.tile(np.fft.irfft(spectrum, period), 2)
+        u *= 5.0 / np.std(u)
+        moved = np.diff(simulate(RIG, u, friction).output[:, 0])[-period:]
+        ratio[:] = np.fft.rfft(moved)[lines] / np.fft.rfft(u[-period:])[lines]
+    ratios /= 1 - np.exp(-1j * omega * dt_s)
+    mean = ratios.mean(axis=0)
+    met = ((1 / mean - 1 / linear) / (1j * omega)).real
+    error = ratios.std(axis=0) / (np.abs(mean) ** 2 * omega * np.sqrt(count))
+    power = np.abs(omega * mean * size) ** 2
+    around = [k for k in range(strong - 5, strong + 6) if k != strong]
+    others = np.average(met[around], weights=error[around] ** -2)
+    excess = met[strong] / others - 1
+    deviation = np.hypot(error[strong], np.sum(error[around] ** -2) ** -0.5) / others
+    predicted = more_at_a_strong_line(float(power[strong] / power.sum()))
+    assert deviation < 0.06
+    assert abs(excess - predicted) < 3 * deviation
+    assert more_at_a_strong_line(1e-3) == pytest.approx(0.25e-3, rel=2e-3)
+    assert more_at_a_strong_line(1.0) == pytest.approx(1.0)
 
 
 def test_modes_narrower_than_the_grid_stay_what_they_are(
