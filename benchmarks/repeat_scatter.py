@@ -9,8 +9,10 @@ examples/slfr_krauss_2009.toml). Every sweep is held out once. Predicted: its sc
 (`repeat_posteriors`), beside what each sweep's own residuals say if they are taken for stationary noise
 (`record_posteriors`). Measured: around the mean of its amplitude. And what is said of the amplitudes.
 
-DaISy (daisy_robot_arm): the second half is the first with its sign turned. Predicted: noise model of the
-posterior of the first half. Measured: sum of the halves over sqrt(2), response and free response taken off.
+DaISy (daisy_robot_arm): the second half is the first with its sign turned, so each half is held out once.
+Predicted: level and colour of the noise by the posterior of the other half. Measured: what its response and a
+free response leave of the half held out, and of the sum of both halves, which is noise and even distortion.
+Both whitened by the noise model, so that its strong bands do not leak into the others.
 
 Kyoto (quanser_rfl_frf): 100 frequencies on four dates (10, 2, 12 and 2 runs), closed loop with gain 1.65,
 opened point by point. Predicted from one date: one more run; held against the runs of the other dates. Models
@@ -26,13 +28,15 @@ import numpy as np
 
 from benchmarks.harness import Print, data_folder, main, reading
 from ident import IdentOptions, Record, band_limited, identify
+from ident.basis.functions import nuisance_columns
 from ident.checks.distortion_findings import distortion_findings
-from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
+from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.closed_loop import two_stage
 from ident.data.ellipses import hotelling_widening
 from ident.data.frf_records import FrfRepeats, inliers
 from ident.data.repeats import repeats_of
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from ident.uncertainty.autoregression import whitened
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import EmbeddingOptions, tangent
 from workflow.text.templates import words
@@ -50,7 +54,7 @@ SLFR_CHANNELS = {
 SLFR_BOUNDS = EmbeddingOptions(coloured_noise=True, max_ar_order=20, fir_length=60)
 POINTS_PER_BAND = 40
 
-DAISY_BANDS = ((0.0316, 0.1), (0.1, 0.316), (0.316, 1.0), (1.0, np.pi))
+DAISY_BANDS = ((0.0316, 0.1), (0.1, 0.316), (0.316, 1.0), (1.0, 3.15))
 
 KYOTO_DT_S = 0.002
 KYOTO_BANDS = ((0.6, 2), (2, 6.3), (6.3, 20), (20, 63), (63, 200), (200, 630), (630, 1200))
@@ -122,26 +126,44 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
         say(f"Said: {words(found)}")
 
 
+def whitened_level(posterior: ResponsePosterior, record: Record) -> np.ndarray:
+    """Residual's power over that of the noise model, per band of DAISY_BANDS."""
+    report = posterior.report
+    assert report is not None
+    whitening = np.array([1.0, *report.ar_coefficients])
+    free = whitened(nuisance_columns(posterior.poles, record.n_samples, 1, True), whitening)
+    rest = whitened(record.output[:, 0] - posterior.simulate(record.input[:, 0]), whitening)
+    rest = (rest - free @ np.linalg.lstsq(free, rest, rcond=1e-10)[0])[whitening.size - 1 :]
+    power = np.abs(np.fft.rfft(rest)) ** 2 / rest.size / report.noise_std**2
+    omega = 2 * np.pi * np.arange(power.size) / rest.size
+    return np.array([power[(omega >= low) & (omega < high)].mean() for low, high in DAISY_BANDS])
+
+
 def daisy(path: Path, say: Print) -> None:
-    """Noise level of the robot arm, predicted by one half and seen in the sum of both."""
+    """Noise level of the robot arm, predicted by one half and seen in the other and in the sum of both."""
     arm = Record.from_file(path, ["u_reaction_torque"], ["y_acceleration"], dt_s=1.0)
-    first, second = arm.slice(0, 512), arm.slice(512, 1024)
-    both = replace(first, input=first.input + second.input, output=first.output + second.output)
-    omega = 2 * np.pi * np.arange(1, 257) / 512
-    say("\nDaISy arm: noise in the sum of the halves over that of the noise model of the first, AR(8) by BIC")
-    say("pairs " + "".join(f"{f'{a:.3g}-{b:.3g}':>13}" for a, b in DAISY_BANDS) + "   rad/sample")
+    halves = [arm.slice(0, 512), arm.slice(512, 1024)]
+    # Of unit noise in each half the sum has a variance of two.
+    root = np.sqrt(2)
+    both = replace(
+        halves[0],
+        input=(halves[0].input + halves[1].input) / root,
+        output=(halves[0].output + halves[1].output) / root,
+    )
+    say("\nDaISy arm: measured over predicted noise, RMS of both ways round")
+    bands = "".join(f"{f'{a:.3g}-{b:.3g}':>12}" for a, b in DAISY_BANDS)
+    say(f"pairs  noise model    {bands}   rad/sample")
     for pairs in (2, 3, 4):
-        model = identify([first], IdentOptions(n_real=0, n_pairs=pairs, feedthrough=True)).model
-        posterior = tangent([first], model, EmbeddingOptions(coloured_noise=True))
-        report = posterior.report
-        assert report is not None
-        whitening = np.polyval([*report.ar_coefficients[::-1], 1.0], np.exp(-1j * omega))
-        predicted = report.noise_std**2 / np.abs(whitening) ** 2
-        residual = fit_on_fresh_data(posterior, both).residual
-        seen = np.abs(np.fft.rfft(residual)[1:]) ** 2 / residual.size / 2
-        inside = [(omega >= low) & (omega < high + 1e-9) for low, high in DAISY_BANDS]
-        ratios = [float(np.sqrt(seen[band].mean() / predicted[band].mean())) for band in inside]
-        say(f"{pairs:>5} " + "".join(f"{verdict(ratio):>13}" for ratio in ratios))
+        for order in (8, 32):
+            levels = []
+            for half, held_out in (halves, halves[::-1]):
+                model = identify([half], IdentOptions(n_real=0, n_pairs=pairs, feedthrough=True)).model
+                noise = EmbeddingOptions(coloured_noise=True, max_ar_order=order)
+                posterior = tangent([half], model, noise)
+                levels.append([whitened_level(posterior, record) for record in (held_out, both)])
+            for what, ratios in zip(("half held out", "sum"), np.sqrt(np.mean(levels, axis=0)), strict=True):
+                told = "".join(f"{verdict(ratio):>12}" for ratio in ratios)
+                say(f"{pairs:>5}  AR, at most {order:>2} {told}   {what}")
 
 
 def share(inside: np.ndarray, omega: np.ndarray) -> str:
