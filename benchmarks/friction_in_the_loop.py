@@ -32,6 +32,7 @@ from control_design.analysis.closed_loop import measure_sensitivity, simulate
 from control_design.controllers.controller import Controller
 from ident.friction import fit_friction
 from plant import SampledArm, parse_effect
+from plant.machine import DryFriction
 from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.friction_check import TOLERANCE_PERCENT
 from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, predicted_peak
@@ -45,16 +46,14 @@ DRAWS = 16
 SINE_RAD, SINE_RAD_S = 0.05, 0.1
 
 
-def sticking_on_arm(
-    controller: Controller, source: SimulatedSource, presliding: float, samples: int
-) -> float:
+def sticking_on_arm(controller: Controller, source: SimulatedSource, samples: int) -> float:
     """By bisection, noise and encoder off."""
     arm = SampledArm(rig_of(source), [parse_effect(effect) for effect in source.effects], None)
     low, high = 1e-5, 1.0
     while high > 1.01 * low:
         middle = float(np.sqrt(low * high))
         moved = simulate(controller, arm, np.full(samples, middle)).measured
-        low, high = (middle, high) if np.max(np.abs(moved)) <= presliding else (low, middle)
+        low, high = (middle, high) if np.max(np.abs(moved)) <= DryFriction.PRE_SLIDING_RAD else (low, middle)
     return low
 
 
@@ -89,7 +88,7 @@ def one_arm(
     samples = settling_samples(float(np.max(np.abs(controller.poles))), 200, 6000)
     fitted = FrictionLoop.of(controller, found)
     spread = [loop.sticking_step(samples) for loop in loops]
-    stuck = sticking_on_arm(controller, source, found.presliding, samples)
+    stuck = sticking_on_arm(controller, source, samples)
     left = []
     for size in STEPS_RAD:
         arm = EncodedArm(source, (), np.random.default_rng([seed, 6]))

@@ -151,7 +151,7 @@ def _with_stribeck(
         return found
     tried = descended(replace(found, law=laws[k]), records, presliding, least)
     tried = descended(tried, records, presliding, least, held=False)
-    return tried if _rss(tried, records) < rss - worth else found
+    return tried if tried.law.excess > 0 and _rss(tried, records) < rss - worth else found
 
 
 def _basis(poles: Poles, record: Record, options: IdentOptions) -> RealArray:

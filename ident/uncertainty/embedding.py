@@ -61,6 +61,8 @@ _SHAPES = (tc_factor, exponential_factor, alternating_factor)
 # Modes that the order selection missed and the embedding adds: coloured noise hides them from a search that
 # takes it for white, and whitening brings them out.
 _MOST_ADDED = 5
+# Share of the output that is nothing beside its noise.
+_FREE = 1e-9
 # Rounds of residuals -> noise model -> whitening: the first sees residuals of an unwhitened fit, the others
 # remove what is left of its bias.
 _NOISE_ROUNDS = 3
@@ -293,8 +295,12 @@ def _posterior(
 
 
 def _noise_std(rows: EmbeddingRows) -> float:
-    """Standard deviation of what regressors and kernel leave, their coefficients free."""
-    reduced = reduce_regression(replace(rows, known_std=None).blocks())
+    """Standard deviation of what regressors and kernel leave, their coefficients as good as free.
+
+    Not quite, for a column may do nothing in these records.
+    """
+    size = max(float(np.std(record.output)) for record in rows.records)
+    reduced = reduce_regression(replace(rows, known_std=_FREE * size).blocks())
     return float(np.sqrt(reduced.rest / max(reduced.degrees_of_freedom - reduced.fir_length, 1)))
 
 
