@@ -25,9 +25,7 @@ from workflow.tasks.stages import STAGES
 
 PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
 POINT_STAGES: tuple[Stage, ...] = tuple(
-    s
-    for s in STAGES
-    if s.name in ("design", "achievable_performance", "certify", "reference_filter", "closed_loop")
+    s for s in STAGES if s.name not in ("records", "identify", "uncertainty")
 )
 
 
