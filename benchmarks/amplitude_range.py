@@ -135,8 +135,8 @@ def run(
                 for at, channel in zip((at_hub, at_tip), config.channels, strict=True)
             )
             behind = (
-                without_friction(at_hub, friction, hub, config.channels[0].uncertainty),
-                other_output_without_friction(at_tip, friction, tip, config.channels[1].uncertainty),
+                without_friction(at_hub, friction, hub, config.channels[0].embedding),
+                other_output_without_friction(at_tip, friction, tip, config.channels[1].embedding),
             )
             rng = np.random.default_rng(seed)
             for what, amplitudes in (("one", None), ("range", (RANGE_V[0], RANGE_V[-1]))):

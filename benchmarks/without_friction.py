@@ -84,8 +84,8 @@ def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> 
                 for at, channel in ((at_hub, hub), (at_tip, tip))
             ]
             posteriors = (
-                without_friction(at_hub, friction, models[0], hub.uncertainty).response,
-                other_output_without_friction(at_tip, friction, models[1], tip.uncertainty).response,
+                without_friction(at_hub, friction, models[0], hub.embedding).response,
+                other_output_without_friction(at_tip, friction, models[1], tip.embedding).response,
             )
             cpu.append(time.process_time() - begin)
             to_Nm = motor.torque_per_volt_Nm_V

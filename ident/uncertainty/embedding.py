@@ -103,6 +103,11 @@ class EmbeddingOptions(BaseModel):
         default=False, description="whiten with an AR model of the residuals, three rounds"
     )
     max_ar_order: int = Field(default=8, ge=1, le=100, description="largest AR order that BIC may choose")
+    order_given: bool | None = Field(
+        default=None,
+        description="the order was stated, not chosen from these data: as likely as not it leaves out "
+        "what a choice would have kept; none given: no, or as the identification beside it says",
+    )
     feedthrough: bool | None = Field(
         default=None, description="direct term; none given: as the model has one or not"
     )
@@ -260,7 +265,7 @@ def embed_response(
     nothing = np.zeros((data.n_rows, 0))
     block = RegressionBlock(nothing, regressors[measured], data.whiten(taps)[measured], data.y[measured])
     reduced = reduce_regression([block])
-    grid = kernel_grid(reduced, _SHAPES)
+    grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
     kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
     mean, factor = joint_factor(reduced, kernel)
     widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
@@ -337,7 +342,7 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     n_added = 0
     while True:
         reduced = reduce_regression(rows.blocks())
-        grid = kernel_grid(reduced, _SHAPES)
+        grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
         kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
@@ -354,7 +359,9 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
 
 def _solve_classical(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     reduced = reduce_regression(rows.blocks())
-    return _Solved(rows, reduced, prior_posterior(kernel_grid(reduced, [exponential_factor])))
+    return _Solved(
+        rows, reduced, prior_posterior(kernel_grid(reduced, [exponential_factor], order_given=False))
+    )
 
 
 def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:

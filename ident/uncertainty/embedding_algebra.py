@@ -262,7 +262,7 @@ def remainder_energies(degrees_of_freedom: int) -> tuple[RealArray, RealArray]:
     (A,).
 
     Log-uniform from invisible to what an order selection would have kept (4 ln nu, design 4.3), and one tenth
-    of the probability beyond, for models whose order was not chosen from the data.
+    of the probability beyond.
     """
     edge = 4 * np.log(degrees_of_freedom)
     n = int(np.ceil(np.log(_LARGEST_ENERGY) / np.log(edge) * _SCALES))
@@ -295,14 +295,19 @@ def evaluate_grid(
 
 
 def kernel_grid(
-    reduced: ReducedRegression, shapes: Iterable[Callable[[float, int], RealArray]]
+    reduced: ReducedRegression, shapes: Iterable[Callable[[float, int], RealArray]], *, order_given: bool
 ) -> KernelGrid:
-    """`evaluate_grid` over twelve decays of every shape, and the scales of `remainder_energies`."""
+    """`evaluate_grid` over twelve decays of every shape, and scales: those of `remainder_energies` where the
+    order was given, else log-uniform from far below the noise on, for a choice from the data leaves little.
+    """
     length = reduced.fir_length
     # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
     decays = np.exp(-1.0 / np.geomspace(0.7, max(length / 6.0, 1.0), 12)).tolist()
     spectra = [kernel_spectrum(reduced, lam, shape(lam, length)) for shape in shapes for lam in decays]
-    return evaluate_grid(reduced, spectra, *remainder_energies(reduced.degrees_of_freedom))
+    if order_given:
+        return evaluate_grid(reduced, spectra, *remainder_energies(reduced.degrees_of_freedom))
+    energy = np.geomspace(1e-2, 1e10, 49)
+    return evaluate_grid(reduced, spectra, energy, np.full(energy.size, 1 / energy.size))
 
 
 def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:

@@ -252,6 +252,13 @@ class Channel(Section):
     identification: IdentOptions = Field(default_factory=IdentOptions)
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
 
+    @property
+    def embedding(self) -> UncertaintyOptions:
+        """The uncertainty's settings with what the identification knows of the order."""
+        given = self.uncertainty.order_given
+        known = self.identification.n_pairs is not None if given is None else given
+        return self.uncertainty.model_copy(update={"order_given": known})
+
     @model_validator(mode="after")
     def _one_filter(self) -> Self:
         if self.input == self.output:

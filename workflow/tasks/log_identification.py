@@ -138,15 +138,18 @@ def identify_records(
         about, found = replace(about, band_rad_s=band_rad_s), about.identification
     with naming("identify"), progress.stage("uncertainty"):
         poles, linear = found.model.poles, None
+        bounds = EmbeddingOptions(order_given=options.n_pairs is not None)
         if friction is None:
-            posterior, tests = _posterior(used, found, noise_order)
+            posterior, tests = _posterior(used, found, noise_order, bounds)
         else:
             white = whiteness_test([friction.residual(record) for record in measured]).passed
             behind = behind_friction(
                 measured,
                 friction,
                 found.model,
-                EmbeddingOptions(coloured_noise=not white, max_ar_order=noise_order or _NOISE_ORDERS[0]),
+                bounds.model_copy(
+                    update={"coloured_noise": not white, "max_ar_order": noise_order or _NOISE_ORDERS[0]}
+                ),
             )
             linear = posterior = behind.response
             tests = residual_tests(posterior, measured, behind.friction)
@@ -189,18 +192,19 @@ def identify_records(
 
 
 def _posterior(
-    used: Sequence[Record], found: Identification, noise_order: int | None
+    used: Sequence[Record], found: Identification, noise_order: int | None, bounds: EmbeddingOptions
 ) -> tuple[ResponsePosterior, Tests]:
     """Tangent posterior and its residual tests, with as much of a noise model as the residuals ask for.
 
     White-noise bounds around coloured residuals are far too narrow, so the data decide.
     """
     if whiteness_test(found.residuals).passed:
-        posterior = tangent(used, found.model)
+        posterior = tangent(used, found.model, bounds)
         return posterior, residual_tests(posterior, used)
     best: tuple[float, ResponsePosterior, Tests] | None = None
     for order in _NOISE_ORDERS if noise_order is None else (noise_order,):
-        posterior = tangent(used, found.model, EmbeddingOptions(coloured_noise=True, max_ar_order=order))
+        coloured = bounds.model_copy(update={"coloured_noise": True, "max_ar_order": order})
+        posterior = tangent(used, found.model, coloured)
         tests = residual_tests(posterior, used)
         whiteness, _ = tests
         # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.

@@ -73,14 +73,14 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
             friction = stage.results.identify.friction if channel.uncertainty.friction_identified else None
             poles, tests = result.model.poles, None
             if friction is None:
-                linear = posterior = posterior_of(result.model, result.bounded, channel.uncertainty, records)
+                linear = posterior = posterior_of(result.model, result.bounded, channel.embedding, records)
             else:
                 measured = [
                     item.record.siso(channel.input, channel.output)
                     for item in stage.results.records.of_role("estimation")
                 ]
                 find = without_friction if k == control else other_output_without_friction
-                behind = find(measured, friction, result.model, channel.uncertainty)
+                behind = find(measured, friction, result.model, channel.embedding)
                 linear = posterior = behind.response
                 if k == control:
                     tests = residual_tests(linear, measured, behind.friction)
@@ -334,7 +334,7 @@ def scatter_of(
     repeated = [group for group in groups.values() if len(group) >= 2]
     if not repeated:
         return None
-    posteriors = repeat_posteriors(repeated, result.identification.model, channel.uncertainty)
+    posteriors = repeat_posteriors(repeated, result.identification.model, channel.embedding)
     low, high = result.data_band_rad_s or (bands[0][0], bands[-1][1])
     edges = np.geomspace(low, high * (1 - 1e-6), max(round(2 * np.log10(high / low)), 1) + 1)
     omega = np.geomspace(low, high * (1 - 2e-6), 20 * len(edges))
