@@ -58,7 +58,7 @@ def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(whitening):
     rows = EmbeddingRows(tuple(records), structure, Poles(np.array([0.8, 0.5])), 3, whitening)
     reduced = reduce_regression(rows.blocks())
     # No kernel: all weight on alpha = 0, so that the fit is plain generalised least squares.
-    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1))
+    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1), np.ones(1))
     kernel = conditional_posterior(grid, np.zeros((1, 1)), 1.0)
     residuals, absorbed = gls_residuals(rows, reduced, kernel)
 
@@ -99,7 +99,7 @@ def test_bias_of_the_estimating_equations_equals_the_dense_one(whitening):
     structure = Structure(estimate_offset=True, estimate_initial_state=True)
     rows = EmbeddingRows((record,), structure, Poles(np.array([0.9, 0.6])), 3, whitening)
     reduced = reduce_regression(rows.blocks())
-    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1))
+    grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1), np.ones(1))
     _, absorbed = gls_residuals(rows, reduced, conditional_posterior(grid, np.zeros((1, 1)), 1.0))
 
     a = np.arange(n)
