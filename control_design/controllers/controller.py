@@ -139,6 +139,7 @@ class ControllerStepper:
         rate = np.inf if controller.rate_limit is None else controller.rate_limit
         self._change = rate * controller.dt_s
         self._given = controller.feedforward
+        self._share = 0.0 if self._given is None else self._given.share(controller.dt_s)
         self.reset()
 
     def reset(self) -> None:
@@ -153,10 +154,9 @@ class ControllerStepper:
 
         reference: the set point, which the feed-forward (if any) looks at; it rested at zero before.
         """
-        if (given := self._given) is not None:
-            dt_s = self._controller.dt_s
-            friction = float(given.friction(np.asarray(reference - self._reference), dt_s))
-            self._smoothed += given.share(dt_s) * (friction - self._smoothed)
+        if self._given is not None:
+            friction = self._given.friction(np.asarray(reference - self._reference), self._controller.dt_s)
+            self._smoothed += self._share * (float(friction) - self._smoothed)
         self._reference = reference
         wanted = float(self._c @ self._x) + self._d * error + self._smoothed
         command = min(max(wanted, self._last - self._change), self._last + self._change)

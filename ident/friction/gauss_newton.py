@@ -39,9 +39,10 @@ class FrictionFit:
     """A linear arm with dry friction, fitted to records of its shaft's position.
 
     law: in units of the input (times the motor's torque per unit of input: N m). model: the arm without
-    friction, each pole once. arm, coefficients (P,): the same on each pole taken twice, as they were fitted.
-    covariance_factor (P + Q, .): of the coefficients and the Q `parameters` of the law. noise_std: of the
-    residual, in output units. between: standard deviation of the level from record to record.
+    friction, each pole once. arm, coefficients (P,): the same on each pole taken twice, as they were
+    fitted. covariance_factor (P + Q, .): of the coefficients and the Q parameters of the law (level,
+    logarithm of the deflection; excess, logarithm of its speed). noise_std: of the residual, in output
+    units. between: standard deviation of the level from record to record.
     """
 
     law: FrictionLaw
@@ -73,7 +74,7 @@ class FrictionFit:
         return self.level > 3 * self.level_std
 
     def motion(self, record: Record) -> tuple[RealArray, RealArray]:
-        """Simulated position (T,) and friction in units of the input (T,), mean of each sample."""
+        """Simulated position (T,) and friction in units of the input (T,), held over each sample."""
         return self.arm.run(self.coefficients, record.input[:, 0], self.law)
 
     def residual(self, record: Record) -> RealArray:

@@ -48,7 +48,7 @@ def test_tangent_covers_and_classical_does_not():
 
 
 def test_a_damped_mode_near_the_nyquist_frequency_that_nobody_asked_for_is_inside():
-    """Too weak to be seen; with a slow kernel alone the ellipses hold half of the responses (measured)."""
+    """Too weak to be seen, and where a slow kernel has least."""
     slow, hidden, size = 0.93 * np.exp(0.25j), 0.45 * np.exp(2.8j), 0.002
     numerator, denominators = [0, 0.02, 0.015], [np.poly([p, np.conj(p)]).real for p in (slow, hidden)]
     omega = np.linspace(0.4, 0.95, 12) * np.pi / DT

@@ -161,7 +161,7 @@ def test_stepped_between_the_samples_without_friction_is_the_discrete_model(
 
 
 def test_held_friction_moves_the_arm_as_far_as_the_one_that_turns_within_a_sample() -> None:
-    """Four millionths of a motion of 1 rad; the mean of each sample alone is 9 microradians off."""
+    """To four millionths of a motion of 1 rad."""
     records = recorded(0.1, 1)
     found = fit_friction(records, OPTIONS)
     arm = GobfModel(found.arm.poles.doubled(), found.coefficients, records[0].dt_s, integrators=1)

@@ -175,7 +175,7 @@ class UncertaintyOptions(EmbeddingOptions):
     promise: str = Field(
         "as recorded",
         description="what response the ellipses are about: as recorded: a linear arm's, whatever is not "
-        "linear taken for noise. The others identify the Coulomb friction of the control channel (its output "
+        "linear taken for noise. The others identify the dry friction of the control channel (its output "
         "is the shaft's position). without friction: the linear arm behind it; this amplitude: the best "
         "linear approximation, friction included, at the rms of the records' inputs; amplitudes from 2 to 8: "
         "at any rms of the input between these, in its unit",
@@ -193,7 +193,7 @@ class UncertaintyOptions(EmbeddingOptions):
 
     @property
     def friction_identified(self) -> bool:
-        """The Coulomb friction of the shaft is identified with the arm."""
+        """The dry friction of the shaft is identified with the arm."""
         return self.promise != "as recorded"
 
     @property
@@ -338,7 +338,7 @@ class ClosedLoopOptions(Section):
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
     friction_feedforward: bool = Field(
         False,
-        description="the controller adds the identified Coulomb friction with the sign of the reference's "
+        description="the controller adds the identified dry friction at the reference's "
         "speed; needs promise = 'without friction'",
     )
     sensitivity: bool = Field(True, description="on the simulated arm: measure S, predicted beside measured")
@@ -469,7 +469,7 @@ class RunConfig(Section):
 
     @property
     def friction_identified(self) -> bool:
-        """The Coulomb friction of the shaft is identified: the promise of some channel needs it."""
+        """The dry friction of the shaft is identified: the promise of some channel needs it."""
         return any(channel.uncertainty.friction_identified for channel in self.channels)
 
     @property
