@@ -42,6 +42,10 @@ _GROWTH_PER_STEP = 0.3
 _SMALLEST_PART = 1e-9
 
 
+# Corner and damping ratio of the accelerometer: far above any mode, and its delay of 0.1 ms is none here.
+_ACCELEROMETER_RAD_S, _ACCELEROMETER_DAMPING = 2 * np.pi * 2000.0, float(np.sqrt(0.5))
+
+
 class PlanState(NamedTuple):
     """What the stepper changes in place: state (N,), slider positions (E,), slip and contact signs (E,)."""
 
@@ -54,13 +58,16 @@ class PlanState(NamedTuple):
 class Plan:
     """The last arguments of `plant.kernel.run`, from `substeps` on, and what is needed beside them.
 
-    parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (3, N).
+    parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (4, N).
+    start_columns: (N, 3 + 2M). State per unit of hub angle, hub speed, voltage, modal deflections and rates.
+    slider_rows: (E, N). Angle of every switching element.
     """
 
     arguments: tuple[Any, ...]
     output_rows: Real
     initial_state: Real
-    n_elements: int
+    start_columns: Real
+    slider_rows: Real
     parts: int
     delay_samples: int
 
@@ -68,19 +75,31 @@ class Plan:
         """Run the compiled stepper over inputs (T, 4), filling observed (T, 3) and changing the state."""
         run(inputs, observed, *state, *self.arguments)
 
-    def at_rest(self) -> PlanState:
-        """The state at time zero: at rest, every friction element stuck, every contact open."""
-        n = self.n_elements
-        return PlanState(self.initial_state.copy(), np.zeros(n), np.zeros(n, dtype=np.int64))
+    def at(self, start: Real | None = None) -> PlanState:
+        """The state at time zero: every friction element stuck without a load, every contact open.
+
+        start (3 + 2m,): hub angle, hub speed, acting voltage, first m modal deflections and their rates;
+        without it at rest at zero.
+        """
+        x = self.initial_state.copy()
+        if start is not None:
+            m, modes = (start.size - 3) // 2, (self.start_columns.shape[1] - 3) // 2
+            columns = [0, 1, 2, *range(3, 3 + m), *range(3 + modes, 3 + modes + m)]
+            x += self.start_columns[:, columns] @ start
+        sliders = self.slider_rows @ x
+        return PlanState(x, sliders, np.zeros(sliders.size, dtype=np.int64))
 
 
-def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: float) -> Plan:
+def make_plan(
+    machine: Machine, dt_s: float, n_modes: int | None, substep_s: float, *, accelerometer: bool = False
+) -> Plan:
     """Prepare the stepper for a machine sampled at dt_s.
 
-    Its outputs are the hub angle, the true tip position and the tip position behind the sensor's lag.
+    Its outputs are the hub angle, the true tip position, the tip position behind the sensor's lag and, with
+    an accelerometer, the second derivative of the true tip position (else zero).
     """
     equations = equations_of_motion(machine, default_n_modes(machine.rig) if n_modes is None else n_modes)
-    builder = _Builder(machine, equations)
+    builder = _Builder(machine, equations, accelerometer=accelerometer)
     element, element_rows = builder.elements()
     kinds, channel, channel_rows, force_columns = builder.channels()
     n, n_elements, n_channels = builder.n, element.shape[0], kinds.size
@@ -119,7 +138,15 @@ def make_plan(machine: Machine, dt_s: float, n_modes: int | None, substep_s: flo
         np.ascontiguousarray(channel_rows.T),
         *builder.gravity(),
     )
-    return Plan(arguments, output_rows, builder.initial_state(), n_elements, len(substeps), whole)
+    return Plan(
+        arguments,
+        output_rows,
+        builder.initial_state(),
+        builder.start_columns(state_matrices[0]),
+        element_rows[:, 0],
+        len(substeps),
+        whole,
+    )
 
 
 def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
@@ -135,9 +162,10 @@ def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
 
 
 class _Builder:
-    """State layout: coordinates, speeds, voltage lag, tip sensor lag, a sine and cosine per disturbance."""
+    """State layout: coordinates, speeds, voltage lag, tip sensor lag, accelerometer (position, speed over its
+    corner frequency), a sine and cosine per disturbance."""
 
-    def __init__(self, machine: Machine, equations: Equations) -> None:
+    def __init__(self, machine: Machine, equations: Equations, *, accelerometer: bool = False) -> None:
         self.machine, self.equations = machine, equations
         size = 2 * equations.mass.shape[0]
         self.mechanical = size
@@ -145,6 +173,8 @@ class _Builder:
         size += self.voltage_state >= 0
         self.sensor_state = size if machine.sensor.lag_s > 0 else -1
         size += self.sensor_state >= 0
+        self.accelerometer = size if accelerometer else -1
+        size += 2 * accelerometer
         self.oscillators = size
         self.n = size + 2 * len(machine.joint.disturbance)
 
@@ -174,6 +204,10 @@ class _Builder:
         if self.sensor_state >= 0:
             a[self.sensor_state] += self._position(eq.tip) / machine.sensor.lag_s
             a[self.sensor_state, self.sensor_state] = -1 / machine.sensor.lag_s
+        if self.accelerometer >= 0:
+            at, corner = self.accelerometer, _ACCELEROMETER_RAD_S
+            a[at, at + 1] = corner
+            a[at + 1] = self._acceleration() / corner
         for i, disturbance in enumerate(machine.joint.disturbance):
             sine = self.oscillators + 2 * i
             omega = 2 * np.pi * disturbance.frequency_Hz
@@ -285,10 +319,48 @@ class _Builder:
         )
 
     def outputs(self) -> Real:
-        """Rows: encoder, tip, tip behind the sensor lag."""
+        """Rows: encoder, tip, tip behind the sensor lag, tip acceleration."""
         tip = self._position(self.equations.tip)
         behind = np.eye(self.n)[self.sensor_state] if self.sensor_state >= 0 else tip
-        return np.array([self._position(self.equations.encoder), tip, behind])
+        acceleration = self._acceleration() if self.accelerometer >= 0 else np.zeros(self.n)
+        return np.array([self._position(self.equations.encoder), tip, behind, acceleration])
+
+    def _acceleration(self) -> Real:
+        """The accelerometer as a spring-mass system: the force on its mass per unit of mass."""
+        row, at = self._position(self.equations.tip), self.accelerometer
+        row[at], row[at + 1] = -1.0, -2 * _ACCELEROMETER_DAMPING
+        return _ACCELEROMETER_RAD_S**2 * row
+
+    def start_columns(self, free: Real) -> Real:
+        """See `Plan`: base at rest in its middle, motor side and link root turned with the hub.
+
+        free (N, N): state matrix with everything that slips slipping.
+        """
+        eq, n = self.equations, self.mechanical // 2
+        turned = np.zeros(n)
+        turned[: eq.first_mode] = 1.0
+        if self.machine.joint.base is not None:
+            turned[1] = 0.0
+        modes = np.eye(n)[:, eq.first_mode :]
+        columns = np.zeros((self.n, 3 + 2 * modes.shape[1]))
+        columns[:n, 0] = columns[n : 2 * n, 1] = turned
+        columns[:n, 3 : 3 + modes.shape[1]] = columns[n : 2 * n, 3 + modes.shape[1] :] = modes
+        if self.voltage_state >= 0:
+            columns[self.voltage_state, 2] = 1.0
+        if self.sensor_state >= 0:
+            columns[self.sensor_state] = self._position(eq.tip) @ columns
+        if self.accelerometer >= 0:
+            # As if the tip had moved with this speed and acceleration for long.
+            corner, twice = _ACCELEROMETER_RAD_S, 2 * _ACCELEROMETER_DAMPING
+            rates = free @ columns
+            if self.voltage_state < 0:
+                rates[:, 2] += self._motor_column()
+            acceleration = self._speed(eq.tip) @ rates
+            speed = (self._speed(eq.tip) @ columns - twice * acceleration / corner) / corner
+            behind = twice * speed + acceleration / corner**2
+            columns[self.accelerometer] = self._position(eq.tip) @ columns - behind
+            columns[self.accelerometer + 1] = speed
+        return columns
 
     def initial_state(self) -> Real:
         x = np.zeros(self.n)

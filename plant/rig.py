@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -78,16 +78,21 @@ class Payload(_Checked):
 
 
 class Sensors(_Checked):
-    """White Gaussian measurement noise of the two outputs."""
+    """Measurement noise of the outputs: white Gaussian, or a maker's figure for noise of any colour."""
 
     hub_angle_noise_rad: NotNegative = Field(description="standard deviation of the hub angle noise")
-    tip_noise_m: NotNegative = Field(description="standard deviation of the tip position noise")
+    tip_noise_m: NotNegative = Field(0.0, description="standard deviation of the tip position noise")
+    tip_acceleration_noise_m_s2: NotNegative = Field(
+        0.0, description="standard deviation of the noise of an accelerometer at the tip"
+    )
+    noise_is: Literal["measured", "data sheet"] = Field("measured", description="where the levels come from")
 
 
 class Sampling(_Checked):
     """Sampling of inputs (held) and outputs."""
 
     dt_s: Positive = Field(description="sampling period; the voltage is held over it")
+    transport_delay_s: NotNegative = Field(0.0, description="from the logged voltage to the motor's")
 
 
 class Rig(_Checked):
@@ -136,14 +141,12 @@ class Rig(_Checked):
     def to_toml(self) -> str:
         """The rig as the text of a rig file; reading it back gives an equal Rig."""
         lines: list[str] = ["# rig; SI units, given in the key names"]
-        for section, values in self.model_dump().items():
+        for section, values in self.model_dump(exclude_defaults=True).items():
             if section == "tolerances":
-                if not values:
-                    continue
                 lines += ["", "# relative standard deviations of the values above; not listed = exact"]
                 lines += ["[tolerances]", *(f'"{key}" = {float(value)!r}' for key, value in values.items())]
             else:
-                lines += ["", f"[{section}]", *(f"{key} = {float(value)!r}" for key, value in values.items())]
+                lines += ["", f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
         return "\n".join(lines) + "\n"
 
     def value(self, key: str) -> float:
@@ -188,8 +191,13 @@ def parameter_keys() -> tuple[str, ...]:
     return tuple(
         f"{section}.{key}"
         for section, field in Rig.model_fields.items()
-        for key in getattr(field.annotation, "model_fields", ())
+        for key, entry in getattr(field.annotation, "model_fields", {}).items()
+        if entry.annotation is float
     )
+
+
+def _toml(value: float | str) -> str:
+    return f'"{value}"' if isinstance(value, str) else repr(float(value))
 
 
 def one_line(error: ValidationError) -> str:

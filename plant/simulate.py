@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TypeVar
 
 import numpy as np
@@ -29,6 +29,8 @@ class Trajectory:
     hub_angle_rad, tip_m : As measured at t_k, before the voltage of the same row takes effect: with the
         effects on the sensors, and with noise if the simulation was given a generator.
     hub_angle_true_rad, tip_true_m : Before every sensor effect and without noise.
+    tip_acceleration_m_s2 : Second derivative of the true tip position, with noise if there is any; zero
+        unless the simulator has an accelerometer.
     """
 
     time_s: Real
@@ -37,6 +39,7 @@ class Trajectory:
     tip_m: Real
     hub_angle_true_rad: Real
     tip_true_m: Real
+    tip_acceleration_m_s2: Real
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -49,7 +52,34 @@ class Trajectory:
     @property
     def output(self) -> Real:
         """(T, 2): hub_angle_rad, tip_m as measured."""
-        return np.column_stack([self.hub_angle_rad, self.tip_m])
+        return self.columns(OUTPUT_NAMES)
+
+    def columns(self, names: Sequence[str]) -> Real:
+        """(T, Y): the quantities of these names."""
+        return np.column_stack([getattr(self, name) for name in names])
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a record starts, if not at rest at zero.
+
+    hub_angle_rad, hub_speed_rad_s : float. With the link straight behind the hub but for `deflections`.
+    deflections, rates : (m,). Of the first m modes of the link (`plant.modal`), sqrt(kg) m and per second.
+    voltage_V : float. Acting voltage up to the first sample.
+    """
+
+    hub_angle_rad: float = 0.0
+    hub_speed_rad_s: float = 0.0
+    deflections: Real = field(default_factory=lambda: np.zeros(0))
+    rates: Real = field(default_factory=lambda: np.zeros(0))
+    voltage_V: float = 0.0
+
+    def vector(self) -> Real:
+        """(3 + 2m,) as `plant.plan` takes it. Raises ValueError if deflections and rates differ in number."""
+        if np.shape(self.deflections) != np.shape(self.rates):
+            raise ValueError(f"as many rates as deflections: {len(self.deflections)}, {len(self.rates)}")
+        scalars = [self.hub_angle_rad, self.hub_speed_rad_s, self.voltage_V]
+        return np.concatenate([scalars, self.deflections, self.rates])
 
 
 def simulate(
@@ -83,7 +113,10 @@ def simulate(
 
 
 class Simulator:
-    """A machine prepared once for many records from rest; see `simulate` for arguments and errors."""
+    """A machine prepared once for many records; see `simulate` for arguments and errors.
+
+    accelerometer: whether the tip's acceleration is observed too.
+    """
 
     def __init__(
         self,
@@ -93,12 +126,16 @@ class Simulator:
         dt_s: float | None = None,
         n_modes: int | None = None,
         substep_s: float = SUBSTEP_S,
+        accelerometer: bool = False,
     ) -> None:
         self.machine = make_machine(rig, effects)
+        self.accelerometer = accelerometer
         self.dt_s = rig.sampling.dt_s if dt_s is None else _positive("dt_s", dt_s)
         if n_modes is not None and not n_modes >= 1:
             raise ValueError(f"n_modes must be at least 1; got {n_modes}")
-        self.plan = make_plan(self.machine, self.dt_s, n_modes, _positive("substep_s", substep_s))
+        self.plan = make_plan(
+            self.machine, self.dt_s, n_modes, _positive("substep_s", substep_s), accelerometer=accelerometer
+        )
 
     def run(
         self,
@@ -107,12 +144,14 @@ class Simulator:
         rng: np.random.Generator | None = None,
         hub_torque_Nm: npt.ArrayLike | None = None,
         tip_force_N: npt.ArrayLike | None = None,
+        start: Start | None = None,
     ) -> Trajectory:
-        """One record from rest."""
+        """One record, from rest at zero unless told."""
         machine, plan = self.machine, self.plan
         voltage = _signal("voltage_V", voltage_V, None)
         n_samples = voltage.size
-        acting = np.zeros(plan.delay_samples + 1 + n_samples)
+        before = 0.0 if start is None else start.voltage_V
+        acting = np.full(plan.delay_samples + 1 + n_samples, before)
         acting[plan.delay_samples + 1 :] = machine.voltage.static(voltage)
         inputs = np.zeros((n_samples, 4))
         late, early = acting[:n_samples], acting[1 : n_samples + 1]
@@ -121,11 +160,11 @@ class Simulator:
             inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
         if tip_force_N is not None:
             inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
-        observed = np.empty((n_samples, 3))
-        plan.advance(inputs, observed, plan.at_rest())
-        hub, tip, tip_behind = observed.T
+        observed = np.empty((n_samples, 4))
+        plan.advance(inputs, observed, plan.at(None if start is None else start.vector()))
+        hub, tip, tip_behind, acceleration = observed.T
         time = np.arange(n_samples, dtype=np.float64) * self.dt_s
-        noise = _noise(machine, rng, n_samples)
+        noise = _noise(machine, rng, n_samples, accelerometer=self.accelerometer)
         return Trajectory(
             time_s=time,
             voltage_V=voltage,
@@ -133,6 +172,7 @@ class Simulator:
             tip_m=_tip_reading(machine.sensor, tip_behind, time, noise[:, 1]),
             hub_angle_true_rad=hub,
             tip_true_m=tip,
+            tip_acceleration_m_s2=acceleration + noise[:, 2],
         )
 
 
@@ -158,13 +198,13 @@ class SampledArm(Simulator):
         super().__init__(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
         self._rng = rng
         self._inputs = np.zeros((1, 4))
-        self._unused = np.empty((1, 3))
+        self._unused = np.empty((1, 4))
         self._rows = self.plan.output_rows
         self.reset()
 
     def reset(self) -> None:
         """Back to rest at time zero. The noise generator goes on; it is not rewound."""
-        self._state = self.plan.at_rest()
+        self._state = self.plan.at()
         self._sample = 0
         self._pending: deque[float] = deque([0.0] * (self.plan.delay_samples + 1))
         self._measurement: Real | None = None
@@ -177,7 +217,7 @@ class SampledArm(Simulator):
     def measure(self) -> Real:
         """(2,) hub_angle_rad, tip_m at t_k as measured; asking twice at one instant gives the same sample."""
         if self._measurement is None:
-            hub, _, tip = (self._rows @ self._state.x).tolist()
+            hub, _, tip, _ = (self._rows @ self._state.x).tolist()
             hub_noise, tip_noise = (0.0, 0.0) if self._rng is None else self._rng.standard_normal(2).tolist()
             sensors = self.machine.rig.sensors
             time = self._sample * self.dt_s
@@ -203,12 +243,14 @@ class SampledArm(Simulator):
         self._measurement = None
 
 
-def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int) -> Real:
-    """(T, 2) noise of hub angle and tip, drawn sample by sample; zeros without a generator."""
-    if rng is None:
-        return np.zeros((n_samples, 2))
-    sensors = machine.rig.sensors
-    return rng.standard_normal((n_samples, 2)) * (sensors.hub_angle_noise_rad, sensors.tip_noise_m)
+def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int, *, accelerometer: bool) -> Real:
+    """(T, 3) noise of hub angle, tip and, where there is one, accelerometer, drawn sample by sample."""
+    noise = np.zeros((n_samples, 3))
+    if rng is not None:
+        sensors, drawn = machine.rig.sensors, 3 if accelerometer else 2
+        levels = sensors.hub_angle_noise_rad, sensors.tip_noise_m, sensors.tip_acceleration_noise_m_s2
+        noise[:, :drawn] = rng.standard_normal((n_samples, drawn)) * levels[:drawn]
+    return noise
 
 
 def _tip_reading(sensor: SensorPath, tip: F, time: F, noise: F) -> F:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from plant.effects import actuator, joint, link, sensor
 from plant.effects.base import EFFECTS, LOOK_ALIKES, Effect
-from plant.machine import Machine
+from plant.machine import Machine, VoltagePath
 from plant.rig import Rig, one_line
 
 __all__ = [
@@ -65,7 +65,7 @@ def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:
 
     Raises ValueError if an entry is not an effect, or an effect is given twice.
     """
-    machine = Machine(rig)
+    machine = Machine(rig, VoltagePath(delay_s=rig.sampling.transport_delay_s))
     seen: set[str] = set()
     for effect in effects:
         if not isinstance(effect, Effect):

@@ -1,0 +1,76 @@
+"""Records that do not start at rest at zero, the transport delay, and the accelerometer."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from plant.effects import parse_effect
+from plant.machine import Machine
+from plant.modal import default_n_modes, equations_of_motion
+from plant.presets import paper_link
+from plant.simulate import Simulator, Start, simulate
+
+N_MODES = 3
+
+
+@pytest.fixture
+def voltage_V() -> np.ndarray:
+    return np.random.default_rng(3).choice([-1.0, 1.0], 30).repeat(10)
+
+
+def test_a_swinging_start_follows_the_matrix_exponential() -> None:
+    rig = paper_link()
+    start = Start(0.7, -0.4, np.array([0.01, -0.002]), np.array([0.1, 0.05]))
+    record = Simulator(rig, n_modes=N_MODES).run(np.zeros(50), start=start)
+    equations = equations_of_motion(Machine(rig), N_MODES)
+    x = np.array([0.7, 0.01, -0.002, 0.0, -0.4, 0.1, 0.05, 0.0])
+    step = expm(equations.state_matrix() * rig.sampling.dt_s)
+    tip = equations.position_row(equations.tip)
+    for k in range(50):
+        assert record.hub_angle_rad[k] == pytest.approx(x[0], abs=1e-12)
+        assert record.tip_m[k] == pytest.approx(tip @ x, abs=1e-12)
+        x = step @ x
+
+
+def test_dry_friction_holds_where_it_starts() -> None:
+    friction = parse_effect({"name": "coulomb_friction", "torque_Nm": 0.1})
+    record = Simulator(paper_link(), [friction]).run(np.zeros(100), start=Start(hub_angle_rad=1.3))
+    assert np.allclose(record.hub_angle_rad, 1.3, atol=1e-9)
+
+
+def test_a_voltage_held_before_the_first_row_acts_through_delay_and_lag(voltage_V: np.ndarray) -> None:
+    rig = paper_link().perturbed({"sampling.transport_delay_s": 0.013})
+    effects = [parse_effect({"name": "actuator_lag", "time_constant_s": 0.05})]
+    ahead = 2000
+    whole = simulate(rig, np.concatenate([np.full(ahead, 2.0), voltage_V]), effects)
+    at = whole.hub_angle_rad[ahead], (whole.hub_angle_rad[ahead] - whole.hub_angle_rad[ahead - 1])
+    # At constant voltage the arm turns at constant speed with the link hardly bent.
+    start = Start(at[0], at[1] / rig.sampling.dt_s, voltage_V=2.0)
+    record = Simulator(rig, effects).run(voltage_V, start=start)
+    assert np.allclose(record.hub_angle_rad, whole.hub_angle_rad[ahead:], atol=1e-6)
+
+
+def test_the_transport_delay_is_an_input_delay(voltage_V: np.ndarray) -> None:
+    late = simulate(paper_link().perturbed({"sampling.transport_delay_s": 0.007}), voltage_V)
+    delayed = simulate(paper_link(), voltage_V, [parse_effect({"name": "input_delay", "delay_s": 0.007})])
+    assert np.array_equal(late.output, delayed.output)
+
+
+def test_the_accelerometer_reads_the_second_derivative_of_the_tip(voltage_V: np.ndarray) -> None:
+    rig, fine = paper_link(), 50
+    start = Start(0.2, 0.5, np.array([0.01]), np.array([0.2]))
+    record = Simulator(rig, accelerometer=True).run(voltage_V, start=start)
+    arguments = {"dt_s": rig.sampling.dt_s / fine, "n_modes": default_n_modes(rig)}
+    tip_m = Simulator(rig, **arguments).run(voltage_V.repeat(fine), start=start).tip_m
+    second = np.diff(tip_m, 2) / arguments["dt_s"] ** 2
+    # Right before the voltage of a row: 1.5 fine steps, seen through the sensor's delay of 0.11 ms.
+    at = np.arange(1, voltage_V.size) * fine - 2
+    error = record.tip_acceleration_m_s2[1:] - second[at]
+    assert np.sqrt(np.mean(error**2)) < 0.05 * np.std(second)
+    still = Simulator(rig, accelerometer=True).run(voltage_V, start=start, rng=np.random.default_rng(1))
+    assert np.array_equal(still.tip_acceleration_m_s2, record.tip_acceleration_m_s2)  # stated as noise-free
+
+
+def test_deflections_and_rates_come_in_pairs() -> None:
+    with pytest.raises(ValueError, match="as many rates as deflections"):
+        Simulator(paper_link()).run(np.zeros(5), start=Start(deflections=np.zeros(2)))
