@@ -198,6 +198,12 @@ def identify(
         str | None,
         typer.Option(help="Reference column of logs made in closed loop: identified in two stages."),
     ] = None,
+    input_limit: Annotated[
+        float | None,
+        typer.Option(
+            help="What the amplifier gives at most, in the input's unit: larger commands are taken as that."
+        ),
+    ] = None,
     pairs: Annotated[
         int | None, typer.Option(min=0, max=12, help="Pole pairs [default: from the data]")
     ] = None,
@@ -285,6 +291,7 @@ def identify(
             dt_s=dt_s,
             time_unit=time_unit,
             reference=reference,
+            input_limit=input_limit,
             validation=validation or [],
             options=options,
             level=level,

@@ -31,6 +31,7 @@ class Record:
     source : str. Where the data came from (the file), named in later error messages.
     time_column : TimeColumn or None
         What the file's time stamps were taken for; None where dt_s was given without any.
+    cut : int. Samples of the commanded input beyond what the amplifier gives (`limited`).
 
     Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
     above 1e100 (names the first one).
@@ -48,6 +49,7 @@ class Record:
     output_units: tuple[str, ...] = ()
     source: str = ""
     time_column: TimeColumn | None = None
+    cut: int = 0
 
     def __post_init__(self) -> None:
         for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
@@ -144,8 +146,14 @@ class Record:
         return self.each(lambda signal: signal[start:stop])
 
     def limited(self, limit: float) -> Record:
-        """The record with an input cut off at a limit, both signs: what an amplifier makes of commands."""
-        return replace(self, input=np.clip(self.input, -limit, limit))
+        """The record with an input cut off at a limit, both signs: what an amplifier makes of commands.
+
+        Raises ValueError unless the limit is positive.
+        """
+        if not limit > 0:
+            raise ValueError(f"the limit of the input must be positive; got {limit:g}")
+        cut = int(np.sum(np.abs(self.input) > limit))
+        return replace(self, input=np.clip(self.input, -limit, limit), cut=cut)
 
     def each(self, change: Callable[[RealArray], RealArray]) -> Record:
         """The record with its input, output and reference, (T, .) each, changed alike."""

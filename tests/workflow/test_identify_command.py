@@ -154,6 +154,29 @@ def test_what_to_do_stands_in_the_table_and_on_the_page(flexlink, undrawn, tmp_p
         assert sentence[1:] in text
 
 
+def test_commands_beyond_what_the_amplifier_gives_are_taken_as_that(flexlink, undrawn, tmp_path):
+    """A log of commands, its limit stated, gives the numbers of a log of what the amplifier gave."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.normal(size=400), 4)
+    given = np.clip(u, -1.5, 1.5)
+    y = scipy.signal.lfilter([0, 0.1], np.polymul([1, -0.9], [1, -1.9, 0.95]), given)
+    y += 0.01 * rng.normal(size=y.size)
+    found, page = {}, tmp_path / "page.html"
+    for name, column, more in (("given", given, ()), ("commanded", u, ("--input-limit", 1.5))):
+        log = write_log(tmp_path / f"{name}.csv", column, y)
+        call = ("identify", log, *COLUMNS, "--real", 1, "--pairs", 1, "--report", page, "--json", *more)
+        found[name] = flexlink(*call).document()
+    numbers = {name: document["numbers"] for name, document in found.items()}
+    for key in ("modes", "real_poles_z", "fit_estimation_percent"):
+        assert str(numbers["commanded"][key]).replace("commanded", "given") == str(numbers["given"][key])
+    cut = int(np.sum(np.abs(u) > 1.5))
+    told = f"{cut} samples of the commanded input went beyond the 1.5 V that the amplifier gives"
+    assert told in Page(page.read_text(encoding="utf-8")).text
+    assert any(told in row["value"] for row in found["commanded"]["table"])
+    # That the input stands at a limit is no doubt where it was stated.
+    assert [sum("clipped" in warning for warning in one["warnings"]) for one in numbers.values()] == [1, 0]
+
+
 def closed_loop_log(path: Path, seed: int) -> Path:
     """u = r - 2 y at the same sample; a mode at 30 rad/s with damping 0.1 and coloured noise in the loop."""
     rng = np.random.default_rng(seed)
@@ -306,6 +329,7 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--report", "{log}"), "that is a source already"),
         (("--report", "{out}/a", "--out", "{out}/a"), "that is --out already"),
         (("--reference", "r"), "no column 'r'"),
+        (("--input-limit", "0"), "log.csv: the limit of the input must be positive; got 0"),
         (("--level", "0.2"), "level: input should be greater than 0.5"),
         (("--promise", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
         (("--promise", "this amplitude", "--band", "10", "20"), "logs as measured, in open loop: no band"),

@@ -76,7 +76,7 @@ def test_commands_beyond_what_the_amplifier_gives_are_taken_as_that(run):
     loud = config_of(run.run).model_copy(update={"source": source.model_copy(update={"effects": effects})})
     first = make_records(StageInput(loud, None, Progress())).records[0]
     commanded = run.records.records[0].record
-    assert first.cut == commanded.n_samples
+    assert first.record.cut == commanded.n_samples
     np.testing.assert_allclose(first.record.input, 0.7 * commanded.input, rtol=1e-12)
     omega = np.geomspace(5.0, 60.0, 40)
     options = loud.channels[0].identification

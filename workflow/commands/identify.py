@@ -34,6 +34,7 @@ def identify_logs(
     dt_s: float | None = None,
     time_unit: str | None = None,
     reference: str | None = None,
+    input_limit: float | None = None,
     validation: Sequence[Path] = (),
     options: IdentOptions | None = None,
     level: float = 0.95,
@@ -49,12 +50,13 @@ def identify_logs(
 
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
     or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
-    logs made in closed loop, for the two-stage method. time_unit: of the time column, where its name does
-    not say it. band_rad_s: fit inside this band only, friction and drift below it and noise above it left
-    out. promise: what the ellipses are about, as `uncertainty.promise` of a configuration; output_name is
-    then the position of the shaft that the friction acts on. noise_order: largest order of the noise model
-    behind the ellipses; none given: 8, or 32 where that
-    leaves coloured residuals. Raises InputError: one line naming file, column or line.
+    logs made in closed loop, for the two-stage method. input_limit: what the amplifier gives at most; larger
+    commands in the logs are taken as that. time_unit: of the time column, where its name does not say it.
+    band_rad_s: fit inside this band only, friction and drift below it and noise above it left out. promise:
+    what the ellipses are about, as `uncertainty.promise` of a configuration; output_name is then the position
+    of the shaft that the friction acts on. noise_order: largest order of the noise model behind the ellipses;
+    none given: 8, or 32 where that leaves coloured residuals. Raises InputError: one line naming file, column
+    or line.
     """
     promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
@@ -68,7 +70,7 @@ def identify_logs(
 
     def read(path: Path) -> Record:
         with naming(str(path)):
-            return Record.from_file(
+            record = Record.from_file(
                 path,
                 [input_name],
                 [output_name],
@@ -77,6 +79,7 @@ def identify_logs(
                 time_unit=time_unit,
                 references=references,
             )
+            return record if input_limit is None else record.limited(input_limit)
 
     true_modes = truth.truth_beside([*logs, *validation], output_name)
     measured = [read(Path(path)) for path in logs]
@@ -94,7 +97,7 @@ def identify_logs(
         with_plot=report is not None,
         progress=progress,
     )
-    result = replace(result, true_modes=truth.beside(result.about, true_modes))
+    result = replace(result, true_modes=truth.beside(result.about, true_modes), input_limit=input_limit)
     if report is not None:
         from workflow.report.identify_page import identify_page  # loads matplotlib: a second
 
@@ -136,4 +139,5 @@ def _log_numbers(record: Record) -> dict[str, Any]:
         "time_column": codec.plain(record.time_column),
         "input_unit": "".join(record.input_units),
         "output_unit": "".join(record.output_units),
+        "input_cut_samples": record.cut,
     }

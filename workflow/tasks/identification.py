@@ -75,9 +75,8 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 two_stage=finding,
             )
             as_measured = [record.siso(channel.input, channel.output) for record in measured]
-            limited = any(item.cut for item in records.records)
-            if known is not None or limited:
-                found = clipped_as_measured(found, as_measured, limited=limited)
+            if known is not None:
+                found = clipped_as_measured(found, as_measured)
             found = with_warnings(found, amplitude_effects(as_measured))
             channels.append(
                 replace(
@@ -98,18 +97,13 @@ def with_warnings(found: IdentifiedChannel, more: Sequence[Finding]) -> Identifi
     return replace(found, identification=replace(found.identification, search=search))
 
 
-def clipped_as_measured(
-    found: IdentifiedChannel, measured: Sequence[Record], *, limited: bool = False
-) -> IdentifiedChannel:
-    """What stands at its limit is seen in what was measured, not in what taking the friction off has left.
-
-    limited: the input stands at the amplifier's limit, which is known; that is no doubt.
-    """
+def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
+    """What stands at its limit is seen in what was measured, not in what taking the friction off has left."""
     search = found.identification.search
     others = tuple(warning for warning in search.warnings if warning.kind is not FindingKind.CLIPPED)
-    doubts = [one for one in clipped(measured) if not (limited and one.values["signal"] == "input")]
     search = replace(search, warnings=others)
-    return with_warnings(replace(found, identification=replace(found.identification, search=search)), doubts)
+    found = replace(found, identification=replace(found.identification, search=search))
+    return with_warnings(found, clipped(measured))
 
 
 def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:

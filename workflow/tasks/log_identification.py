@@ -49,7 +49,7 @@ class LogIdentification:
     of a run's stages; `careful` says what to look at. The stabilisation plot is None where nobody asked for
     it. `true_modes`: beside each mode of `about` the true one, known of simulated logs. `promised`: what the
     ellipses are about; friction: identified, where that asks for it; equivalent: the viscous friction that
-    acts like it, where it asks for amplitudes.
+    acts like it, where it asks for amplitudes. input_limit: that the amplifier gives, where it was stated.
     """
 
     measured: tuple[Record, ...]
@@ -62,6 +62,7 @@ class LogIdentification:
     friction: FrictionFit | None = None
     equivalent: EquivalentFriction | None = None
     true_modes: tuple[TrueMode | None, ...] = ()
+    input_limit: float | None = None
 
 
 def identify_records(

@@ -38,12 +38,13 @@ def make_records(stage: StageInput) -> RecordsResult:
                 made.append(simulate_record(source, entry, stage.config.run.seed))
     else:
         made = [read_record(source, entry, stage.config.channels) for entry in source.records]
-    limit, items = source.input_limit or np.inf, []
-    for about, record in zip(entries, with_common_sampling_time(made), strict=True):
-        cut = int(np.sum(np.abs(record.input) > limit))
-        record = record.limited(limit) if cut else record
-        items.append(RunRecord(record, about.role, about.condition, about.remark, _kind(about), cut))
-    result = RecordsResult(tuple(items))
+    limit = source.input_limit or np.inf
+    result = RecordsResult(
+        tuple(
+            RunRecord(record.limited(limit), about.role, about.condition, about.remark, _kind(about))
+            for about, record in zip(entries, with_common_sampling_time(made), strict=True)
+        )
+    )
     for item in result.of_role("estimation"):
         refuse_constant_input(item.record)
     return result

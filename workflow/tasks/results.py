@@ -47,17 +47,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """A record of the run and what the configuration says about it.
-
-    kind: of the excitation, or "file". cut: samples of the commanded input beyond what the amplifier gives.
-    """
+    """A record of the run and what the configuration says about it; kind: of the excitation, or "file"."""
 
     record: Record
     role: Role
     condition: str | None
     remark: str
     kind: str = "file"
-    cut: int = 0
 
     @property
     def name(self) -> str:
