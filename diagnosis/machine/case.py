@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from diagnosis.machine.flexible_arm import FlexibleArm
+from diagnosis.machine.flexible_arm import FlexibleArm, Output
 from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
@@ -22,9 +22,14 @@ class Experiment:
     role : "estimation" or "held_out"
         Held-out records judge a repaired model; no parameter is fitted to them.
     voltage_V : (T,). Commanded voltage, held from its row to the next.
-    output : (T, 2). hub_angle_rad, tip_m as measured.
+    output : (T, Y). The outputs as measured, at the instants at which the voltage changes.
     kind : str. Sort of input, in the words of whoever made the record; only shown.
     closed_loop : bool. The command came from a feedback. It is still the exact input of the actuator.
+    outputs : names of the Y columns, the hub angle first.
+    reference_rad : (T,) or None. What the controller was to follow, in the zero of the encoder.
+    missing : rows that the log lacks; what stands there is interpolated.
+    readings : (R, Y). The outputs' values before any interpolation, for the steps of their sensors; default
+        `output`.
     """
 
     name: str
@@ -33,12 +38,19 @@ class Experiment:
     output: Real
     kind: str = ""
     closed_loop: bool = False
+    outputs: tuple[Output, ...] = ("hub_angle_rad", "tip_m")
+    reference_rad: Real | None = None
+    missing: tuple[int, ...] = ()
+    readings: Real | None = None
 
     def __post_init__(self) -> None:
         lock(self, "voltage_V", "output")
+        lock(self, *(name for name in ("reference_rad", "readings") if getattr(self, name) is not None))
         if self.voltage_V.ndim != 1:
             raise ValueError(f"experiment {self.name}: voltage_V must be (T,); got {self.voltage_V.shape}")
-        check_record(self, ("hub_angle_rad", "tip_m"))
+        if self.reference_rad is not None and self.reference_rad.shape != self.voltage_V.shape:
+            raise ValueError(f"experiment {self.name}: reference_rad must be (T,) like voltage_V")
+        check_record(self, self.outputs)
 
     @property
     def input(self) -> Real:
@@ -50,26 +62,39 @@ class Experiment:
 class Case(RecordedCase[Experiment]):
     """A rig as its makers know it, and what it did.
 
-    Raises ValueError if there is no estimation or no held-out experiment, a name comes twice, or a noise
-    level is zero (then nothing can be said to lie beyond the noise).
+    model_error : float. Share of the motion (RMS of an output about its mean) that a good model may miss.
+
+    Raises ValueError if there is no estimation or no held-out experiment, a name comes twice, experiments
+    differ in their outputs, or a noise level is zero (then nothing can be said to lie beyond the noise).
     """
 
     name: str
     rig: Rig
     experiments: tuple[Experiment, ...]
+    model_error: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if len({e.outputs for e in self.experiments}) > 1 or self.outputs[0] != "hub_angle_rad":
+            raise ValueError(
+                f"case {self.name}: all experiments need the same outputs, the hub angle first; got "
+                f"{sorted({e.outputs for e in self.experiments})}"
+            )
         if not np.all(self.noise > 0):
             raise ValueError(f"case {self.name}: sensors need a noise level above zero to judge a gap by")
 
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Names of the outputs of every experiment."""
+        return self.experiments[0].outputs
+
     @cached_property
     def steps(self) -> Real:
-        """(2,) steps of the quantisation grids that the outputs of all records lie on; 0: on none."""
-        outputs = [[e.output[:, k] for e in self.experiments] for k in range(2)]
-        return np.array([grid_step(y, float(sigma)) for y, sigma in zip(outputs, self.noise, strict=True)])
+        """(Y,) steps of the quantisation grids that the outputs of all records lie on; 0: on none."""
+        read = [e.output if e.readings is None else e.readings for e in self.experiments]
+        return np.array([grid_step([y[:, k] for y in read], float(s)) for k, s in enumerate(self.noise)])
 
     @property
     def machine(self) -> FlexibleArm:
         """The rig in the form that fits and evidence ask for (see `diagnosis.machine.machine_protocol`)."""
-        return FlexibleArm(self.rig)
+        return FlexibleArm(self.rig, self.outputs)

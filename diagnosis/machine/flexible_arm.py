@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -13,20 +14,33 @@ from plant.effects.search_space import Candidate, Scales
 from plant.rig import Rig
 from plant.simulate import Simulator
 
+Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2"]
+"""What a flexible link can be measured by, in the order of a record's columns."""
+
+_NOISE: dict[Output, str] = {
+    "hub_angle_rad": "hub_angle_noise_rad",
+    "tip_m": "tip_noise_m",
+    "tip_acceleration_m_s2": "tip_acceleration_noise_m_s2",
+}
 _WEIGHING = Weighing()
 _SPEED_SAMPLES = 10
 
 
 @dataclass(frozen=True, eq=False)
 class FlexibleArm:
-    """A rig with the registry of `plant.effects`: voltage (T, 1) -> hub_angle_rad, tip_m."""
+    """A rig with the registry of `plant.effects`: voltage (T, 1) -> the outputs (T, Y) that are measured."""
 
     rig: Rig
+    outputs: tuple[Output, ...] = ("hub_angle_rad", "tip_m")
 
     @property
     def noise(self) -> Real:
-        sensors = self.rig.sensors
-        return np.array([sensors.hub_angle_noise_rad, sensors.tip_noise_m])
+        """Raises ValueError if the rig states no noise level of an output."""
+        levels = [getattr(self.rig.sensors, _NOISE[name], None) for name in self.outputs]
+        for name, level in zip(self.outputs, levels, strict=True):
+            if level is None:
+                raise ValueError(f"the rig states no sensors.{_NOISE[name]}, and {name} is an output")
+        return np.array(levels)
 
     @property
     def tolerances(self) -> Mapping[str, float]:
@@ -41,7 +55,7 @@ class FlexibleArm:
         return self.rig
 
     def scaled(self, factors: Mapping[str, float]) -> FlexibleArm:
-        return FlexibleArm(self.rig.scaled(factors))
+        return FlexibleArm(self.rig.scaled(factors), self.outputs)
 
     def simulator(self, effects: Sequence[Effect]) -> Callable[[Real], Real]:
         prepared = Simulator(self.rig, effects)

@@ -104,6 +104,21 @@ class Table:
             raise ValueError(f"{self.path}: {error}") from None
         return column.seconds(stamps), replace(column, doubtful=column.doubtful_for(stamps))
 
+    def increasing(self, stamps: RealArray, name: str | None) -> None:
+        """Raises ValueError unless there are two time stamps at least, each later than the one before."""
+        if stamps.size < 2:
+            raise ValueError(
+                f"{self.path}: a single row of numbers; expected at least 2 to find the sampling time"
+            )
+        backwards = np.flatnonzero(~(np.diff(stamps) > 0))
+        if backwards.size:
+            row = int(backwards[0]) + 1
+            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else "split the file there"
+            raise ValueError(
+                f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
+                f"{stamps[row]:.9g} s; expected increasing time ({what})"
+            )
+
     def sampling_time(self, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
         """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both
         are there.
@@ -119,19 +134,8 @@ class Table:
                     f"{self.path}: give the time column or dt_s; the file has {_listed(self.names)}"
                 )
             return float(dt_s)
-        if stamps.size < 2:
-            raise ValueError(
-                f"{self.path}: a single row of numbers; expected at least 2 to find the sampling time"
-            )
+        self.increasing(stamps, name)
         interval = np.diff(stamps)
-        backwards = np.flatnonzero(~(interval > 0))
-        if backwards.size:
-            row = int(backwards[0]) + 1
-            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else "split the file there"
-            raise ValueError(
-                f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
-                f"{stamps[row]:.9g} s; expected increasing time ({what})"
-            )
         # The median says what the step is even where samples are lost; the mean over all is the better
         # estimate after.
         median = float(np.median(interval))

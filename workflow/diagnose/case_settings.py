@@ -1,0 +1,104 @@
+"""The keys of a case file (docs/case_files.md)."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from typing import Annotated, Literal, get_args
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from diagnosis.machine.flexible_arm import Output
+from ident.data.arrays import RealArray
+from plant.effects import EFFECTS
+from workflow.config.settings import Section, repeated
+
+RIG_FILE = "rig.toml"
+
+
+class Column(Section):
+    """Where a quantity stands in a log: quantity = scale * column + offset."""
+
+    column: str = Field(min_length=1, description="name of the column")
+    scale: float | None = Field(
+        None,
+        description="unit of the quantity per unit of the column, not 0; default 1, of time its header's",
+    )
+    offset: float = Field(0.0, description="added after scaling, in the unit of the quantity")
+
+    def quantity(self, values: RealArray) -> RealArray:
+        return values * (1.0 if self.scale is None else self.scale) + self.offset
+
+
+def _column(value: object) -> object:
+    return {"column": value} if isinstance(value, str) else value
+
+
+def _moves(column: Column) -> Column:
+    if column.scale == 0:
+        raise ValueError("scale must not be 0")
+    return column
+
+
+ColumnChoice = Annotated[Column, BeforeValidator(_column), AfterValidator(_moves)]
+
+
+class Columns(Section):
+    """Which column holds which quantity; what is left out keeps its default."""
+
+    time_s: ColumnChoice | None = Field(None, description="time stamp: when the outputs were sampled")
+    voltage_V: ColumnChoice | None = Field(None, description="commanded voltage")
+    hub_angle_rad: ColumnChoice | None = Field(None, description="hub angle")
+    tip_m: ColumnChoice | None = Field(None, description="tip position, arc plus deflection")
+    tip_acceleration_m_s2: ColumnChoice | None = Field(None, description="across the link, at the tip")
+    reference_rad: ColumnChoice | None = Field(None, description="controller's reference, where there is one")
+
+
+class ExperimentEntry(Section):
+    """One log."""
+
+    file: str = Field(min_length=1, description="log file, relative to the case file")
+    role: Literal["estimation", "held_out"]
+    kind: str = ""
+    samples: int | None = Field(None, ge=1, description="rows the file must have")
+    closed_loop: bool = False
+    description: str = ""
+    columns: Columns = Field(default_factory=Columns)
+
+    def column(self, quantity: str, of_all: Columns) -> Column:
+        """Where a quantity stands in this log: as said for it, as said for all logs, or under its own name."""
+        stated: Column | None = getattr(self.columns, quantity) or getattr(of_all, quantity)
+        return stated or Column(column=quantity)
+
+
+def _known_effect(name: str) -> str:
+    if name not in EFFECTS:
+        close = get_close_matches(name, EFFECTS, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"known effects: {', '.join(EFFECTS)}"
+        raise ValueError(f"no such effect {name!r} ({hint})")
+    return name
+
+
+def _hub_first(names: tuple[Output, ...]) -> tuple[Output, ...]:
+    if "hub_angle_rad" not in names or (twice := repeated(names)) is not None:
+        wrong = "without hub_angle_rad" if "hub_angle_rad" not in names else f"{twice} twice"
+        raise ValueError(
+            f"{', '.join(names) or 'none'}: {wrong}; expected hub_angle_rad and others, each once"
+        )
+    return tuple(name for name in get_args(Output) if name in names)
+
+
+class CaseSettings(Section):
+    """A case file."""
+
+    case: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=80)] | None = Field(
+        None, description="names the output files; letters, digits, '_', '-' and '.'"
+    )
+    rig: str = Field(RIG_FILE, min_length=1, description="rig file, relative to the case file")
+    dt_s: float | None = Field(None, gt=0, description="sampling period of logs without a time column [s]")
+    outputs: Annotated[tuple[Output, ...], AfterValidator(_hub_first)] = ("hub_angle_rad", "tip_m")
+    model_error: float = Field(
+        0.0, ge=0, lt=1, description="share of the motion's RMS that a good model may miss; 0: none"
+    )
+    suspected: tuple[Annotated[str, AfterValidator(_known_effect)], ...] = ()
+    columns: Columns = Field(default_factory=Columns)
+    experiments: tuple[ExperimentEntry, ...] = Field(min_length=1)
