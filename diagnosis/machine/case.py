@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from diagnosis.machine.flexible_arm import FlexibleArm, Output
+from diagnosis.machine.flexible_arm import NOISE, FlexibleArm, Output
 from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
@@ -80,8 +80,12 @@ class Case(RecordedCase[Experiment]):
                 f"case {self.name}: all experiments need the same outputs, the hub angle first; got "
                 f"{sorted({e.outputs for e in self.experiments})}"
             )
-        if not np.all(self.noise > 0):
-            raise ValueError(f"case {self.name}: sensors need a noise level above zero to judge a gap by")
+        for name, level in zip(self.outputs, self.noise, strict=True):
+            if not level > 0:
+                raise ValueError(
+                    f"case {self.name}: sensors.{NOISE[name]} is {level:g}; {name} needs a noise level above "
+                    "zero to judge a gap by"
+                )
 
     @property
     def outputs(self) -> tuple[Output, ...]:

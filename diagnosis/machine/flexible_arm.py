@@ -17,11 +17,13 @@ from plant.simulate import Simulator
 Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2"]
 """What a flexible link can be measured by, in the order of a record's columns."""
 
-_NOISE: dict[Output, str] = {
+NOISE: dict[Output, str] = {
     "hub_angle_rad": "hub_angle_noise_rad",
     "tip_m": "tip_noise_m",
     "tip_acceleration_m_s2": "tip_acceleration_noise_m_s2",
 }
+_TIP: Output = "tip_m"
+_ACCELERATION: Output = "tip_acceleration_m_s2"
 _WEIGHING = Weighing()
 _SPEED_SAMPLES = 10
 
@@ -35,12 +37,7 @@ class FlexibleArm:
 
     @property
     def noise(self) -> Real:
-        """Raises ValueError if the rig states no noise level of an output."""
-        levels = [getattr(self.rig.sensors, _NOISE[name], None) for name in self.outputs]
-        for name, level in zip(self.outputs, levels, strict=True):
-            if level is None:
-                raise ValueError(f"the rig states no sensors.{_NOISE[name]}, and {name} is an output")
-        return np.array(levels)
+        return np.array([self.rig.value(f"sensors.{NOISE[name]}") for name in self.outputs])
 
     @property
     def tolerances(self) -> Mapping[str, float]:
@@ -58,13 +55,15 @@ class FlexibleArm:
         return FlexibleArm(self.rig.scaled(factors), self.outputs)
 
     def simulator(self, effects: Sequence[Effect]) -> Callable[[Real], Real]:
-        prepared = Simulator(self.rig, effects)
-        return lambda inputs: prepared.run(inputs[:, 0]).output
+        prepared = Simulator(self.rig, effects, accelerometer=_ACCELERATION in self.outputs)
+        return lambda inputs: prepared.run(inputs[:, 0]).columns(self.outputs)
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
-        """Every effect of the registry that a fit can find; signed ones twice."""
+        """Every effect of the registry that a fit can find; signed ones twice. Those on the sensor of tip_m
+        only where it is measured."""
         scales = scales_of(self.rig, experiments)
-        return tuple(found for effect in EFFECTS.values() for found in effect.candidates(scales))
+        seen = [effect for effect in EFFECTS.values() if effect.group != "sensor" or _TIP in self.outputs]
+        return tuple(found for effect in seen for found in effect.candidates(scales))
 
 
 def scales_of(rig: Rig, experiments: Sequence[RecordOfMachine]) -> Scales:

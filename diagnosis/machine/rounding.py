@@ -11,8 +11,6 @@ from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from plant.effects.sensor import Quantisation
 
-_TIP = 1
-
 
 @dataclass(frozen=True)
 class Rounding:
@@ -37,13 +35,16 @@ def rounding_effect(case: CaseOfMachine) -> Rounding | None:
 
     Rounding errors are taken as uniform over a step: step / sqrt(12).
     """
-    if not isinstance(case, Case) or not case.steps[_TIP] > 0:
+    if not isinstance(case, Case) or "tip_m" not in case.outputs:
         return None
-    step = float(case.steps[_TIP])
+    tip = case.outputs.index("tip_m")
+    step = float(case.steps[tip])
+    if not step > 0:
+        return None
     # Values are written with six digits at least: of the outermost one, the step inherits that share.
-    widest = max(float(np.max(np.abs(e.output[:, _TIP]))) for e in case.experiments)
+    widest = max(float(np.max(np.abs(e.output[:, tip]))) for e in case.experiments)
     error = 1e-6 * step + 1e-6 * widest / max(widest / step, 1.0)
-    energy = (step / case.noise[_TIP]) ** 2 / 12 / case.noise.size
+    energy = (step / case.noise[tip]) ** 2 / 12 / case.noise.size
     return Rounding(
         effect=Quantisation(step_m=step),
         intervals={"step_m": (step - error, step + error)},

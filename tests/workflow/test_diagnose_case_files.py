@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.workflow.diagnosis_examples import FRICTION, write_case
@@ -65,6 +68,57 @@ def test_own_logs_with_a_column_map_give_the_same_case(folder, tmp_path):
         np.testing.assert_allclose(one.output, other.output, rtol=0, atol=1e-14)
 
 
+WORKSHOP = [
+    *(f"labelled/work-{n:02d}" for n in range(1, 25)),
+    *(f"sealed/case-{n:02d}" for n in range(1, 31)),
+]
+
+
+@pytest.mark.parametrize("name", WORKSHOP)
+def test_a_workshop_case_is_what_its_files_say(gap_cases, name):
+    folder = gap_cases / "workshop" / name
+    if not folder.is_dir():
+        pytest.skip(f"no such case: {folder}")
+    stated = tomllib.loads((folder / "case.toml").read_text())
+    case = load_case(folder).case
+    assert case.outputs == tuple(stated["outputs"])
+    assert case.model_error == stated["model_error"]
+    assert np.all(case.noise > 0)
+    answer = folder / "answer.toml"
+    records = tomllib.loads(answer.read_text())["records"] if answer.is_file() else {}
+    for entry, experiment in zip(stated["experiments"], case.experiments, strict=True):
+        log = pd.read_csv(folder / entry["file"])
+
+        def by_hand(quantity, log=log):
+            column = stated["columns"][quantity]
+            return column["scale"] * log[column["column"]].to_numpy() + column["offset"]
+
+        assert len(experiment.output) == len(log) + len(experiment.missing)
+        if experiment.name in records:
+            assert experiment.missing == tuple(records[experiment.name]["lost_rows"])
+        rows = np.setdiff1d(np.arange(len(experiment.output)), experiment.missing)
+        np.testing.assert_array_equal(experiment.voltage_V[rows], by_hand("voltage_V"))
+        late = np.max(np.abs(by_hand("time_s") / case.rig.sampling.dt_s - rows))
+        for k, quantity in enumerate(case.outputs):
+            read = by_hand(quantity)
+            # Late by that much of a step, an output is off by no more than that share of its largest slope.
+            moved = np.max(np.abs(experiment.output[rows, k] - read))
+            assert moved <= (0 if late < 1e-3 else 2 * late * np.max(np.abs(np.diff(read)))), quantity
+        assert (experiment.reference_rad is not None) == entry["closed_loop"]
+
+
+def test_only_the_stated_outputs_are_asked_for(folder):
+    head = 'case = "arm"\noutputs = ["hub_angle_rad"]\nmodel_error = 0.1'
+    edit(folder / "case.toml", 'case = "arm"', head)
+    for log in (folder / "experiments").iterdir():
+        log.write_text("\n".join(line.rpartition(",")[0] for line in log.read_text().splitlines()))
+    case = load_case(folder).case
+    assert case.model_error == 0.1
+    assert case.noise.tolist() == [case.rig.sensors.hub_angle_noise_rad]
+    assert case.machine.simulator(())(case.experiments[0].input).shape == (240, 1)
+    assert not {c.effect for c in case.machine.candidates(case.experiments)} & {"sensor_lag", "sensor_drift"}
+
+
 def test_the_input_hash_follows_every_file(folder):
     hashes = {load_case(folder).input_sha256, load_case(folder, "rig_uncertain.toml").input_sha256}
     edit(folder / "case.toml", 'kind = "prbs"', 'kind = "noise"')
@@ -115,6 +169,18 @@ SPOILT = {
     "no such column": (
         _case('role = "estimation"', 'role = "estimation"\ncolumns = { tip_m = "tip_mm" }'),
         ["01_prbs.csv", "no column 'tip_mm'", "time_s"],
+    ),
+    "no hub angle": (
+        _case('case = "arm"', 'case = "arm"\noutputs = ["tip_m"]'),
+        ["case.toml: outputs", "expected hub_angle_rad", "got tip_m"],
+    ),
+    "one column twice": (
+        _case('role = "estimation"', 'role = "estimation"\ncolumns = { tip_m = "hub_angle_rad" }'),
+        ["case.toml: experiments[0]", "hub_angle_rad and tip_m are both 'hub_angle_rad'"],
+    ),
+    "a restart": (
+        lambda folder: edit(folder / "experiments/01_prbs.csv", "\n0.5,", "\n0.4,"),
+        ["01_prbs.csv, line 102", "goes from 0.495 to 0.4 s"],
     ),
     "scale of nothing": (
         _case("[[experiments]]", '[columns]\ntip_m = { column = "tip_m", scale = 0 }\n\n[[experiments]]'),

@@ -65,7 +65,7 @@ class ExperimentEntry(Section):
     columns: Columns = Field(default_factory=Columns)
 
     def column(self, quantity: str, of_all: Columns) -> Column:
-        """Where a quantity stands in this log: as said for it, as said for all logs, or under its own name."""
+        """Where a quantity stands in this log: as said for it, for all logs, or under its own name."""
         stated: Column | None = getattr(self.columns, quantity) or getattr(of_all, quantity)
         return stated or Column(column=quantity)
 
@@ -79,11 +79,8 @@ def _known_effect(name: str) -> str:
 
 
 def _hub_first(names: tuple[Output, ...]) -> tuple[Output, ...]:
-    if "hub_angle_rad" not in names or (twice := repeated(names)) is not None:
-        wrong = "without hub_angle_rad" if "hub_angle_rad" not in names else f"{twice} twice"
-        raise ValueError(
-            f"{', '.join(names) or 'none'}: {wrong}; expected hub_angle_rad and others, each once"
-        )
+    if "hub_angle_rad" not in names or repeated(names) is not None:
+        raise ValueError(f"expected hub_angle_rad and others, each once; got {', '.join(names) or 'none'}")
     return tuple(name for name in get_args(Output) if name in names)
 
 
