@@ -20,9 +20,10 @@ from benchmarks.harness import Print, main, reading, timed
 from benchmarks.p2_plants import Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
+from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.uncertainty import FrequencyUncertainty, offset_disc_radius
-from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
+from ident.uncertainty.embedding import classical, tangent
 from ident.uncertainty.nominal import nominal_near
 from tests.ident.benchmark_plants import DT_S, Truth
 

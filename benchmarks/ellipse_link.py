@@ -27,7 +27,8 @@ import numpy as np
 
 from benchmarks.harness import Print, main, timed
 from control_design import SynthesisOptions, SynthesisResult, certify, synthesise
-from control_design.convex.youla import BracketProblem, YoulaOptions, youla_bracket
+from control_design.convex.convex_options import YoulaOptions
+from control_design.convex.youla import BracketProblem, youla_bracket
 from validation.example_plants import Scenario, flexible_link, flexible_link_specification
 
 REFERENCE: dict[Scenario, dict[int | str, float]] = {

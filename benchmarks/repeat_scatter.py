@@ -29,6 +29,7 @@ import numpy as np
 from benchmarks.harness import Print, data_folder, main, reading
 from ident import IdentOptions, Record, band_limited, identify
 from ident.basis.functions import nuisance_columns
+from ident.basis.options import EmbeddingOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.closed_loop import two_stage
@@ -38,7 +39,7 @@ from ident.data.repeats import repeats_of
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.autoregression import whitened
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding import tangent
 from workflow.text.templates import words
 
 HZ = 2 * np.pi

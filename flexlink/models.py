@@ -14,10 +14,11 @@ import ident
 from flexlink.shown import Shown, dressed
 from ident import GobfModel, IdentOptions, Poles, band_limited, identify_frf, identify_miso
 from ident.basis import posterior
+from ident.basis.options import EmbeddingOptions
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
 from plant.rig import one_line

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.ellipses import factor_matrices
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.identify import Identification, identify
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.one_input import Identification, identify
+from ident.uncertainty.embedding import tangent
 
 # A first stage that explains less of the input than this has gone wrong.
 _EXPLAINED_PERCENT = 50.0

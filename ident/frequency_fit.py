@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from ident.basis.model import GobfModel
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import pairs_outside
@@ -18,12 +18,12 @@ from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
 from ident.fit.refinement import pole_system
-from ident.identify import in_order
+from ident.one_input import in_order
 from ident.search.order_selection import OrderSelection, OrderStep
 from ident.search.pole_search import PoleSearch
 from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import SearchTrace
-from ident.uncertainty.embedding import EmbeddingOptions, embed_response
+from ident.uncertainty.embedding import embed_response
 
 # The covariances explain the residual if chi-square is no less probable than this.
 _LEVEL = 0.99

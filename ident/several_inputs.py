@@ -20,7 +20,7 @@ from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.regression import prepare_inputs
 from ident.identification import MisoIdentification
-from ident.identify import description, fitted_on_all, least_order, searched
+from ident.one_input import description, fitted_on_all, least_order, searched
 from ident.search.order_selection import Progress, silent
 from ident.search.pole_search import Fitted
 from ident.search.pole_warnings import pole_warnings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -14,7 +14,9 @@ from rich.table import Column, Table
 
 from workflow.engine import progress
 from workflow.engine.errors import printable
-from workflow.tasks.summary import RunSummary
+
+if TYPE_CHECKING:
+    from workflow.tasks.summary import RunSummary
 
 
 class TerminalProgress(progress.Progress):

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import control
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real
+
+if TYPE_CHECKING:
+    import control
 
 SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
 _NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}
@@ -123,6 +125,8 @@ class Cascade:
 
     def to_control(self, x: Sequence[float] | Real) -> control.StateSpace:
         """The cascade as `control.StateSpace`."""
+        import control  # here, because it brings a plotting library with it
+
         return control.ss(*self.state_space(x), self.dt_s)
 
 

@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
-import control
 import numpy as np
-import scipy.io
 import scipy.linalg
 
 from control_design.controllers.feedforward import FrictionFeedforward
@@ -19,6 +17,9 @@ from control_design.controllers.law import Law
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,8 @@ class Controller(Law):
 
     def save_mat(self, file: str | PathLike[str] | BinaryIO) -> None:
         """MATLAB 5 file (path or stream) with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
+        import scipy.io  # here and below: few use such files, and every command would wait for it
+
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         given = values.pop("feedforward")
         if given is not None:
@@ -113,6 +116,8 @@ class Controller(Law):
     @classmethod
     def load_mat(cls, path: str | PathLike[str]) -> Controller:
         """Inverse of `save_mat`."""
+        import scipy.io
+
         data = scipy.io.loadmat(Path(path), simplify_cells=True)
         known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
         unlimited = {key: None for key in ("input_limit", "rate_limit") if np.isinf(known.get(key, 0.0))}

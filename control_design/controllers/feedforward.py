@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from control_design.plants.ellipses import Real
 
@@ -55,6 +54,8 @@ class FrictionFeedforward:
 
     def signal(self, reference: Real, dt_s: float) -> Real:
         """What joins the command, (T,), for a reference (T,) that rested at zero before."""
+        from scipy.signal import lfilter  # here: every command would wait for it
+
         share = self.share(dt_s)
         friction = self.friction(np.diff(reference, prepend=0.0), dt_s)
         return np.asarray(lfilter([share], [1.0, share - 1.0], friction))

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-import control
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import frequency_response
 from ident.data.arrays import lock
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,8 @@ class Law:
 
     def to_control(self) -> control.StateSpace:
         """As `control.StateSpace`."""
+        import control  # here, because it brings a plotting library with it
+
         return control.ss(np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D), self.dt_s)
 
     def response(self, omega_rad_s: Real) -> Complex:

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import control
 import numpy as np
 import scipy.optimize
-from pydantic import Field
 
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
 from control_design.controllers.law import Law
+from control_design.convex.convex_options import ReferenceFilterOptions
 from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
 from control_design.convex.youla_basis import with_constant
 from control_design.plants.ellipses import Complex, Ellipses, Real, distance_to_minus_one, largest_ratio
-from control_design.plants.frequency_grid import GridOptions, programme_grid
+from control_design.plants.frequency_grid import programme_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
 from ident.basis.functions import basis_state_space
@@ -32,21 +32,6 @@ from ident.basis.poles import Poles
 
 _BOUNDARY_SAMPLES = 24  # of every ellipse
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
-
-
-class ReferenceFilterOptions(GridOptions):
-    """Order of the reference filter and how finely it is designed."""
-
-    order: int = Field(
-        default=1, ge=0, le=12, description="real poles, searched; unused if poles_rad_s is given"
-    )
-    poles_rad_s: tuple[float, ...] | None = Field(
-        default=None, description="decay rates of the real poles, rad/s; none = searched"
-    )
-    unit_gain: bool = Field(
-        default=True, description="F(1) = 1: what the loop does with constant references stays as it is"
-    )
-    exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")
 
 
 @dataclass(frozen=True, eq=False)

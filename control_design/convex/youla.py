@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from control_design.analysis.grids import Grids
 from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.convex.convex_options import YoulaOptions
 from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
 from control_design.convex.youla_basis import (
     AffineLoop,
@@ -36,31 +36,12 @@ from control_design.convex.youla_basis import (
 )
 from control_design.convex.youla_hull import hull_bound
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.frequency_grid import GridOptions
 from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
 
 _ELLIPSE_ROUNDS = 20  # turns of angles and Q
 Region = Literal["inscribed", "ellipse", "enclosing"]
-
-
-class YoulaOptions(GridOptions):
-    """How fine the basis and the grids are; the defaults take about two seconds a plant."""
-
-    real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
-    pairs_per_mode: int = Field(
-        default=12, ge=1, le=50, description="pole pairs of the basis at every mode and light zero"
-    )
-    grid_points: int = Field(default=200, ge=20, le=2000, description="logarithmic points of the programme")
-    mode_points: int = Field(
-        default=100, ge=0, le=1000, description="points spread around the flexible modes"
-    )
-    exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
-    hull: bool = Field(
-        default=False,
-        description="also bound from below by hulls of what every frequency allows; some seconds",
-    )
 
 
 @dataclass(frozen=True)

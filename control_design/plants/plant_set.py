@@ -5,13 +5,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, EvaluableUncertainty, Real, ResponseSet
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,8 @@ class Channel:
     level: float = 0.95
 
     def __post_init__(self) -> None:
+        import control  # here and below, because it brings a plotting library with it
+
         system = self.nominal
         if not isinstance(system, control.StateSpace):
             raise ValueError(
@@ -167,6 +171,8 @@ def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
     """A SISO discrete system behind a delay of whole samples; the delay's states come after its own."""
     if samples == 0:
         return system
+    import control
+
     a, b, c, d = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
     for _ in range(samples):
         n = a.shape[0]

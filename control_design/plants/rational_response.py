@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
@@ -12,6 +12,9 @@ import scipy.linalg
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.first_order import FirstOrder, Intervals
 from control_design.plants.weights import RationalWeight
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False)

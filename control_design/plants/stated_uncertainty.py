@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import control
 import numpy as np
 
 from control_design.plants.ellipses import Real, radius_of
@@ -16,6 +15,9 @@ from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
 from ident.uncertainty import FrequencyUncertainty
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,6 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from control_design.synthesis.work_pool import WorkPool
 
-__all__ = ["Progress", "SynthesisOptions", "synthesise"]
-
 Progress = Callable[[float, str], None]
 
 _STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too

@@ -32,7 +32,7 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw, less_friction
 from ident.friction.gauss_newton import WORTH, FrictionFit, descended, equations, least_squares, started
-from ident.identify import untested_model
+from ident.one_input import untested_model
 
 # Speeds over which friction may fall, in units of the rms speed, and the first guess of what it falls by.
 _FALLS, _EXCESS = (0.03, 0.1, 0.3), 0.1

@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.basis.model import GobfModel
+from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, linearised
-from ident.uncertainty.embedding import EmbeddingOptions, tangent_beside
+from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
 

@@ -18,11 +18,12 @@ from dataclasses import replace
 import numpy as np
 
 from ident.basis.model import GobfModel
+from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.ellipses import hotelling_widening
 from ident.data.record import Record
-from ident.uncertainty.embedding import EmbeddingOptions, common_fir_length, tangent, tangent_rows
+from ident.uncertainty.embedding import common_fir_length, tangent, tangent_rows
 from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 
 # Errors count together for as long as a response lasts: time constants of the slowest pole, and the longest

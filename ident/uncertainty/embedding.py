@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from ident.basis.model import GobfModel
+from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
 from ident.basis.structure import Structure
@@ -66,51 +65,6 @@ _FREE = 1e-9
 # Rounds of residuals -> noise model -> whitening: the first sees residuals of an unwhitened fit, the others
 # remove what is left of its bias.
 _NOISE_ROUNDS = 3
-
-
-class EmbeddingOptions(BaseModel):
-    """Settings of the uncertainty estimate."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    fir_length: int | None = Field(
-        default=None,
-        ge=1,
-        description="taps of the kernel on the remainder; none given: 150, less for short records",
-    )
-    hyperparameters: Literal["average", "maximum"] = Field(
-        default="average",
-        description="average the kernel over a grid weighted by restricted likelihood, or take the largest",
-    )
-    prior_no_remainder: float = Field(
-        default=0.5,
-        ge=0.0,
-        lt=1.0,
-        description="prior probability that the poles explain everything (alpha = 0)",
-    )
-    estimate_offset: bool = Field(default=True, description="a constant on each record's output")
-    estimate_initial_state: bool = Field(
-        default=True, description="free response of all poles in each record"
-    )
-    prior_missed_mode: float = Field(
-        default=0.5,
-        ge=0.0,
-        lt=1.0,
-        description="prior probability that the poles lack a lightly damped mode; 0: none is looked for. "
-        "For records only: a fit to a measured frequency response does not look for one",
-    )
-    coloured_noise: bool = Field(
-        default=False, description="whiten with an AR model of the residuals, three rounds"
-    )
-    max_ar_order: int = Field(default=8, ge=1, le=100, description="largest AR order that BIC may choose")
-    order_given: bool | None = Field(
-        default=None,
-        description="the order was stated, not chosen from these data: as likely as not it leaves out "
-        "what a choice would have kept; none given: no, or as the identification beside it says",
-    )
-    feedthrough: bool | None = Field(
-        default=None, description="direct term; none given: as the model has one or not"
-    )
 
 
 def tangent(

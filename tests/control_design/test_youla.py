@@ -6,7 +6,8 @@ import control
 import numpy as np
 import pytest
 
-from control_design.convex.youla import YoulaOptions, youla_bracket
+from control_design.convex.convex_options import YoulaOptions
+from control_design.convex.youla import youla_bracket
 from control_design.convex.youla_basis import coprime_factors
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight

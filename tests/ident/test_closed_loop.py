@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.closed_loop import indirect, two_stage
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.identify import identify
+from ident.one_input import identify
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding import tangent
 
 DT = 0.01
 B, A, GAIN = [0.0, 0.06, 0.05], [1.0, -1.62, 0.72], 1.5

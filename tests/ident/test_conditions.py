@@ -8,11 +8,11 @@ from scipy import signal
 from scipy.stats import chi2, f
 
 from ident.basis.model import GobfModel
+from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.record import Record
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
-from ident.uncertainty.embedding import EmbeddingOptions
 
 DT = 0.01
 OMEGA = np.geomspace(1.0, 300.0, 25)

@@ -7,13 +7,13 @@ import pytest
 from scipy import signal
 
 from ident.basis.model import GobfModel
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited
-from ident.identify import identify
+from ident.one_input import identify
 from ident.uncertainty.autoregression import fit_autoregression
-from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
+from ident.uncertainty.embedding import classical, tangent
 
 from .benchmark_plants import DT_S as DT
 from .three_mode_arm import BANDS, OMEGA, per_band, random_arm

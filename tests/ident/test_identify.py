@@ -11,7 +11,7 @@ import scipy.signal
 from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
 from ident.fit.residual_colour import residual_colour
-from ident.identify import identify
+from ident.one_input import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
 from tests.ident.findings import kinds
 from tests.workflow.test_codec import same

@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 from ident.basis.functions import free_response
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.closed_loop import two_stage
@@ -20,9 +20,8 @@ from ident.data.record import Record
 from ident.data.repeats import repeats_of
 from ident.data.signal_filter import band_limited
 from ident.frequency_fit import identify_frf
-from ident.identify import identify
+from ident.one_input import identify
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors
-from ident.uncertainty.embedding import EmbeddingOptions
 from tests.ident.findings import only
 
 HZ = 2 * np.pi

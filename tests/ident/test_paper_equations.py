@@ -32,7 +32,7 @@ from ident.basis.structure import Structure
 from ident.fit.least_squares import fit
 from ident.fit.problem import CandidateCost
 from ident.fit.regression import prepare
-from ident.identify import identify
+from ident.one_input import identify
 from ident.search.direct import minimise
 from ident.search.error_surface import error_surface
 from ident.search.pole_search import PoleSearch

@@ -10,7 +10,7 @@ import scipy.signal
 
 from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
-from ident.identify import identify
+from ident.one_input import identify
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction
 from tests.ident.findings import kinds, only
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.record import Record
 from ident.uncertainty.autoregression import autocovariance, first_rows, fit_autoregression, whitened
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
+from ident.uncertainty.embedding import tangent
 from ident.uncertainty.embedding_algebra import (
     conditional_posterior,
     evaluate_grid,

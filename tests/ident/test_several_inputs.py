@@ -14,7 +14,7 @@ from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.fit.least_squares import fit, pole_sensitivities, project
 from ident.fit.regression import prepare_inputs
-from ident.identify import identify
+from ident.one_input import identify
 from ident.several_inputs import identify_miso
 from ident.uncertainty.miso_uncertainty import response_uncertainty
 from tests.ident.benchmark_plants import p3

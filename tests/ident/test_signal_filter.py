@@ -8,7 +8,7 @@ import scipy.signal
 
 from ident.basis.options import IdentOptions
 from ident.data.signal_filter import band_limited, increments
-from ident.identify import identify
+from ident.one_input import identify
 from tests.ident.benchmark_plants import as_record
 
 

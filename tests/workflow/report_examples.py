@@ -22,7 +22,7 @@ from ident.checks.nuisance_tests import NuisanceTest
 from ident.checks.validation import ScatterRow, fit_on_fresh_data
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
-from ident.identify import Identification
+from ident.one_input import Identification
 from ident.search.order_selection import OrderStep
 from ident.search.search_trace import PolishedMinimum, SearchStage, SearchTrace
 from ident.stabilisation import Stabilisation

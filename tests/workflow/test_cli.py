@@ -443,3 +443,42 @@ def test_numpy_is_loaded_after_its_threads_are_settled(given):
     )
     expected = "False 2 None" if given else "False 1 1"
     assert answer.stdout.splitlines()[-1] == expected
+
+
+_ARM = FAST_ARM.read_text()
+REFUSED = [
+    ("run --config gone.toml", "cannot read gone.toml", True),
+    ("run --config bad.toml", "unknown key run.sead", False),
+    ("identify gone.csv --input u --output y --dt-s 1", "cannot read gone.csv", True),
+    ("identify log.csv --input v --output y --dt-s 1", "no column 'v'", True),
+    ("design gone.npz", "cannot read gone.npz", True),
+    ("design log.csv --spec wish.toml", "unknown key specification.bandwith_rad_s", True),
+    ("study --config gone.toml --out s", "cannot read gone.toml", True),
+    ("study --config study.toml --out s", "unknown key axis", True),
+    ("diagnose gone --out d", "cannot read gone", True),
+]
+
+
+@pytest.mark.parametrize(("command", "words", "without_arm"), REFUSED)
+def test_what_is_refused_is_refused_before_anything_slow_is_loaded(tmp_path, command, words, without_arm):
+    """A run configuration holds settings of the simulated arm, whose compiled code comes with them."""
+    (tmp_path / "bad.toml").write_text(_ARM.replace("\nseed =", "\nsead ="))
+    (tmp_path / "wish.toml").write_text("[specification]\nbandwith_rad_s = 1.0\n")
+    (tmp_path / "study.toml").write_text("[axis]\n'specification.bandwidth_rad_s' = [1.0]\n")
+    write_case(tmp_path, good_table())
+    slow = {"control", "matplotlib", "casadi", "nlopt"} | (
+        {"numba", "scipy.signal"} if without_arm else set()
+    )
+    code = "import sys\nfrom workflow.cli import main\n"
+    code += f"print(main({command.split()!r}), *({slow!r} & sys.modules.keys()))"
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert words in done.stderr
+    assert done.stdout.split() == ["2"]

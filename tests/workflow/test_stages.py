@@ -13,7 +13,7 @@ from control_design.analysis.certificate import certify
 from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
 from ident.data.record import Record
-from ident.identify import identify
+from ident.one_input import identify
 from plant import linear_arm, parse_effect, simulate
 from plant.presets import paper_link
 from tests.workflow.command import FAST_ARM

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.residual_tests import whiteness_test
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
-from ident.identify import Identification, identify
+from ident.one_input import Identification, identify
 from ident.uncertainty import FrequencyUncertainty
-from ident.uncertainty.embedding import EmbeddingOptions, classical, tangent
+from ident.uncertainty.embedding import classical, tangent
 from validation.paper.machines import LinkExperiment, PaperMachine, SimulationExample
 from validation.paper.methods import JUDGED_BAND_RAD_S, gobf_options
 from validation.paper.settings import PaperSettings

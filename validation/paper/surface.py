@@ -24,7 +24,7 @@ from ident.fit.least_squares import fit
 from ident.fit.problem import PoleProblem
 from ident.fit.refinement import refine
 from ident.fit.regression import prepare
-from ident.identify import identify
+from ident.one_input import identify
 from ident.search.direct import minimise
 from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.pole_search import PoleSearch

@@ -1,4 +1,4 @@
-"""`flexlink design`: one controller for one or several plants, from files."""
+"""One controller for one or several plants, from the files that describe them into its own."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from pathlib import Path
 
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
+from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
-from workflow.engine.errors import InputError, naming, need
+from workflow.engine.errors import InputError, naming
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.achievable_performance import bracket_numbers, find_bracket
 from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
 from workflow.tasks.design import certify_asked, find_design, joint_numbers
-from workflow.tasks.design_source import DesignFile, load_sources, read_design_file
+from workflow.tasks.design_source import load_sources
 from workflow.tasks.reference_filter import check_filter, find_filter
 from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, ReferenceFilterResult
 from workflow.tasks.summary import RunSummary
@@ -58,38 +59,23 @@ def _design(
         )
 
 
-def design_controller(
-    sources: Path | Sequence[Path],
-    specification_path: Path | None,
-    *,
-    out: Path | None = None,
-    seed: int = 2006,
+def designed(
+    paths: Sequence[Path], file: DesignFile, *, name: str, out: Path | None, seed: int
 ) -> RunSummary:
-    """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
-
-    Without a design file the source must be a run directory, whose own specification is taken. With `out` the
-    controller is written, by its ending as JSON, MAT file or C source, and beside it a reference filter if
-    there is one; a controller that is not certified carries that in its name. A specification that no
-    controller can meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
-    """
-    paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(path) for path in sources]
-    if not paths:
-        raise InputError("nothing to design for: give at least one run directory or file with a plant")
+    """`design_controller` with the design file that was read; name: what to call it in a complaint."""
     written = [] if out is None else targets(out)
     if out is not None and not out.is_dir() and out.suffix.lower() not in SUFFIXES:
         raise InputError(f"--out {out}: the ending must be one of {', '.join(SUFFIXES)}, or a directory")
     storage.refuse_in_the_way(
         paths, [("--out", one) for path in written for one in (path, filter_file(path))]
     )
-    need(*paths)
-    file = read_design_file(specification_path) if specification_path is not None else DesignFile()
     sources_found = load_sources(paths, file)
     asked = file.completed(sources_found[0].config)
     specification = file.specification if len(paths) > 1 else asked.specification
     if specification is None:
         raise InputError(f"{', '.join(map(str, paths))}: no specification for all: give --spec FILE")
     plants = [source.plant for source in sources_found]
-    check_filter(asked.reference_filter, plants[0].dt_s, str(specification_path or paths[0]))
+    check_filter(asked.reference_filter, plants[0].dt_s, name)
     done = _design(plants, specification, asked, seed)
     certificate, certified = done.certify.certificate, done.certify.certified
     synthesis, order = done.design.synthesis, specification.controller_order

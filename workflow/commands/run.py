@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from workflow.config.run_config import built_in_config, load_config
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
-from workflow.report.stage import REPORT
-from workflow.tasks.pipeline import config_of, rebuild_page, run_pipeline
-from workflow.tasks.summary import RunSummary
+
+if TYPE_CHECKING:
+    from workflow.tasks.summary import RunSummary
 
 
 def run_from_files(
@@ -33,9 +34,15 @@ def run_from_files(
     if config_path is not None:
         config, text = load_config(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
+        from workflow.tasks.pipeline import config_of
+
         config, text = config_of(RunDirectory.open(out)), ""
     else:
         config, text = built_in_config()
+    # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
+    from workflow.report.stage import REPORT
+    from workflow.tasks.pipeline import run_pipeline
+
     return run_pipeline(
         config,
         out if out is not None else default_directory(config.run.name),
@@ -49,4 +56,7 @@ def run_from_files(
 
 def rebuild_report(run: RunDirectory) -> RunSummary:
     """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing."""
+    from workflow.report.stage import REPORT
+    from workflow.tasks.pipeline import rebuild_page
+
     return rebuild_page(run, REPORT)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polypow
 from pydantic import ConfigDict, Field, model_validator
 
-from control_design.convex.reference_filter import ReferenceFilterOptions
-from control_design.convex.youla import YoulaOptions
+from control_design.convex.convex_options import ReferenceFilterOptions, YoulaOptions
 from control_design.specification import RationalWeight
 from workflow.config.settings import Section
 

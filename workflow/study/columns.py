@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from control_design.analysis.margins import Margins
-from workflow.tasks.achievable_performance import bracket_numbers
-from workflow.tasks.results import RunResults
+if TYPE_CHECKING:
+    from control_design.analysis.margins import Margins
+    from workflow.tasks.results import RunResults
 
 Number = float | int | None
 
@@ -69,6 +69,9 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     loop, inside the band of the specification where it names one. The measured peak of S is that of the arm
     that was identified, at the larger of two sizes.
     """
+    # Here: a study that is refused needs the names of the columns only.
+    from workflow.tasks.achievable_performance import bracket_numbers
+
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
     gamma, certify = results.design.gamma, results.certify
     found["design_gamma"] = _finite(gamma)

@@ -1,4 +1,4 @@
-"""A whole study as one library call."""
+"""The points of a study: computed, then table and page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from workflow.study.points import (
 )
 from workflow.study.rows import PointRow, csv_text, row_of, row_without_run
 from workflow.study.search import ParzenSearch
-from workflow.study.settings import StudyConfig, load_study
+from workflow.study.settings import StudyConfig
 from workflow.study.task import Done, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
@@ -39,31 +39,19 @@ from workflow.tasks.summary import RunSummary
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
 
 
-def run_study(
+def compute_study(
+    given: tuple[StudyConfig, str, Path | None],
     config_path: Path,
     out: Path,
     *,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    resume: bool = False,
-    replace: bool = False,
-    progress: Progress | None = None,
+    jobs: int | None,
+    scheduler: str | None,
+    resume: bool,
+    replace: bool,
+    progress: Progress,
 ) -> RunSummary:
-    """Compute every point of a study into `out`, then table and page; the table's numbers in the summary.
-
-    `resume` takes up the study that is there, `replace` deletes it first (when all that was given is right).
-
-    jobs: processes of this machine (default: one per processor). scheduler: address of a Dask scheduler whose
-    workers compute the points; what the points share is still computed here. A point that cannot be certified
-    is a result.
-
-    Raises InputError (one line) for anything wrong with what the user gave, StageError when points failed
-    (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
-    """
-    progress = progress or Progress()
-    if jobs is not None and scheduler is not None:
-        raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
-    study, text, base_path = load_study(config_path)
+    """`run_study` with the study that was read: settings, text, base."""
+    study, text, base_path = given
     base = load_base(study, config_path, base_path)
     maker = PointMaker(study, config_path, base)
     count, search = study.search.trials, None

@@ -14,7 +14,7 @@ from ident.data.finding import Finding, FindingKind
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
 from ident.friction import FrictionFit, fit_friction, refuse_unrecorded, refuse_unseen_shaft
-from ident.identify import identify
+from ident.one_input import identify
 from ident.stabilisation import stabilisation
 from workflow.config.run_config import Channel, Role
 from workflow.engine.errors import naming

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.basis.options import IdentOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import residual_advice, whiteness_test
@@ -27,8 +27,8 @@ from ident.friction import (
 from ident.friction import without_friction as behind_friction
 from ident.identification import Identification
 from ident.uncertainty import ResponsePosterior
-from ident.uncertainty.embedding import EmbeddingOptions, tangent
-from workflow.config.run_config import UncertaintyOptions
+from ident.uncertainty.embedding import tangent
+from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
 from workflow.tasks.identification import clipped_as_measured, identified_channel

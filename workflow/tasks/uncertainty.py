@@ -34,7 +34,8 @@ from ident.uncertainty.conditions import combine_posteriors, group_posteriors, r
 from ident.uncertainty.embedding import classical, tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
-from workflow.config.run_config import Channel, UncertaintyOptions
+from workflow.config.run_config import Channel
+from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import naming
 from workflow.tasks.identification import as_bounded
 from workflow.tasks.results import (

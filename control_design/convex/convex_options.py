@@ -1,0 +1,40 @@
+"""How finely the convex programmes are solved."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from control_design.plants.frequency_grid import GridOptions
+
+
+class YoulaOptions(GridOptions):
+    """How fine the basis and the grids are; the defaults take about two seconds a plant."""
+
+    real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
+    pairs_per_mode: int = Field(
+        default=12, ge=1, le=50, description="pole pairs of the basis at every mode and light zero"
+    )
+    grid_points: int = Field(default=200, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(
+        default=100, ge=0, le=1000, description="points spread around the flexible modes"
+    )
+    exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
+    hull: bool = Field(
+        default=False,
+        description="also bound from below by hulls of what every frequency allows; some seconds",
+    )
+
+
+class ReferenceFilterOptions(GridOptions):
+    """Order of the reference filter and how finely it is designed."""
+
+    order: int = Field(
+        default=1, ge=0, le=12, description="real poles, searched; unused if poles_rad_s is given"
+    )
+    poles_rad_s: tuple[float, ...] | None = Field(
+        default=None, description="decay rates of the real poles, rad/s; none = searched"
+    )
+    unit_gain: bool = Field(
+        default=True, description="F(1) = 1: what the loop does with constant references stays as it is"
+    )
+    exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")

@@ -1,0 +1,130 @@
+"""The TOML file of `flexlink design`: what a controller has to do, and what a plant's file does not say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, PrivateAttr, field_validator, model_validator
+
+from control_design.specification import RationalWeight, Specification
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from ident.basis.options import IdentOptions
+from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
+from workflow.config.settings import InputPath, Section, check, read_toml
+
+if TYPE_CHECKING:
+    from workflow.config.run_config import RunConfig
+
+
+class PlantSection(Section):
+    """[plant] of a design file: what a file with a plant does not say itself."""
+
+    integrators: int = Field(0, ge=0, le=2, description="poles at z = 1 that the plant is known to have")
+    dt_s: float | None = Field(None, gt=0, description="sampling period behind a measured response [s]")
+    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse of a measured response")
+    ellipses: Literal["measured", "fitted"] = Field(
+        "measured",
+        description="of a measured response: its own covariances at its own frequencies, or the posterior of "
+        "a model fitted to it, known at every frequency",
+    )
+    nominal: InputPath | None = Field(
+        None, description="model (state space) whose poles stand for a measured response; none: one is fitted"
+    )
+    fit: IdentOptions = Field(
+        default_factory=IdentOptions, description="how a model is fitted to a measured response"
+    )
+    pool_neighbours: int = Field(
+        0, ge=0, le=50, description="repeats: frequencies on either side whose scatter is pooled"
+    )
+    outlier_threshold: float | None = Field(
+        None, gt=0, description="repeats: points farther out, in robust standard deviations, are dropped"
+    )
+    between_points: Literal["nothing", "linear"] = Field(
+        "nothing", description="what the certificate may assume of ellipses between their own frequencies"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if "integrators" in self.fit.model_fields_set:
+            raise ValueError("fit.integrators: say integrators in [plant] itself")
+        if self.ellipses == "fitted" and self.nominal is not None:
+            raise ValueError("ellipses = 'fitted' makes its own nominal: leave nominal out")
+        return self
+
+
+class StatedUncertainty(Section):
+    """[uncertainty] of a design file: how far a plant may be from a plain state space."""
+
+    multiplicative: RationalWeight | None = Field(
+        None, description="|G - G_nom|/|G_nom| at most this: a number, or numerator and denominator in s"
+    )
+    additive: RationalWeight | None = Field(
+        None, description="|G - G_nom| at most this: a number, or numerator and denominator in s"
+    )
+
+    @field_validator("multiplicative", "additive", mode="before")
+    @classmethod
+    def _constant(cls, value: Any) -> Any:
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not 0 < value < np.inf:
+                raise ValueError(f"a constant radius must be positive and finite; got {value}")
+            return RationalWeight(numerator=(float(value),), denominator=(1.0,))
+        # A table seen before it is checked is no JSON any more, whose lists stand for tuples.
+        lists = value.items() if isinstance(value, Mapping) else ()
+        return {key: tuple(v) if isinstance(v, list) else v for key, v in lists} or value
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.multiplicative is None) == (self.additive is None):
+            raise ValueError("give either multiplicative or additive")
+        return self
+
+
+class DesignFile(Section):
+    """What a design file says; specification None where there is no file."""
+
+    specification: Specification | None = None
+    synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
+    plant: PlantSection = Field(default_factory=PlantSection)
+    uncertainty: StatedUncertainty | None = None
+    certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
+    achievable_performance: AchievableOptions = Field(
+        default_factory=lambda: AchievableOptions.model_validate({})
+    )
+    reference_filter: ReferenceFilterSettings | None = None
+    _name: str = PrivateAttr("a design file (--spec FILE)")
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    def completed(self, run: RunConfig | None) -> DesignFile:
+        """What is left out is as in a run; but a file without [reference_filter] asks for none, it has no
+        other way to."""
+        if run is None:
+            return self
+        lacking = {"specification", "synthesis", "certificate", "achievable_performance"}
+        if self.specification is None:
+            lacking.add("reference_filter")
+        return self.model_copy(update={name: getattr(run, name) for name in lacking - self.model_fields_set})
+
+
+def read_design_file(path: Path) -> DesignFile:
+    """TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
+    [uncertainty], [synthesis], [certificate], [achievable_performance] and [reference_filter]; of a run's
+    configuration all of these but the first two are taken. Raises InputError."""
+    _, document = read_toml(path)
+    known = DesignFile.model_fields.keys()
+    if "specification" not in document:
+        wishes = {key: document.pop(key) for key in document.keys() - known}
+        document["specification"] = wishes
+    elif "channels" in document:
+        # Which amplitudes the ellipses are about is up to whoever made them.
+        document["specification"].pop("amplitudes", None)
+        document = {key: value for key, value in document.items() if key in known}
+    found = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})
+    found._name = str(path)
+    return found

@@ -1,0 +1,67 @@
+"""How ellipses are made, and what response they are about."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from ident.basis.options import EmbeddingOptions
+
+_NUMBER = r"(\d+(?:\.\d+)?)"
+_RANGE = rf"amplitudes from {_NUMBER} to {_NUMBER}"
+
+
+class UncertaintyOptions(EmbeddingOptions):
+    """How the ellipses around an identified response are made (design 4.5)."""
+
+    method: Literal["tangent", "records", "conditions", "classical"] = Field(
+        "tangent",
+        description="tangent: covers noise; records: tangent per record plus the scatter between records, "
+        "for arms that differ from run to run or with amplitude (four records or more); conditions: the same "
+        "between records of different condition; classical: the published recipe, for comparison",
+    )
+    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
+    promise: str = Field(
+        "as recorded",
+        description="what response the ellipses are about: as recorded: a linear arm's, whatever is not "
+        "linear taken for noise. The others identify the dry friction of the control channel (its output "
+        "is the shaft's position). without friction: the linear arm behind it; this amplitude: the best "
+        "linear approximation, friction included, at the rms of the records' inputs; amplitudes from 2 to 8: "
+        "at any rms of the input between these, in its unit",
+    )
+
+    @field_validator("promise")
+    @classmethod
+    def _known(cls, promise: str) -> str:
+        if not re.fullmatch(f"as recorded|without friction|this amplitude|{_RANGE}", promise):
+            raise ValueError(
+                "expected 'as recorded', 'without friction', 'this amplitude' or 'amplitudes from 2 to 8', "
+                f"got {promise!r}"
+            )
+        return promise
+
+    @property
+    def friction_identified(self) -> bool:
+        """The dry friction of the shaft is identified with the arm."""
+        return self.promise != "as recorded"
+
+    @property
+    def about_amplitudes(self) -> bool:
+        """The ellipses hold at an amplitude, or over a range of them."""
+        return self.promise not in ("as recorded", "without friction")
+
+    @property
+    def amplitudes(self) -> tuple[float, float] | None:
+        """Smallest and largest rms of the input, where a range is promised."""
+        ends = re.fullmatch(_RANGE, self.promise)
+        return None if ends is None else (float(ends[1]), float(ends[2]))
+
+    @model_validator(mode="after")
+    def _friction_by_tangent(self) -> Self:
+        if self.friction_identified and self.method != "tangent":
+            raise ValueError(f"promise = {self.promise!r} goes with method = 'tangent', not {self.method!r}")
+        if self.amplitudes is not None and not 0 < self.amplitudes[0] < self.amplitudes[1]:
+            raise ValueError(f"promise = {self.promise!r}: the first amplitude must be positive and smaller")
+        return self
