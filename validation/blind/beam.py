@@ -9,6 +9,7 @@ nonlinearity sits in the kinetic energy. This is the truth of the blind protocol
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -30,12 +31,32 @@ class LinkBasis:
         the last row to the tip.
     weights_m : (G,). Quadrature weights over the length.
     stiffness : (M,). Squared natural frequencies [rad^2/s^2] of the clamped link.
+    tip_angle : (M,). P_i at the tip.
     """
 
     angle: Real
     integral: Real
     weights_m: Real
     stiffness: Real
+    tip_angle: Real
+
+
+@cache
+def _polynomials() -> tuple[Real, Real, Real, Real]:
+    """On (-1, 1): integral (G + 1, G), weights (G,), angles (G, N); and (G,) from the Gauss points to the tip."""
+    nodes, weights = legendre.leggauss(_POINTS)
+    integral = np.empty((_POINTS + 1, _POINTS))
+    to_series = np.linalg.inv(legendre.legvander(nodes, _POINTS - 1))
+    for h in range(_POINTS):
+        antiderivative = legendre.legint(to_series[:, h], lbnd=-1.0)
+        integral[:_POINTS, h] = legendre.legval(nodes, antiderivative)
+    integral[_POINTS] = weights
+    angles = np.empty((_POINTS, _POLYNOMIALS))
+    for k in range(_POLYNOMIALS):
+        series = np.zeros(k + 1)
+        series[k] = 1.0
+        angles[:, k] = legendre.legval(nodes, legendre.legint(series, lbnd=-1.0))
+    return integral, weights, angles, legendre.legvander(np.ones(1), _POINTS - 1)[0] @ to_series
 
 
 def link_basis(
@@ -52,25 +73,20 @@ def link_basis(
     """
     if not 1 <= n_modes <= _POLYNOMIALS - 3:
         raise ValueError(f"n_modes must be 1..{_POLYNOMIALS - 3}; got {n_modes}")
-    nodes, weights = legendre.leggauss(_POINTS)
-    integral = np.empty((_POINTS + 1, _POINTS))
-    to_series = np.linalg.inv(legendre.legvander(nodes, _POINTS - 1))
-    for h in range(_POINTS):
-        antiderivative = legendre.legint(to_series[:, h], lbnd=-1.0)
-        integral[:_POINTS, h] = legendre.legval(nodes, antiderivative)
-    integral[_POINTS] = weights
-    integral *= 0.5 * length_m
-    angles = np.empty((_POINTS, _POLYNOMIALS))
-    for k in range(_POLYNOMIALS):
-        series = np.zeros(k + 1)
-        series[k] = 1.0
-        angles[:, k] = legendre.legval(nodes, legendre.legint(series, lbnd=-1.0)) * 0.5 * length_m
+    unit_integral, weights, unit_angles, to_tip = _polynomials()
+    integral, angles = 0.5 * length_m * unit_integral, 0.5 * length_m * unit_angles
     stiffness = np.diag(bending_stiffness_Nm2 * length_m / (2 * np.arange(_POLYNOMIALS) + 1))
     deflection = integral @ angles
     lumps = mass_per_length_kg_m * 0.5 * length_m * np.append(weights, 0.0)
     lumps[-1] = tip_mass_kg
     mass = deflection.T @ (lumps[:, None] * deflection)
     squares, shapes = eigh(stiffness, mass)
+    # Polynomials of degree 12 at most: the Gauss points determine them at the tip.
+    modes = angles @ shapes[:, :n_modes]
     return LinkBasis(
-        angles @ shapes[:, :n_modes], integral, 0.5 * length_m * weights, np.asarray(squares[:n_modes])
+        modes,
+        integral,
+        0.5 * length_m * weights,
+        np.asarray(squares[:n_modes]),
+        to_tip @ modes,
     )

@@ -1,7 +1,7 @@
 """Compiled time stepping of the blind protocol's machine: classical Runge-Kutta, four stages.
 
-Rotary bodies are base, motor side, hub and link root; a matrix maps the free angles to these four, so that a
-rigid coupling is a missing coordinate and not a stiff spring. `p` is the record of constants of `Truth`.
+Rotary bodies are base, motor side, hub, link root and what is attached to the hub; a matrix maps the free angles
+to these five, so that a rigid coupling is a missing coordinate and not a stiff spring. `p` is the record of constants of `Truth`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import numpy.typing as npt
 
 Real = npt.NDArray[np.float64]
 
-BASE, MOTOR, HUB, ROOT = 0, 1, 2, 3
+BASE, MOTOR, HUB, ROOT, ATTACHED = 0, 1, 2, 3, 4
+BODIES = 5
 
 
 class Link(NamedTuple):
-    """Coupling (4, R) of the bodies to the free angles, and the link as in `beam.LinkBasis`.
+    """Coupling (5, R) of the bodies to the free angles, and the link as in `beam.LinkBasis`.
 
     lumps (G + 1,): mass at the Gauss points and at the tip; weights (G,).
     """
@@ -29,6 +30,7 @@ class Link(NamedTuple):
     lumps: Real
     weights: Real
     stiffness: Real
+    tip_angle: Real
 
 
 @numba.njit(cache=True)
@@ -55,6 +57,18 @@ def _stribeck(p: Any, stretch: float, speed: float) -> float:
 
 
 @numba.njit(cache=True)
+def _lagged(p: Any, asked: float, filtered: float, ready: float, after_s: float) -> float:
+    """Voltage at the motor behind two lags in series, whose outputs were filtered and ready after_s ago."""
+    slow = filtered - asked if p.lag > 0.0 else 0.0
+    if p.amplifier_lag <= 0.0:
+        return asked + (slow * np.exp(-after_s / p.lag) if p.lag > 0.0 else 0.0)
+    slow *= p.lag / (p.lag - p.amplifier_lag)
+    value = asked + (ready - asked - slow) * np.exp(-after_s / p.amplifier_lag)
+    return value + (slow * np.exp(-after_s / p.lag) if p.lag > 0.0 else 0.0)
+
+
+# Sums may be taken in any order, so that they run in parallel.
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 def _accelerations(
     p: Any,
     link: Link,
@@ -71,13 +85,13 @@ def _accelerations(
     a: Real,
 ) -> float:
     """Fill a with the accelerations; returns the derivative of the motor current."""
-    couple, angle, integral, lumps, weights, stiffness = link
+    couple, angle, integral, lumps, weights, stiffness, _ = link
     G, n = angle.shape
     R = couple.shape[1]
     size = R + n
-    body = np.zeros(4)
-    speed = np.zeros(4)
-    for i in range(4):
+    body = np.zeros(BODIES)
+    speed = np.zeros(BODIES)
+    for i in range(BODIES):
         for k in range(R):
             body[i] += couple[i, k] * q[k]
             speed[i] += couple[i, k] * v[k]
@@ -98,7 +112,9 @@ def _accelerations(
         a[i] = 0.0
         for j in range(size):
             M[i, j] = 0.0
-    ux, uy = np.cos(alpha), -np.sin(alpha)  # direction of in-plane gravity in this frame
+    # In-plane gravity in this frame.
+    ux = p.gravity * np.cos(alpha) + p.gravity_across * np.sin(alpha)
+    uy = p.gravity_across * np.cos(alpha) - p.gravity * np.sin(alpha)
     dx, dy = work[4], work[5]
     for g in range(G + 1):
         x, y = p.radius_m, 0.0
@@ -118,7 +134,7 @@ def _accelerations(
                 sy += w * cosine[h]
             dx[1 + i], dy[1 + i] = sx, sy
         lump = lumps[g]
-        fx, fy = lump * (p.gravity * ux - bx), lump * (p.gravity * uy - by)
+        fx, fy = lump * (ux - bx), lump * (uy - by)
         if p.drag > 0.0 and g < G:
             vx, vy = dx[0] * alpha_dot, dy[0] * alpha_dot
             for i in range(n):
@@ -167,9 +183,15 @@ def _accelerations(
     if p.stribeck_static > 0.0:
         stretch = _stribeck(p, dry[1] + shaft - from_angle, slip)
         torque -= p.stribeck_static / p.pre_sliding * stretch
+    if p.seal_static > 0.0:
+        stretch = _clipped(dry[2] + shaft - from_angle, -p.seal_sliding, p.seal_sliding)
+        torque -= p.seal_static / p.seal_sliding * stretch
+    torque -= p.gear_drag * abs(slip) * slip
+    if p.detent != 0.0:
+        torque += p.detent * np.sin(p.detent_cycles * shaft + p.detent_phase)
     if p.ripple != 0.0:
         torque += p.ripple * np.sin(p.ripple_cycles * shaft + p.ripple_phase)
-    force = np.zeros(4)
+    force = np.zeros(BODIES)
     force[MOTOR] += torque
     force[BASE] -= torque + p.base_stiffness * body[BASE] + p.base_damping * speed[BASE]
     force[MOTOR] -= p.cubic_spring * body[MOTOR] ** 3 + p.linear_spring * body[MOTOR]
@@ -178,6 +200,10 @@ def _accelerations(
     twist = p.joint_stiffness * (alpha - body[HUB]) + p.joint_damping * (alpha_dot - speed[HUB])
     force[HUB] += twist
     force[ROOT] -= twist
+    pull = p.attached_stiffness * (body[ATTACHED] - body[HUB])
+    pull += p.attached_damping * (speed[ATTACHED] - speed[HUB])
+    force[HUB] += pull
+    force[ATTACHED] -= pull
     if p.backlash >= 0.0:
         lead = body[MOTOR] - body[HUB]
         closing = speed[MOTOR] - speed[HUB]
@@ -189,13 +215,14 @@ def _accelerations(
         force[MOTOR] -= push
         force[HUB] += push
     for k in range(R):
-        for i in range(4):
+        for i in range(BODIES):
             a[k] += couple[i, k] * force[i]
         for m in range(R):
             M[k, m] += (
                 couple[BASE, k] * couple[BASE, m] * p.base_inertia
                 + couple[MOTOR, k] * couple[MOTOR, m] * p.motor_inertia
                 + couple[HUB, k] * couple[HUB, m] * p.hub_inertia
+                + couple[ATTACHED, k] * couple[ATTACHED, m] * p.attached_inertia
             )
     # Cholesky in the lower triangle, then the two triangular systems.
     for j in range(size):
@@ -220,7 +247,7 @@ def _accelerations(
 @numba.njit(cache=True)
 def _outputs(p: Any, link: Link, q: Real) -> tuple[float, float]:
     """Hub angle as an encoder sees it, and (r + L) theta + deflection across the turned hub axis."""
-    couple, angle, integral, _, _, _ = link
+    couple, angle, integral, _, _, _, _ = link
     G, n = angle.shape
     R = couple.shape[1]
     base, hub, root = 0.0, 0.0, 0.0
@@ -241,6 +268,32 @@ def _outputs(p: Any, link: Link, q: Real) -> tuple[float, float]:
 
 
 @numba.njit(cache=True)
+def _tip_acceleration(p: Any, link: Link, q: Real, v: Real, a: Real) -> float:
+    """What an accelerometer at the tip feels across the link there; a: accelerations of the coordinates."""
+    couple, angle, integral, _, _, _, tip_angle = link
+    G, n = angle.shape
+    R = couple.shape[1]
+    alpha_dot, alpha_ddot = 0.0, 0.0
+    for k in range(R):
+        alpha_dot += couple[ROOT, k] * v[k]
+        alpha_ddot += couple[ROOT, k] * a[k]
+    x, y = -p.radius_m * alpha_dot * alpha_dot, p.radius_m * alpha_ddot
+    for h in range(G):
+        turn, rate, gain = 0.0, alpha_dot, alpha_ddot
+        for i in range(n):
+            turn += angle[h, i] * q[R + i]
+            rate += angle[h, i] * v[R + i]
+            gain += angle[h, i] * a[R + i]
+        w = integral[G, h]
+        x -= w * (gain * np.sin(turn) + rate * rate * np.cos(turn))
+        y += w * (gain * np.cos(turn) - rate * rate * np.sin(turn))
+    turn = 0.0
+    for i in range(n):
+        turn += tip_angle[i] * q[R + i]
+    return float(y * np.cos(turn) - x * np.sin(turn))
+
+
+@numba.njit(cache=True)
 def run(
     p: Any,
     link: Link,
@@ -254,16 +307,21 @@ def run(
     hub_noise: Real,
     reference: Real,
     delay_samples: int,
+    start: Real,
+    encoder: Real,
     outputs: Real,
 ) -> bool:
-    """Step through T samples; outputs (T, 2) hub angle and tip behind a sensor lag, before every other error.
+    """Step through T samples; outputs (T, 3) hub angle, tip behind a sensor lag and acceleration across the tip,
+    before every other error.
 
     acting: (T,) voltage behind the static part of the amplifier, which acts late_s + delay_samples dt later;
-    with a `feedback` of (proportional, derivative, filter pole) that is not empty, `commanded` and `acting`
-    are filled in on the way: the command of row k + 1 is computed from the noisy hub angle of row k.
-    static: (gain, dead zone, limit, cubic part). Returns whether everything stayed finite and within a turn.
+    with a `feedback` of (proportional, derivative, filter pole, limit) that is not empty, `commanded` and `acting`
+    are filled in on the way: the command of row k + 1 is computed from the noisy hub angle of row k, as the
+    `encoder` (offset, step or 0, eccentricity, its phase) shows it. start: hub angle of the straight link at
+    rest, time of the first sample. static: (gain, dead zone, limit, cubic part, dead zone of the negative
+    side). Returns whether everything stayed finite and within a turn.
     """
-    couple, angle, integral, _, _, _ = link
+    couple, angle, integral, _, _, _, _ = link
     G, n = angle.shape
     R = couple.shape[1]
     size = R + n
@@ -279,9 +337,13 @@ def run(
     ki = np.zeros(4)
     M = np.zeros((size, size))
     work = np.zeros((6, max(G, n + 1) + 1))
-    dry = np.zeros(2)
-    current, filtered, seen_tip, rate = 0.0, 0.0, 0.0, 0.0
-    before = 0.0
+    dry = np.zeros(3)
+    current, filtered, ready, slewed, voltage, rate = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(R):
+        if couple[BASE, k] == 0.0:
+            q[k] = start[0]
+    before = start[0] + encoder[0]
+    _, seen_tip = _outputs(p, link, q)
     fractions = np.array([0.0, 0.5, 0.5, 1.0])
     T = commanded.size
     for k in range(T):
@@ -290,16 +352,27 @@ def run(
             return False
         outputs[k, 0] = hub
         outputs[k, 1] = seen_tip if p.sensor_lag > 0.0 else tip
+        shaft = 0.0
+        for m in range(R):
+            shaft += (couple[MOTOR, m] - couple[BASE, m]) * q[m]
+        at_s = start[1] + k * dt_s
+        _accelerations(p, link, arms, q, v, current, voltage, at_s, dry, shaft, work, M, kv[0])
+        outputs[k, 2] = _tip_acceleration(p, link, q, v, kv[0])
         if feedback.size:
-            measured = hub + hub_noise[k]
+            measured = hub + encoder[2] * (np.sin(hub + encoder[3]) - np.sin(encoder[3]))
+            measured += encoder[0] + hub_noise[k]
+            if encoder[1] > 0.0:
+                measured = encoder[1] * np.rint(measured / encoder[1])
             rate = feedback[2] * rate + (1 - feedback[2]) * (measured - before) / dt_s
             before = measured
             if k + 1 < T:
                 command = feedback[0] * (reference[k] - measured) - feedback[1] * rate
+                command = _clipped(command, -feedback[3], feedback[3])
                 commanded[k + 1] = np.round(command * 1e4) * 1e-4
                 value = static[0] * commanded[k + 1]
                 value += static[3] * value**3
-                size_V = min(max(abs(value) - static[1], 0.0), static[2])
+                dead = static[1] if value >= 0 else static[4]
+                size_V = min(max(abs(value) - dead, 0.0), static[2])
                 acting[k + 1] = size_V if value >= 0 else -size_V
         for piece in range(2):
             span = late_s if piece == 0 else dt_s - late_s
@@ -307,11 +380,17 @@ def run(
                 continue
             at = k - delay_samples - (1 if piece == 0 else 0)
             held = acting[at] if at >= 0 else 0.0
-            begin = k * dt_s + (0.0 if piece == 0 else late_s)
+            begin = start[1] + k * dt_s + (0.0 if piece == 0 else late_s)
             count = max(1, int(np.ceil(substeps * span / dt_s - 1e-9)))
             step = span / count
             for s in range(count):
                 time = begin + s * step
+                asked = held
+                if p.slew_V_s < 1e8:
+                    # Held at its mean over the substep.
+                    move = _clipped(held - slewed, -p.slew_V_s * step, p.slew_V_s * step)
+                    asked = slewed + 0.5 * move
+                    slewed += move
                 shaft = 0.0
                 for m in range(R):
                     shaft += (couple[MOTOR, m] - couple[BASE, m]) * q[m]
@@ -326,9 +405,7 @@ def run(
                             q_stage[i] = q[i] + f * kq[stage - 1, i]
                             v_stage[i] = v[i] + f * kv[stage - 1, i]
                         amps = current + f * ki[stage - 1]
-                    voltage = held
-                    if p.lag > 0.0:
-                        voltage = held + (filtered - held) * np.exp(-f / p.lag)
+                    voltage = _lagged(p, asked, filtered, ready, f)
                     for i in range(size):
                         kq[stage, i] = v_stage[i]
                     ki[stage] = _accelerations(
@@ -351,8 +428,10 @@ def run(
                     v[i] += step / 6 * (kv[0, i] + 2 * kv[1, i] + 2 * kv[2, i] + kv[3, i])
                 current += step / 6 * (ki[0] + 2 * ki[1] + 2 * ki[2] + ki[3])
                 current = _clipped(current, -p.current_limit, p.current_limit)
+                voltage = _lagged(p, asked, filtered, ready, step)
+                ready = voltage
                 if p.lag > 0.0:
-                    filtered = held + (filtered - held) * np.exp(-step / p.lag)
+                    filtered = asked + (filtered - asked) * np.exp(-step / p.lag)
                 turned, slip = -shaft, 0.0
                 for m in range(R):
                     turned += (couple[MOTOR, m] - couple[BASE, m]) * q[m]
@@ -361,6 +440,7 @@ def run(
                     dry[0] = _coulomb(p, dry[0] + turned)
                 if p.stribeck_static > 0.0:
                     dry[1] = _stribeck(p, dry[1] + turned, slip)
+                dry[2] = _clipped(dry[2] + turned, -p.seal_sliding, p.seal_sliding)
                 if p.sensor_lag > 0.0:
                     # Exact for a tip that moves linearly over the substep.
                     _, now = _outputs(p, link, q)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from validation.blind.beam import LinkBasis, link_basis
-from validation.blind.kernel import BASE, HUB, MOTOR, ROOT, Link, run
+from validation.blind.kernel import ATTACHED, BASE, BODIES, HUB, MOTOR, ROOT, Link, run
 
 Real = npt.NDArray[np.float64]
 RigTable = Mapping[str, Mapping[str, float]]
@@ -57,12 +57,21 @@ UNLISTED = (
     "winding_heat",  # resistance grows linearly in time during a record
     "encoder_eccentricity",  # a (sin(theta + p) - sin p) added to the hub angle
 )
+# The same, in workshop cases only (the other cases stay what they were).
+WORKSHOP_UNLISTED = (
+    "gear_drag",  # -c |omega| omega on the motor side
+    "asymmetric_dead_zone",  # dead zone of another width for each sign of the voltage
+    "slew_limit",  # voltage of the amplifier changes at a limited rate
+    "attachment",  # a body on the hub behind a torsion spring and damper
+)
 
 PRE_SLIDING_RAD = 1e-5
 _CONTACT_HZ = 180.0
 _FASTEST_MODE_HZ = 300.0
 # Substeps: enough for stability and a local error far below the noise; contacts want more.
 _FEWEST, _FEWEST_CONTACT, _MOST = 16, 128, 2000
+# A workshop's imperfections are far larger than what the fifth mode and finer steps add.
+_MODES_WORKSHOP, _FEWEST_WORKSHOP = 4, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +82,35 @@ class Feedback:
     proportional_V_rad: float
     derivative_Vs_rad: float
     filter_pole: float
+    limit_V: float = 1e9
+
+
+@dataclass(frozen=True)
+class Background:
+    """What no data sheet of a machine mentions; all of it absent by default.
+
+    Dry friction with a pre-sliding deflection, cogging torque, lag of the amplifier, tilt of the plane (in-plane
+    gravity and its direction, an angle of the link), and the encoder's zero and step (0: none).
+    """
+
+    dry_friction_Nm: float = 0.0
+    presliding_rad: float = 1e-3
+    cogging_Nm: float = 0.0
+    cogging_per_rev: float = 1.0
+    cogging_phase_rad: float = 0.0
+    amplifier_lag_s: float = 0.0
+    tilt_m_s2: float = 0.0
+    tilt_angle_rad: float = 0.0
+    hub_offset_rad: float = 0.0
+    encoder_step_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class Before:
+    """How a record begins: the link straight and at rest at this hub angle, rows_before rows before the first."""
+
+    start_angle_rad: float = 0.0
+    rows_before: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +122,7 @@ class Clean:
     tip_m: Real
     step_m: float
     clip_m: float
+    tip_acceleration_m_s2: Real
 
     def measured(self, noise: Real) -> Real:
         """(T, 2) with noise (T, 2) added and the tip quantised or clipped where its sensor does so."""
@@ -97,16 +136,22 @@ class Clean:
 class Truth:
     """A machine at rest, ready for any number of records; `effects` are tables with a name and parameters."""
 
-    def __init__(self, rig: RigTable, effects: Effects = ()) -> None:
+    def __init__(
+        self, rig: RigTable, effects: Effects = (), background: Background | None = None
+    ) -> None:
         by_name = {str(e["name"]): e for e in effects}
         if len(by_name) != len(effects):
             raise ValueError(f"an effect is given twice: {[e['name'] for e in effects]}")
         for name in by_name:
-            if name not in LISTED and name not in UNLISTED:
+            if name not in LISTED + UNLISTED + WORKSHOP_UNLISTED:
                 raise ValueError(f"unknown effect {name!r}; known: {', '.join(LISTED + UNLISTED)}")
         self.rig = rig
+        self.background = around = background or Background()
         self.dt_s = float(rig["sampling"]["dt_s"])
-        self.noise = np.array([rig["sensors"]["hub_angle_noise_rad"], rig["sensors"]["tip_noise_m"]])
+        sensors = rig["sensors"]
+        self.noise = np.array([sensors["hub_angle_noise_rad"], sensors.get("tip_noise_m", 0.0)])
+        # Nominal with workshop cases only; input_delay comes on top.
+        self.transport_delay_s = float(rig["sampling"].get("transport_delay_s", 0.0))
 
         def get(name: str, parameter: str, absent: float) -> float:
             return float(by_name[name][parameter]) if name in by_name else absent
@@ -118,11 +163,14 @@ class Truth:
         bending = link["youngs_modulus_Pa"] * section * link["thickness_m"] ** 2 / 12 * stiffness_ratio
         line = link["density_kg_m3"] * section
         tip_mass = rig["payload"]["mass_kg"] + get("tip_payload", "mass_kg", 0.0)
-        basis = _basis(link["length_m"], bending, line, tip_mass)
+        fixed = None if background is None else _MODES_WORKSHOP
+        self._fewest = _FEWEST if background is None else _FEWEST_WORKSHOP
+        basis = _basis(link["length_m"], bending, line, tip_mass, fixed)
         lumps = np.append(line * basis.weights_m, tip_mass)
         self._link = Link(
-            _couple(set(by_name)), basis.angle, basis.integral, lumps, basis.weights_m, basis.stiffness
-        )
+            _couple(set(by_name)), basis.angle, basis.integral, lumps, basis.weights_m, basis.stiffness,
+            basis.tip_angle,
+        )  # fmt: skip
         J = hub["inertia_kg_m2"] * get("hub_inertia", "ratio", 1.0)
         backlash = "backlash" in by_name
         contact = 0.21 * J * (2 * pi * _CONTACT_HZ) ** 2
@@ -145,7 +193,10 @@ class Truth:
             "torque_constant": motor["torque_constant_Nm_A"],
             "back_emf": motor["back_emf_Vs_rad"],
             "resistance": motor["resistance_ohm"],
-            "gravity": get("gravity", "acceleration_m_s2", 0.0),
+            # along the link axis at a hub angle of zero, and a quarter turn further
+            "gravity": get("gravity", "acceleration_m_s2", 0.0)
+            + around.tilt_m_s2 * float(np.cos(around.tilt_angle_rad)),
+            "gravity_across": around.tilt_m_s2 * float(np.sin(around.tilt_angle_rad)),
             # two friction elements: Coulomb, with a level of its own in the negative direction ...
             "dry_static": get("coulomb_friction", "torque_Nm", uneven[0]),
             "dry_minus": get("coulomb_friction", "torque_Nm", uneven[1]),
@@ -154,6 +205,12 @@ class Truth:
             "stribeck_coulomb": get("stribeck_friction", "coulomb_torque_Nm", 0.0),
             "stribeck_velocity": get("stribeck_friction", "stribeck_velocity_rad_s", 1.0),
             "pre_sliding": PRE_SLIDING_RAD,
+            "seal_static": around.dry_friction_Nm,
+            "seal_sliding": around.presliding_rad,
+            "gear_drag": get("gear_drag", "coefficient_Nms2", 0.0),
+            "detent": around.cogging_Nm,
+            "detent_cycles": around.cogging_per_rev,
+            "detent_phase": around.cogging_phase_rad,
             "ripple": get("torque_ripple", "amplitude_Nm", 0.0),
             "ripple_cycles": get("torque_ripple", "cycles_per_rev", 1.0),
             "ripple_phase": get("torque_ripple", "phase_rad", 0.0),
@@ -179,6 +236,11 @@ class Truth:
             "heating_1_s": get("winding_heat", "rate_1_s", 0.0),
             "drag": get("air_drag", "coefficient_Ns2_m3", 0.0),
             "sensor_lag": get("sensor_lag", "time_constant_s", 0.0),
+            "amplifier_lag": around.amplifier_lag_s,
+            "slew_V_s": get("slew_limit", "rate_V_s", 1e9),
+            "attached_stiffness": get("attachment", "stiffness_Nm_rad", 0.0),
+            "attached_damping": get("attachment", "damping_Nms", 0.0),
+            "attached_inertia": get("attachment", "inertia_kg_m2", 0.0),
         }
         kinds = [(name, np.float64) for name in constants]
         # A record with named fields, which compiled code reads as well.
@@ -186,9 +248,15 @@ class Truth:
         self.substeps = self._substeps()
 
     def record(
-        self, voltage_V: npt.ArrayLike, feedback: Feedback | None = None, hub_noise_rad: Real | None = None
+        self,
+        voltage_V: npt.ArrayLike,
+        feedback: Feedback | None = None,
+        hub_noise_rad: Real | None = None,
+        before: Before | None = None,
     ) -> Clean:
         """Drive the machine from rest; with a feedback the voltage is the controller's (and T its length).
+
+        The rows before the first one are returned too; time counts from the first.
 
         Raises ValueError where the motion leaves every bound (an unstable loop).
         """
@@ -196,47 +264,66 @@ class Truth:
         commanded = np.array(voltage_V, dtype=np.float64)
         static = self.amplifier
         acting = amplified(commanded, static)
-        whole, late = _delay(get("input_delay", "delay_s", 0.0), self.dt_s)
+        whole, late = _delay(get("input_delay", "delay_s", 0.0) + self.transport_delay_s, self.dt_s)
         if feedback is None:
             gains, reference = np.zeros(0), np.zeros(0)
             noise = np.zeros(0)
         else:
-            gains = np.array([feedback.proportional_V_rad, feedback.derivative_Vs_rad, feedback.filter_pole])
+            gains = np.array(
+                [
+                    feedback.proportional_V_rad,
+                    feedback.derivative_Vs_rad,
+                    feedback.filter_pole,
+                    feedback.limit_V,
+                ]
+            )
             reference = np.array(feedback.reference_rad)
             noise = np.zeros(commanded.size) if hub_noise_rad is None else np.array(hub_noise_rad)
             commanded[:], acting[:] = 0.0, 0.0
-        outputs = np.zeros((commanded.size, 2))
+        outputs = np.zeros((commanded.size, 3))
+        around, begin = self.background, before or Before()
+        start = np.array([begin.start_angle_rad, -begin.rows_before * self.dt_s])
+        encoder = np.array([around.hub_offset_rad, around.encoder_step_rad, *self._eccentricity])
         fine = run(
             p, self._link, acting, commanded, late, self.dt_s, self.substeps, gains, static, noise,
-            reference, whole, outputs,
+            reference, whole, start, encoder, outputs,
         )  # fmt: skip
         if not fine or not np.all(np.isfinite(outputs)):
             raise ValueError("the motion leaves every bound: the loop is unstable or the voltage too high")
-        return self.sensed(commanded, outputs)
+        return self.sensed(commanded, outputs, start[1])
 
     @property
     def amplifier(self) -> Real:
-        """(gain, dead zone, limit, cubic part) of the voltage's static path."""
+        """(gain, dead zone, limit, cubic part, negative dead zone) of the voltage's static path."""
         get = self.get
         return np.array(
             [
                 get("actuator_gain", "ratio", 1.0),
-                get("actuator_dead_zone", "width_V", 0.0),
+                get("asymmetric_dead_zone", "positive_V", get("actuator_dead_zone", "width_V", 0.0)),
                 get("actuator_saturation", "limit_V", 1e9),
                 get("amplifier_cubic", "cubic_1_V2", 0.0),
+                get("asymmetric_dead_zone", "negative_V", get("actuator_dead_zone", "width_V", 0.0)),
             ]
         )
 
-    def sensed(self, commanded: Real, outputs: Real) -> Clean:
-        """The record as sensors see it, but for noise, clipping and quantisation; outputs (T, 2)."""
+    @property
+    def _eccentricity(self) -> tuple[float, float]:
         get = self.get
-        hub, tip = outputs.T
-        a, phase = (
+        return (
             get("encoder_eccentricity", "amplitude_rad", 0.0),
             get("encoder_eccentricity", "phase_rad", 0.0),
         )
+
+    def sensed(self, commanded: Real, outputs: Real, from_s: float) -> Clean:
+        """The record as sensors see it, but for noise, clipping and quantisation, and the encoder's zero.
+
+        outputs (T, 3), the first of them at the time from_s.
+        """
+        get = self.get
+        hub, tip, acceleration = outputs.T
+        a, phase = self._eccentricity
         hub = hub + a * (np.sin(hub + phase) - np.sin(phase))
-        time = np.arange(commanded.size) * self.dt_s
+        time = from_s + np.arange(commanded.size) * self.dt_s
         tip = get("sensor_gain", "ratio", 1.0) * tip + get("sensor_drift", "rate_m_s", 0.0) * time
         return Clean(
             commanded,
@@ -244,17 +331,16 @@ class Truth:
             tip,
             get("quantisation", "step_m", 0.0),
             get("sensor_clipping", "limit_m", float("inf")),
+            acceleration,
         )
 
-    def _substeps(self) -> int:
-        """Substeps per sample from the fastest eigenvalue of the machine at rest, contacts closed."""
+    def linear(self) -> tuple[Real, Real, Real]:
+        """Mass, stiffness and damping at rest, contacts closed: free angles, then modes of the link."""
         p, link, couple = self._physics, self._link, self._link.couple
         R, n = couple.shape[1], link.stiffness.size
         size = R + n
         M, K, C = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
-        shapes = np.column_stack(
-            [p.radius_m + link.integral @ np.ones(link.weights.size), link.integral @ link.angle]
-        )
+        shapes = self.shapes
         to_link = np.zeros((1 + n, size))
         to_link[0, :R] = couple[ROOT]
         to_link[1:, R:] = np.eye(n)
@@ -268,17 +354,37 @@ class Truth:
             K[...] += k * np.outer(d, d)
             C[...] += c * np.outer(d, d)
 
-        bodies = ((BASE, p.base_inertia), (MOTOR, p.motor_inertia), (HUB, p.hub_inertia))
+        bodies = (
+            (BASE, p.base_inertia),
+            (MOTOR, p.motor_inertia),
+            (HUB, p.hub_inertia),
+            (ATTACHED, p.attached_inertia),
+        )
         for body, inertia in bodies:
             M[:R, :R] += inertia * np.outer(couple[body], couple[body])
         ground = np.zeros(R)
-        dry = (p.dry_static + p.stribeck_static) / p.pre_sliding
+        dry = (p.dry_static + p.stribeck_static) / p.pre_sliding + p.seal_static / p.seal_sliding
         motor = p.gear**2 * p.torque_constant * p.back_emf / p.resistance
         spring(couple[MOTOR], couple[BASE], dry, p.viscous + motor)
         spring(couple[BASE], ground, p.base_stiffness, p.base_damping)
         spring(couple[ROOT], couple[HUB], p.joint_stiffness, p.joint_damping)
+        spring(couple[ATTACHED], couple[HUB], p.attached_stiffness, p.attached_damping)
         if p.backlash >= 0:
             spring(couple[MOTOR], couple[HUB], p.contact_stiffness, p.contact_damping)
+        return M, K, C
+
+    @property
+    def shapes(self) -> Real:
+        """(G + 1, 1 + M): transverse displacement at the Gauss points and the tip, straight link."""
+        link = self._link
+        turned = self._physics.radius_m + link.integral @ np.ones(link.weights.size)
+        return np.column_stack([turned, link.integral @ link.angle])
+
+    def _substeps(self) -> int:
+        """Substeps per sample from the fastest eigenvalue of the machine at rest."""
+        p = self._physics
+        M, K, C = self.linear()
+        size = M.shape[0]
         A = np.zeros((2 * size, 2 * size))
         A[:size, size:] = np.eye(size)
         A[size:, :size] = -np.linalg.solve(M, K)
@@ -286,34 +392,41 @@ class Truth:
         fastest = float(np.max(np.abs(np.linalg.eigvals(A))))
         if p.inductance > 0:
             fastest = max(fastest, p.resistance / p.inductance)
-        fewest = _FEWEST_CONTACT if p.backlash >= 0 else _FEWEST
+        fewest = _FEWEST_CONTACT if p.backlash >= 0 else self._fewest
         return int(np.clip(np.ceil(self.dt_s * fastest / 0.9), fewest, _MOST))
 
 
 def amplified(voltage_V: Real, static: Real) -> Real:
-    """Gain, cubic part, dead zone and limit; see `Truth.amplifier`."""
+    """Gain, cubic part, dead zones and limit; see `Truth.amplifier`."""
     value = static[0] * voltage_V
     value = value + static[3] * value**3
-    return np.asarray(np.sign(value) * np.clip(np.abs(value) - static[1], 0.0, static[2]))
+    dead = np.where(value >= 0, static[1], static[4])
+    return np.asarray(np.sign(value) * np.clip(np.abs(value) - dead, 0.0, static[2]))
 
 
-def _basis(length: float, bending: float, line: float, tip_mass: float) -> LinkBasis:
+def _basis(length: float, bending: float, line: float, tip_mass: float, modes: int | None) -> LinkBasis:
+    if modes is not None:
+        return link_basis(length, bending, line, tip_mass, modes)
     every = link_basis(length, bending, line, tip_mass, 7)
     wanted = int(np.sum(np.sqrt(every.stiffness) / (2 * pi) < _FASTEST_MODE_HZ))
     return link_basis(length, bending, line, tip_mass, min(max(wanted, 4), 6))
 
 
 def _couple(names: set[str]) -> Real:
-    """(4, R): base, motor side, hub and link root as functions of the free angles."""
+    """(5, R): base, motor side, hub, link root and attachment as functions of the free angles."""
     columns = []
     groups = [[BASE]] if "base_compliance" in names else []
     rigid = [[MOTOR], [HUB], [ROOT]]
     if "joint_compliance" not in names:
         rigid = [[MOTOR], [HUB, ROOT]]
+    if "attachment" in names:
+        groups.append([ATTACHED])
+    else:
+        rigid[1] = [*rigid[1], ATTACHED]
     if "backlash" not in names:
         rigid = [rigid[0] + rigid[1], *rigid[2:]]
     for group in groups + rigid:
-        column = np.zeros(4)
+        column = np.zeros(BODIES)
         column[group] = 1.0
         columns.append(column)
     return np.ascontiguousarray(np.column_stack(columns))

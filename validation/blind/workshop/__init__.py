@@ -1,0 +1,1 @@
+"""Workshop cases of the blind protocol: imperfectly known machines, awkward logs, undocumented imperfections."""
