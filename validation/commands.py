@@ -45,8 +45,14 @@ def blind(
     ] = None,
     only: Annotated[
         str | None,
-        typer.Option(help="One sort of cases: none, faint, clear, pair or unlisted [default: a mix]."),
+        typer.Option(
+            help="One sort of cases: none, faint, clear, pair or unlisted [default: a mix]; "
+            "with --workshop: none, single, pair or unlisted."
+        ),
     ] = None,
+    workshop: Annotated[
+        bool, typer.Option("--workshop", help="Imperfectly known machines and awkward logs.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in --out; completed cases are reused.")
     ] = False,
@@ -60,7 +66,9 @@ def blind(
     from workflow.console import TerminalProgress, print_summary
 
     with TerminalProgress() as progress:
-        summary = run_blind(cases, seed, out, jobs=jobs, only=only, resume=resume, progress=progress)
+        summary = run_blind(
+            cases, seed, out, jobs=jobs, only=only, workshop=workshop, resume=resume, progress=progress
+        )
     if as_json:
         print_json(summary.numbers)
     else:

@@ -43,7 +43,7 @@ class LinkBasis:
 
 @cache
 def _polynomials() -> tuple[Real, Real, Real, Real]:
-    """On (-1, 1): integral (G + 1, G), weights (G,), angles (G, N); and (G,) from the Gauss points to the tip."""
+    """On (-1, 1): integral (G + 1, G), weights (G,), angles (G, N), and (G,) from the points to the tip."""
     nodes, weights = legendre.leggauss(_POINTS)
     integral = np.empty((_POINTS + 1, _POINTS))
     to_series = np.linalg.inv(legendre.legvander(nodes, _POINTS - 1))

@@ -19,12 +19,13 @@ import numpy as np
 import tomlkit
 import typer
 
-from validation.blind.cases import BlindCase, Sort, make_case, schedule
+from validation.blind.cases import BlindCase, make_case, schedule
 from validation.blind.rigs import rig_toml
+from validation.blind.workshop import generate as workshop_cases
 from workflow.engine.storage import write_text
 
 Answer = dict[str, Any]
-Plan = tuple[Sort, bool, str]
+Plan = tuple[Any, bool, str] | workshop_cases.WorkshopPlan
 
 
 def case_name(index: int) -> str:
@@ -75,10 +76,13 @@ def answer_toml(answer: Mapping[str, Any]) -> str:
 
 def _one(seed: int, out: Path, open_cases: bool, job: tuple[int, Plan]) -> Answer:
     index, plan = job
-    case = make_case(*plan, np.random.default_rng([seed, 1, index]))
     folder = out / case_name(index)
-    write_case(case, folder)
-    answer = {"case": folder.name, **case.answer}
+    if isinstance(plan, workshop_cases.WorkshopPlan):
+        answer = {"case": folder.name, **workshop_cases.write_case(seed, index, plan, folder)}
+    else:
+        case = make_case(*plan, np.random.default_rng([seed, 1, index]))
+        write_case(case, folder)
+        answer = {"case": folder.name, **case.answer}
     if open_cases:
         write_text(folder / "rig_exact.toml", rig_toml(answer["true_rig"]))
         write_text(folder / "answer.toml", answer_toml(answer))
@@ -92,19 +96,22 @@ def generate(
     *,
     jobs: int = 1,
     open_cases: bool = False,
-    only: Sort | None = None,
+    only: Any = None,
+    workshop: bool = False,
     finished: Mapping[str, Answer] | None = None,
     keep: Callable[[Answer], None] | None = None,
 ) -> list[Answer]:
     """Write the cases of a seed below `out` and return their answers; the same seed gives the same bytes.
 
     finished: answers of cases that are there already (case name -> answer) and are not drawn again.
+    only, workshop: one sort of cases, and workshop cases instead of the usual ones.
     keep: called with every answer as soon as its case is written.
     """
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
     work = partial(_one, seed, out, open_cases)
-    plans = schedule(n_cases, np.random.default_rng([seed, 0, n_cases]), only)
+    drawn = np.random.default_rng([seed, 0, n_cases])
+    plans: list[Plan] = [*(workshop_cases.workshop_schedule if workshop else schedule)(n_cases, drawn, only)]
     tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
 
     def take(done: Iterable[Answer]) -> None:
@@ -129,10 +136,11 @@ def main(
     open_cases: Annotated[
         bool, typer.Option("--open", help="Write answers and exact rigs beside the records.")
     ] = False,
+    workshop: Annotated[bool, typer.Option("--workshop", help="Imperfect machines, awkward logs.")] = False,
 ) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise typer.BadParameter("need an empty directory")
-    generate(cases, seed, out, jobs=jobs, open_cases=open_cases)
+    generate(cases, seed, out, jobs=jobs, open_cases=open_cases, workshop=workshop)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Compiled time stepping of the blind protocol's machine: classical Runge-Kutta, four stages.
 
-Rotary bodies are base, motor side, hub, link root and what is attached to the hub; a matrix maps the free angles
-to these five, so that a rigid coupling is a missing coordinate and not a stiff spring. `p` is the record of constants of `Truth`.
+Rotary bodies are base, motor side, hub, link root and what is attached to the hub; a matrix maps the free
+angles to these five, so that a rigid coupling is a missing coordinate and not a stiff spring. `p` is the
+record of constants of `Truth`.
 """
 
 from __future__ import annotations
@@ -61,10 +62,10 @@ def _lagged(p: Any, asked: float, filtered: float, ready: float, after_s: float)
     """Voltage at the motor behind two lags in series, whose outputs were filtered and ready after_s ago."""
     slow = filtered - asked if p.lag > 0.0 else 0.0
     if p.amplifier_lag <= 0.0:
-        return asked + (slow * np.exp(-after_s / p.lag) if p.lag > 0.0 else 0.0)
+        return float(asked + (slow * np.exp(-after_s / p.lag) if p.lag > 0.0 else 0.0))
     slow *= p.lag / (p.lag - p.amplifier_lag)
     value = asked + (ready - asked - slow) * np.exp(-after_s / p.amplifier_lag)
-    return value + (slow * np.exp(-after_s / p.lag) if p.lag > 0.0 else 0.0)
+    return float(value + (slow * np.exp(-after_s / p.lag) if p.lag > 0.0 else 0.0))
 
 
 # Sums may be taken in any order, so that they run in parallel.
@@ -311,15 +312,15 @@ def run(
     encoder: Real,
     outputs: Real,
 ) -> bool:
-    """Step through T samples; outputs (T, 3) hub angle, tip behind a sensor lag and acceleration across the tip,
-    before every other error.
+    """Step through T samples; outputs (T, 3) hub angle, tip behind a sensor lag and acceleration across the
+    tip, before every other error.
 
     acting: (T,) voltage behind the static part of the amplifier, which acts late_s + delay_samples dt later;
-    with a `feedback` of (proportional, derivative, filter pole, limit) that is not empty, `commanded` and `acting`
-    are filled in on the way: the command of row k + 1 is computed from the noisy hub angle of row k, as the
-    `encoder` (offset, step or 0, eccentricity, its phase) shows it. start: hub angle of the straight link at
-    rest, time of the first sample. static: (gain, dead zone, limit, cubic part, dead zone of the negative
-    side). Returns whether everything stayed finite and within a turn.
+    with a `feedback` of (proportional, derivative, filter pole, limit) that is not empty, `commanded` and
+    `acting` are filled in on the way: the command of row k + 1 is computed from the noisy hub angle of row k,
+    as the `encoder` (offset, step or 0, eccentricity, its phase) shows it. start: hub angle of the straight
+    link at rest, time of the first sample. static: (gain, dead zone, limit, cubic part, dead zone of the
+    negative side). Returns whether everything stayed finite and within a turn.
     """
     couple, angle, integral, _, _, _, _ = link
     G, n = angle.shape
@@ -389,7 +390,7 @@ def run(
                 if p.slew_V_s < 1e8:
                     # Held at its mean over the substep.
                     move = _clipped(held - slewed, -p.slew_V_s * step, p.slew_V_s * step)
-                    asked = slewed + 0.5 * move
+                    asked = slewed + move * (1.0 - 0.5 * abs(move) / (p.slew_V_s * step))
                     slewed += move
                 shaft = 0.0
                 for m in range(R):

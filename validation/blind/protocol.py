@@ -17,10 +17,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from validation.blind.cases import SORTS, Sort
+from validation.blind.cases import SORTS
 from validation.blind.generate import Answer, folder_hash, generate
 from validation.blind.report import confusion_figure, summary, text
-from validation.blind.scores import scores
+from validation.blind.scores import GROUPS, scores
 from validation.blind.seal import (
     COMMITMENT,
     SEAL_DIRECTORY,
@@ -30,6 +30,8 @@ from validation.blind.seal import (
     write_private,
 )
 from validation.blind.worker import BlindCase, diagnose_folder, failed
+from validation.blind.workshop.generate import SHARES
+from validation.blind.workshop.score import FAMILIES
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.executor import Failure, LocalProcesses
@@ -60,6 +62,7 @@ def run_blind(
     *,
     jobs: int | None = None,
     only: str | None = None,
+    workshop: bool = False,
     resume: bool = False,
     progress: Progress | None = None,
     diagnose: Diagnose = diagnose_folder,
@@ -67,21 +70,23 @@ def run_blind(
     """Generate, seal, diagnose, open, score. Raises InputError, one line, for whatever was given wrongly.
 
     only: cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
+    workshop: imperfectly known machines and awkward logs; their sorts are none, single, pair and unlisted.
     diagnose: case folder -> document; runs in processes that are kept out of the run's directory.
     """
     progress = progress or Progress()
-    sort = next((name for name in SORTS if name == only), None)
-    if only is not None and sort is None:
-        raise InputError(f"--only must be one of {', '.join(SORTS)}; got {only!r}")
+    sorts = [*(SHARES if workshop else SORTS)]
+    if only is not None and only not in sorts:
+        raise InputError(f"--only must be one of {', '.join(sorts)}; got {only!r}")
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     if n_cases < 1 or seed < 0:
         raise InputError(f"--cases must be at least 1 and --seed at least 0; got {n_cases} and {seed}")
     width = jobs or os.cpu_count() or 1
-    settings = {"format": _FORMAT, "cases": n_cases, "seed": seed}
-    _begin(BlindDirectory(out), settings if sort is None else {**settings, "only": sort}, resume)
+    settings: dict[str, Any] = {"format": _FORMAT, "cases": n_cases, "seed": seed}
+    settings |= ({"only": only} if only else {}) | ({"workshop": True} if workshop else {})
+    _begin(BlindDirectory(out), settings, resume)
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
-    _sealed_cases(out, n_cases, seed, width, sort, progress)
+    _sealed_cases(out, settings, width, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
     _predict(out, names, width, diagnose, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
@@ -91,7 +96,7 @@ def run_blind(
     )
     labels = open_seal(out)
     _check_cases(out, labels)
-    document = _scored(predictions, labels)
+    document = _scored(predictions, labels, FAMILIES if workshop else GROUPS)
     document["commitment"] = read_json(out / COMMITMENT)["sha256"]
     document["settings"] = read_json(out / "blind.json")
     write_text(out / "scores.json", plain_text(document))
@@ -118,10 +123,9 @@ def _begin(store: BlindDirectory, settings: Mapping[str, Any], resume: bool) -> 
             )
 
 
-def _sealed_cases(
-    out: Path, n_cases: int, seed: int, jobs: int, only: Sort | None, progress: Progress
-) -> None:
+def _sealed_cases(out: Path, settings: Mapping[str, Any], jobs: int, progress: Progress) -> None:
     """Cases and closed seal; an interrupted generation goes on where it stopped."""
+    n_cases = settings["cases"]
     taken_up = (out / COMMITMENT).is_file()
     with progress.stage("cases", taken_up=taken_up) as update:
         if taken_up:
@@ -136,7 +140,16 @@ def _sealed_cases(
             count += 1
             update(count / n_cases, f"{count} of {n_cases}")
 
-        answers = generate(n_cases, seed, out / "cases", jobs=jobs, only=only, finished=finished, keep=keep)
+        answers = generate(
+            n_cases,
+            settings["seed"],
+            out / "cases",
+            jobs=jobs,
+            only=settings.get("only"),
+            workshop="workshop" in settings,
+            finished=finished,
+            keep=keep,
+        )
         close_seal(out, answers)
         shutil.rmtree(parts)
 
@@ -161,8 +174,10 @@ def _check_cases(out: Path, labels: Sequence[Answer]) -> None:
             raise InputError(f"{out}: records of {label['case']} are not those the labels were sealed for")
 
 
-def _scored(predictions: Sequence[Mapping[str, Any]], labels: Sequence[Answer]) -> dict[str, Any]:
-    document: dict[str, Any] = {"diagnosis": scores(predictions, labels), "baselines": {}}
+def _scored(
+    predictions: Sequence[Mapping[str, Any]], labels: Sequence[Answer], groups: Mapping[str, str]
+) -> dict[str, Any]:
+    document: dict[str, Any] = {"diagnosis": scores(predictions, labels, groups), "baselines": {}}
     methods = {name: None for p in predictions for name in p.get("baselines", {})}
     for method in methods:
         answers = [
@@ -170,6 +185,6 @@ def _scored(predictions: Sequence[Mapping[str, Any]], labels: Sequence[Answer]) 
             or {"case": p["case"], "verdict": "failed", "effects": [], "combination": []}
             for p in predictions
         ]
-        document["baselines"][method] = scores(answers, labels)
+        document["baselines"][method] = scores(answers, labels, groups)
     document["failed"] = {p["case"]: p["reason"] for p in predictions if p["verdict"] == "failed"}
     return document

@@ -2,7 +2,8 @@
 
 Predictions are documents of `flexlink diagnose` (verdict, effects with probabilities best first, combination,
 gap_after), answers are those of the gap cases (verdict, effects with parameters, max_ratio, pooled_gap);
-"nominal" in an answer says exact or uncertain and is optional.
+"nominal" in an answer says exact or uncertain and is optional. The ratio of a workshop case is that of the
+major effects over what undocumented imperfections leave.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,8 @@ from plant.effects import EFFECTS
 
 Document = Mapping[str, Any]
 
+GROUPS: Mapping[str, str] = MappingProxyType({name: effect.group for name, effect in EFFECTS.items()})
+
 CLEAR, FAINT = 3.0, (0.3, 1.5)
 CONFIDENT = 0.8
 _BINS = 10
@@ -28,7 +32,7 @@ _BINS = 10
 _LEAST_GAP = 0.02
 
 
-def _case(said: Document, true: Document) -> dict[str, Any]:
+def _case(said: Document, true: Document, groups: Mapping[str, str]) -> dict[str, Any]:
     """One row: what was said and what is true.
 
     kind: none, single, several or unknown. first: the answer in one word, none, unknown or the first effect.
@@ -51,7 +55,7 @@ def _case(said: Document, true: Document) -> dict[str, Any]:
     if probability is None and verdict == "none" and effects:
         probability = 1.0 - sum(float(e.get("probability") or 0.0) for e in effects.values())
     ranking = list(dict.fromkeys([first, *effects]))
-    family, *families = (EFFECTS[name].group if name in EFFECTS else name for name in (first, *names))
+    family, *families = (groups.get(name, name) for name in (first, *names))
     hidden = ", ".join(str(e["name"]) for e in true.get("unlisted") or ())
     matches = [
         (key, float(value), effects[effect["name"]], float(estimate))
@@ -63,7 +67,7 @@ def _case(said: Document, true: Document) -> dict[str, Any]:
     return {
         "case": true["case"],
         "nominal": str(true.get("nominal", "exact")),
-        "ratio": float(true.get("max_ratio", math.nan)),
+        "ratio": float(true.get("max_ratio", true.get("major_over_background_realised", math.nan))),
         "kind": kind,
         "true": " + ".join(names) or hidden or kind,
         "verdict": verdict,
@@ -97,8 +101,10 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def scores(predictions: Sequence[Document], answers: Sequence[Document]) -> dict[str, Any]:
-    """Everything that can be said about these predictions.
+def scores(
+    predictions: Sequence[Document], answers: Sequence[Document], groups: Mapping[str, str] = GROUPS
+) -> dict[str, Any]:
+    """Everything that can be said about these predictions; groups: effect -> family.
 
     Returns
     -------
@@ -115,7 +121,7 @@ def scores(predictions: Sequence[Document], answers: Sequence[Document]) -> dict
         raise ValueError(
             f"predictions and answers must name the same cases, each once; differing: {', '.join(odd) or '-'}"
         )
-    cases = pd.DataFrame([_case(said[name], true[name]) for name in sorted(true)])
+    cases = pd.DataFrame([_case(said[name], true[name], groups) for name in sorted(true)])
     several, unknown = cases[cases.kind == "several"], cases[cases.kind == "unknown"]
     named = cases[cases.kind != "several"]
     columns = ["case", "true", "answer", "probability", "ratio", "nominal"]

@@ -89,8 +89,8 @@ class Feedback:
 class Background:
     """What no data sheet of a machine mentions; all of it absent by default.
 
-    Dry friction with a pre-sliding deflection, cogging torque, lag of the amplifier, tilt of the plane (in-plane
-    gravity and its direction, an angle of the link), and the encoder's zero and step (0: none).
+    Dry friction with a pre-sliding deflection, cogging torque, lag of the amplifier, tilt of the plane
+    (in-plane gravity and its direction, an angle of the link), and the encoder's zero and step (0: none).
     """
 
     dry_friction_Nm: float = 0.0
@@ -107,7 +107,7 @@ class Background:
 
 @dataclass(frozen=True)
 class Before:
-    """How a record begins: the link straight and at rest at this hub angle, rows_before rows before the first."""
+    """How a record begins: straight and at rest at this hub angle, rows_before rows before the first."""
 
     start_angle_rad: float = 0.0
     rows_before: int = 0
@@ -136,9 +136,7 @@ class Clean:
 class Truth:
     """A machine at rest, ready for any number of records; `effects` are tables with a name and parameters."""
 
-    def __init__(
-        self, rig: RigTable, effects: Effects = (), background: Background | None = None
-    ) -> None:
+    def __init__(self, rig: RigTable, effects: Effects = (), background: Background | None = None) -> None:
         by_name = {str(e["name"]): e for e in effects}
         if len(by_name) != len(effects):
             raise ValueError(f"an effect is given twice: {[e['name'] for e in effects]}")

@@ -1,1 +1,1 @@
-"""Workshop cases of the blind protocol: imperfectly known machines, awkward logs, undocumented imperfections."""
+"""Workshop cases of the blind protocol: imperfect and imperfectly known machines, awkward logs."""

@@ -11,9 +11,9 @@ import pandas as pd
 import tomlkit
 
 from validation.blind.rigs import rig_toml, rounded
+from validation.blind.workshop.answer import MODEL_ERROR
+from validation.blind.workshop.cases import WorkshopCase
 from workflow.engine.storage import write_text
-
-from .cases import MODEL_ERROR, WorkshopCase
 
 _DEGREE = float(np.pi / 180)
 _G = 9.80665
@@ -22,7 +22,13 @@ _COLUMNS: Mapping[str, tuple[tuple[str, float], ...]] = {
     "time_s": (("time_s", 1.0), ("Zeit_ms", 1e-3), ("stamp_us", 1e-6), ("time_ms", 1e-3), ("t", 1.0)),
     "voltage_V": (("voltage_V", 1.0), ("u_mV", 1e-3), ("U_motor [V]", 1.0), ("amp_V", 1.0), ("u_mV", -1e-3)),
     "hub_angle_rad": (("phi_deg", _DEGREE), ("q1_mrad", 1e-3), ("hub_rad", 1.0), ("enc [deg]", _DEGREE)),
-    "tip_m": (("tip_mm", 1e-3), ("y_tip_m", 1.0), ("y_tip_m", -1.0), ("laser [mm]", 1e-3), ("camera_cm", 1e-2)),
+    "tip_m": (
+        ("tip_mm", 1e-3),
+        ("y_tip_m", 1.0),
+        ("y_tip_m", -1.0),
+        ("laser [mm]", 1e-3),
+        ("camera_cm", 1e-2),
+    ),
     "tip_acceleration_m_s2": (("acc_mg", _G / 1e3), ("acc_g", _G), ("a_tip", 1.0), ("acc_mg", -_G / 1e3)),
     "reference_rad": (("ref_deg", _DEGREE), ("soll [deg]", _DEGREE), ("w", 1.0), ("setpoint_rad", 1.0)),
 }
@@ -47,7 +53,9 @@ def write_workshop_case(case: WorkshopCase, folder: Path, rng: np.random.Generat
         frame = pd.DataFrame(table).drop(index=sample.lost_rows)
         write_text(folder / "experiments" / f"{sample.run.plan.name}.csv", frame.to_csv(index=False))
     shown_rig = rig_toml(machine.stated, machine.tolerances)
-    write_text(folder / "rig.toml", shown_rig.replace("\n\n[sampling]", '\nnoise_is = "data sheet"\n\n[sampling]'))
+    write_text(
+        folder / "rig.toml", shown_rig.replace("\n\n[sampling]", '\nnoise_is = "data sheet"\n\n[sampling]')
+    )
     outputs = ["hub_angle_rad"] + ([machine.sensor_key] if machine.sensor_key else [])
     document: dict[str, Any] = {
         "case": folder.name,
@@ -88,11 +96,3 @@ def _column(name: str, case: WorkshopCase, rng: np.random.Generator) -> tuple[st
     choices = _COLUMNS[name]
     column, scale = choices[int(rng.integers(len(choices)))]
     return column, scale, round(rng.uniform(-0.4, 0.4), 3) if column in _SHIFTED else 0.0
-
-
-def workshop_answer(answer: Mapping[str, Any]) -> str:
-    """Text of an answer file as the labelled workshop cases have it (the true rig is left out)."""
-    shown = {key: value for key, value in answer.items() if key not in ("true_rig", "sha256")}
-    return str(tomlkit.dumps(shown))
-
-

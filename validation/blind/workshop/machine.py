@@ -88,7 +88,7 @@ class Workshop:
 
 
 def draw_workshop(sensor: Sensor, rng: np.random.Generator) -> Workshop:
-    """A machine; sizes of friction, cogging and tilt are relative to each other only (see `Workshop.scaled`)."""
+    """A machine; friction, cogging and tilt are relative to each other only (see `Workshop.scaled`)."""
 
     def log(low: float, high: float) -> float:
         return rounded(float(np.exp(rng.uniform(np.log(low), np.log(high)))))

@@ -23,7 +23,7 @@ _SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A record as the fit sees it: voltage (B + T,), of which B rows lie before the first, and outputs (T, n)."""
+    """A record as the fit sees it: voltage (B + T,), B rows of it before the first, and outputs (T, n)."""
 
     voltage_V: Real
     output: Real
@@ -64,7 +64,7 @@ class Linear:
     def responses(self, log: Log) -> tuple[Real, Real]:
         """Forced response (T, n) to the voltage from rest, and (T, n, S) to initial states and offset.
 
-        The last of the S is the encoder's zero. n: hub angle, then the tip's position or acceleration, as in log.
+        The last of the S is the encoder's zero. n: hub angle, then the tip's position or acceleration.
         """
         T, n = log.output.shape
         B = log.voltage_V.size - T
@@ -97,7 +97,7 @@ def _held(A: Real, b: Real, over_s: float) -> Real:
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """Residuals (T, n) per record, log deviations of the stated values, and the slopes they were found with."""
+    """Residuals (T, n) per record, and log deviations of the stated values."""
 
     residuals: list[Real]
     deviations: Real
@@ -177,10 +177,7 @@ class Nominal:
         free = [linear.responses(log)[1] for log in self.logs]
         left = [self.without_start(gap, f) for gap, f in zip(gaps, free, strict=True)]
         slopes = [
-            [
-                self.without_start((moved[k] - forced[0][k]) / _STEP, free[k])
-                for moved in forced[1:]
-            ]
+            [self.without_start((moved[k] - forced[0][k]) / _STEP, free[k]) for moved in forced[1:]]
             for k in range(len(self.logs))
         ]
         fitted = [k for k, log in enumerate(self.logs) if not log.held_out]

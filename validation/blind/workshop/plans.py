@@ -44,7 +44,12 @@ def plan_workshop(
             ("steps_high", "random steps of the reference, large", "estimation", makers.steps(large)),
             ("multisine", "random-phase multisine reference", "estimation", makers.tones(u(0.15, 0.5))),
             ("slews", "smooth slews of the reference", "estimation", makers.slews(u(0.7, 1.3))),
-            ("steps_fresh", "random steps of the reference, another sequence", "held_out", makers.steps(fresh)),
+            (
+                "steps_fresh",
+                "random steps of the reference, another sequence",
+                "held_out",
+                makers.steps(fresh),
+            ),
             ("mixed", "multisine on slews of the reference", "held_out", makers.mixed()),
         ]
     else:
@@ -241,7 +246,7 @@ class _Makers:
         return np.tile(wave, 3)[:T]
 
     def _scaled(self, wave: Real, span_rad: float) -> Real:
-        """Until the hub's span or the largest deflection is reached; nothing but a pulse before the first row."""
+        """Until the hub's span or the largest deflection is reached; before the first row at most a pulse."""
         rows = self.rows_before
         wave = wave.copy()
         wave[:rows] = 0.0

@@ -1,4 +1,4 @@
-"""Major effects of workshop cases: what is drawn, how large it may get, and what makes it more than a tolerance."""
+"""Major effects of workshop cases: what is drawn, how large it may get, when it exceeds a tolerance."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from validation.blind.inputs import Planned
 from validation.blind.rigs import Rig, rounded
 from validation.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, sizable
 from validation.blind.truth import LISTED, UNLISTED, WORKSHOP_UNLISTED, RigTable
-
-from .machine import Sensor
+from validation.blind.workshop.machine import Sensor
 
 TIP_ONLY = frozenset({"sensor_lag", "sensor_gain", "sensor_drift", "quantisation", "sensor_clipping"})
 # Effects whose size has an end of its own; the others may grow beyond what the noise-sized cases need.

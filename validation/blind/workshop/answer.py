@@ -1,0 +1,94 @@
+"""The answer of a workshop case, as the answer files of the labelled ones have it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from validation.blind.rigs import Rig, rounded
+from validation.blind.sizes import Table
+from validation.blind.truth import Real
+from validation.blind.workshop.machine import Workshop
+from validation.blind.workshop.plans import Controller
+from validation.blind.workshop.sizes import tolerances_away
+
+Sort = Literal["none", "single", "pair", "unlisted"]
+MODEL_ERROR = 0.05
+
+
+def answer_of(
+    sort: Sort,
+    machine: Workshop,
+    closed: bool,
+    controller: Controller,
+    effects: list[Table],
+    designed: dict[str, float],
+    sizes: dict[str, Any],
+    left: Real,
+) -> dict[str, Any]:
+    """As the answer files of the labelled cases."""
+    hidden = sort == "unlisted"
+    b, noise = machine.background, machine.noise
+    entries = []
+    for effect in effects if not hidden else ():
+        entry: dict[str, Any] = {
+            "name": effect["name"],
+            "parameters": {k: v for k, v in effect.items() if k != "name"},
+        }
+        away = tolerances_away(effect, machine.true, machine.tolerances)
+        entries.append(entry if away is None else {**entry, "tolerances_away": away})
+    true_over_stated = _relative(machine.true, machine.stated, machine.tolerances)
+    worst = max(abs(d) / machine.tolerances[key] for key, d in true_over_stated.items())
+    answer: dict[str, Any] = {
+        "verdict": "none" if sort == "none" else "unknown" if hidden else "effect",
+        "severity": "none" if sort == "none" else "clear",
+        "effects": entries,
+        "unlisted": effects if hidden else [],
+        "sensor": machine.sensor,
+        "closed_loop": closed,
+        "controller": controller,
+        "nominal": "uncertain",
+        "model_error": MODEL_ERROR,
+        "oracle_gap_after_major": sizes["pooled_gap"]["held_out_gap_after_oracle"],
+        "nominal_worst_tolerances": rounded(worst, 3),
+    }
+    if effects:
+        answer["major_over_background_realised"] = sizes["major_over_background_realised"]
+        answer["major_over_background"] = {"unlisted": next(iter(designed.values()))} if hidden else designed
+    answer["background"] = {
+        "dry_friction_Nm": b.dry_friction_Nm,
+        "presliding_rad": b.presliding_rad,
+        "cogging_Nm": b.cogging_Nm,
+        "cogging_per_rev": b.cogging_per_rev,
+        "cogging_phase_rad": b.cogging_phase_rad,
+        "amplifier_lag_s": b.amplifier_lag_s,
+        "tilt_m_s2": b.tilt_m_s2,
+        "tilt_angle_rad": b.tilt_angle_rad,
+        "transport_delay_s": machine.true["sampling"]["transport_delay_s"],
+        "encoder_counts_per_turn": machine.counts,
+        "hub_noise_true_over_stated": rounded(noise.hub / machine.stated["sensors"]["hub_angle_noise_rad"]),
+        "hub_offset_rad": b.hub_offset_rad,
+        "time_stamp_jitter": noise.jitter,
+    }
+    if machine.sensor != "none":
+        answer["background"] |= {
+            "tip_noise_true_over_stated": rounded(noise.tip / list(machine.stated["sensors"].values())[-1]),
+            "tip_noise_ar1": noise.correlation,
+            "hum_over_tip_noise": noise.hum,
+            "hum_Hz": noise.hum_Hz,
+        }
+    answer["true_minus_nominal_relative"] = true_over_stated
+    answer["rms_held_out"] = {
+        key: {**numbers, "background_rms_predicted": rounded(float(left[k]))}
+        for k, (key, numbers) in enumerate(sizes["rms_held_out"].items())
+    }
+    answer["pooled_gap"] = sizes["pooled_gap"]
+    answer["true_rig"] = machine.true
+    return answer
+
+
+def _relative(true: Rig, stated: Rig, keys: dict[str, float]) -> dict[str, float]:
+    found = {}
+    for key in keys:
+        section, name = key.split(".")
+        found[key] = rounded(true[section][name] / stated[section][name] - 1)
+    return found

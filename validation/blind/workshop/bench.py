@@ -1,0 +1,167 @@
+"""Runs of a workshop's true machine, and what its nominal one leaves of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from validation.blind.inputs import Planned
+from validation.blind.rigs import rounded
+from validation.blind.sizes import Table
+from validation.blind.truth import Background, Clean, Real, Truth
+from validation.blind.workshop.machine import Workshop
+from validation.blind.workshop.nominal import Log, Nominal
+from validation.blind.workshop.plans import Run
+from validation.blind.workshop.sizes import tolerances_away
+
+_WIDEST_RAD = 2.6  # hub angle from the start of a record
+_MOST_SUBSTEPS = 160
+
+
+class Bench:
+    """Runs of the true machine and what the nominal one, refitted, leaves of them."""
+
+    def __init__(self, machine: Workshop, runs: tuple[Run, ...], quiet: Background) -> None:
+        self.machine, self.runs, self.quiet = machine, runs, quiet
+
+    def voltages(self) -> tuple[Planned, ...]:
+        """The plans with the voltages they lead to, for the scales of effects."""
+        truth = Truth(self.machine.true, (), self.quiet)
+        return tuple(
+            replace(
+                run.plan,
+                voltage_V=self.record(truth, run).voltage_V[run.before.rows_before :],
+                feedback=None,
+            )
+            for run in self.runs
+        )
+
+    def record(self, truth: Truth, run: Run, hub_noise: Real | None = None) -> Clean:
+        """Raises ValueError where the hub turns farther than any workshop would let it."""
+        clean = truth.record(run.plan.voltage_V, run.plan.feedback, hub_noise, run.before)
+        if np.max(np.abs(clean.hub_angle_rad - run.before.start_angle_rad)) > _WIDEST_RAD:
+            raise ValueError("the hub turns too far: it leaves every bound")
+        return clean
+
+    def output(self, clean: Clean, rows_before: int) -> Real:
+        """(T, n) as sensors without noise, encoder zero or resolution see it."""
+        columns = [clean.hub_angle_rad]
+        if self.machine.sensor == "tip":
+            tip = np.clip(clean.tip_m, -clean.clip_m, clean.clip_m)
+            columns.append(clean.step_m * np.rint(tip / clean.step_m) if clean.step_m > 0 else tip)
+        elif self.machine.sensor == "acc":
+            columns.append(clean.tip_acceleration_m_s2)
+        return np.column_stack(columns)[rows_before:]
+
+    def logs(self, truth: Truth) -> list[Log]:
+        if truth.substeps > _MOST_SUBSTEPS:
+            raise ValueError("a machine this stiff is beyond every bound")
+        found = []
+        for run in self.runs:
+            clean = self.record(truth, run)
+            output = self.output(clean, run.before.rows_before)
+            found.append(Log(clean.voltage_V, output, run.plan.role == "held_out"))
+        return found
+
+    def nominal(self, logs: list[Log]) -> Nominal:
+        sensors = self.machine.stated["sensors"]
+        noise = np.array(list(sensors.values()))[: logs[0].output.shape[1]]
+        return Nominal(self.machine.tolerances, logs, self.machine.sensor == "acc", noise)
+
+    def gap(self, effects: tuple[Table, ...], background: Background | None, *, refit: bool = True) -> Real:
+        """Root mean square (n,) of the held-out residuals of records with these effects, no noise."""
+        logs = self.logs(Truth(self.machine.true, effects, background or self.quiet))
+        nominal = self.nominal(logs)
+        if refit:
+            residuals = nominal.refit(self.machine.true).residuals
+        else:
+            residuals = nominal.residuals(self.machine.true, np.zeros(len(self.machine.tolerances)))
+        return rms([r for r, log in zip(residuals, logs, strict=True) if log.held_out])
+
+    def share(self, background: Background) -> float:
+        """What a refit leaves over the motion on the held-out records, over all outputs."""
+        logs = self.logs(Truth(self.machine.true, (), background))
+        residuals = self.nominal(logs).refit(self.machine.true).residuals
+        held = [k for k, log in enumerate(logs) if log.held_out]
+        left = rms([residuals[k] for k in held])
+        motion = rms([logs[k].output - logs[k].output.mean(axis=0) for k in held])
+        return float(np.sqrt(np.mean((left / motion) ** 2)))
+
+
+def rms(parts: list[Real]) -> Real:
+    """(n,) over all samples of the records (T, n)."""
+    return np.asarray(np.sqrt(np.mean(np.concatenate(parts) ** 2, axis=0)))
+
+
+def outputs_of(machine: Workshop) -> list[str]:
+    return ["hub_angle_rad"] + ([machine.sensor_key] if machine.sensor_key else [])
+
+
+def measured_sizes(
+    bench: Bench,
+    clean: list[Log],
+    noisy: list[Log],
+    oracle: list[Real],
+    effects: list[Table],
+) -> dict[str, Any]:
+    """Gaps of the nominal machine (stated, true and refitted values) and of the true effects."""
+    machine = bench.machine
+    stated = np.array(list(machine.stated["sensors"].values()))
+    none = np.zeros(len(machine.tolerances))
+    outputs = outputs_of(machine)
+
+    def held(parts: list[Real]) -> list[Real]:
+        return [part for part, log in zip(parts, clean, strict=True) if log.held_out]
+
+    pure = bench.nominal(clean)
+    background = pure.linear_refit(
+        machine.true, [log.output - same for log, same in zip(clean, oracle, strict=True)]
+    )
+    refit = pure.refit(machine.true).residuals
+    true_values = pure.residuals(machine.true, none)
+    parametric = [tolerances_away(e, machine.true, machine.tolerances) is not None for e in effects]
+    before = true_values if any(parametric) else refit
+    noise = bench.nominal(noisy)
+    gaps = {
+        "nominal": noise.residuals(machine.stated, none),
+        "true_values": noise.residuals(machine.true, none),
+        "refit": noise.refit(machine.true).residuals,
+        "after_oracle": noise.linear_refit(
+            machine.true, [log.output - same for log, same in zip(noisy, oracle, strict=True)]
+        ),
+    }
+    gaps["before"] = gaps["true_values" if any(parametric) else "refit"]
+    pooled = {}
+    for role in ("estimation", "held_out"):
+        for name, parts in gaps.items():
+            mine = [p for p, log in zip(parts, clean, strict=True) if log.held_out == (role == "held_out")]
+            pooled[f"{role}_gap_{name}"] = rounded(float(np.sqrt(np.mean((rms(mine) / stated) ** 2))))
+    left, motion = (
+        rms(held(background)),
+        rms([log.output - log.output.mean(axis=0) for log in clean if log.held_out]),
+    )
+    table = {}
+    for k, key in enumerate(outputs):
+
+        def major(parts: list[Real], k: int = k) -> float:
+            return (
+                rounded(float(np.sqrt(max(rms(held(parts))[k] ** 2 - left[k] ** 2, 0.0)))) if effects else 0.0
+            )
+
+        table[key] = {
+            "motion_rms": rounded(float(motion[k])),
+            "noise_stated": float(stated[k]),
+            "background_rms": rounded(float(left[k])),
+            "background_share_of_motion": rounded(float(left[k] / motion[k])),
+            "major_rms_after_refit": major(refit),
+            "major_rms_true_values": major(true_values),
+        }
+    named = "major_rms_true_values" if before is true_values else "major_rms_after_refit"
+    realised = max(v[named] / v["background_rms"] for v in table.values())
+    return {
+        "rms_held_out": table,
+        "pooled_gap": pooled,
+        "major_over_background_realised": rounded(realised, 3),
+    }

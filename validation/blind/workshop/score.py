@@ -1,0 +1,86 @@
+"""Scores of workshop answers against labelled cases, wherever they came from.
+
+    python -m validation.blind.workshop.score LABELLED OUT
+
+reads LABELLED/<case>/answer.toml and every diagnosis below OUT, the directory of `flexlink diagnose --out`.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import typer
+
+from validation.blind.report import text
+from validation.blind.scores import scores
+from validation.blind.worker import failed
+from workflow.diagnose.document import FORMAT
+from workflow.engine.errors import InputError
+
+# Causes that are repaired at the same place.
+_FAMILIES = {
+    "friction": ("coulomb_friction", "stribeck_friction", "viscous_friction"),
+    "actuator": (
+        "actuator_saturation",
+        "actuator_dead_zone",
+        "actuator_gain",
+        "actuator_lag",
+        "input_delay",
+    ),
+    "torque": ("torque_ripple", "periodic_disturbance", "hardening_spring", "gravity"),
+    "compliance": ("joint_compliance", "base_compliance", "backlash"),
+    "link": ("link_stiffness", "structural_damping", "tip_payload", "hub_inertia"),
+    "sensor": ("sensor_lag", "sensor_gain", "sensor_drift", "quantisation"),
+}
+FAMILIES: Mapping[str, str] = MappingProxyType(
+    {name: family for family, names in _FAMILIES.items() for name in names}
+)
+
+
+def score_folders(labelled: Path, found: Path, *, partial: bool = False) -> dict[str, Any]:
+    """As `validation.blind.scores.scores`; a case without a diagnosis is wrong, or left out if partial.
+
+    Raises InputError if there is no labelled case, or a diagnosis that belongs to none.
+    """
+    answers = {
+        path.parent.name: tomllib.loads(path.read_text("utf-8"))
+        for path in sorted(labelled.glob("*/answer.toml"))
+    }
+    if not answers:
+        raise InputError(f"{labelled}: no labelled case is there; expected <case>/answer.toml")
+    documents = {}
+    for path in sorted(found.rglob("*.json")):
+        document = json.loads(path.read_text("utf-8"))
+        if isinstance(document, dict) and document.get("format") == FORMAT:
+            documents[str(document["case"])] = document
+    strange = sorted(documents.keys() - answers.keys())
+    if strange:
+        raise InputError(f"{found}: {strange[0]} is none of the cases labelled in {labelled}")
+    names = [name for name in answers if name in documents or not partial]
+    if not names:
+        raise InputError(f"{found}: no diagnosis of a case in {labelled}")
+    said = [documents.get(name) or failed(name, "no diagnosis") for name in names]
+    return scores(said, [answers[name] for name in names], FAMILIES)
+
+
+def main(
+    labelled: Annotated[Path, typer.Argument(help="Directory of the labelled cases.")],
+    found: Annotated[Path, typer.Argument(help="Directory of their diagnoses.")],
+    partial: Annotated[bool, typer.Option("--partial", help="Leave out cases without a diagnosis.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="The scores as JSON.")] = False,
+) -> None:
+    try:
+        scored = score_folders(labelled, found, partial=partial)
+    except InputError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(2) from error
+    typer.echo(json.dumps(scored, indent=1) if as_json else text(scored), nl=False)
+
+
+if __name__ == "__main__":
+    typer.run(main)
