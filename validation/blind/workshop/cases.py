@@ -27,7 +27,7 @@ from validation.blind.workshop.sizes import (
 
 _BACKGROUND = (0.02, 0.035)  # of the motion, root mean square, held out, after a refit
 _MAJOR = (3.5, 8.0)  # over the background
-_LEAST_REALISED = 2.0
+_REALISED = (2.0, 16.0)
 _CLOSE_ENOUGH = 0.12  # in the logarithm of a wanted size
 _TRIES = 40
 
@@ -221,7 +221,7 @@ def _recorded(
         oracle_logs.append(bench.output(same, before))
     sizes = measured_sizes(bench, clean_logs, noisy_logs, oracle_logs, effects)
     realised = sizes["major_over_background_realised"]
-    if effects and not realised >= _LEAST_REALISED:
+    if effects and not _REALISED[0] <= realised <= _REALISED[1]:
         return None
     answer = answer_of(sort, machine, closed, controller, effects, designed, sizes, left)
     answer["records"] = {
