@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from diagnosis.machine.case import Case, Experiment
+from diagnosis.machine.plausible import refuse_implausible
 from ident.data.record_files import read_table
 from ident.data.time_grid import TimeGrid
 from plant.rig import Rig
@@ -69,6 +70,7 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     ]
     with naming(str(file)):
         case = Case(name, machine, tuple(experiments), settings.model_error)
+        refuse_implausible(case)
     files = {CASE_FILE: file, RIG_FILE: rig_path}
     files |= {f"{i}": folder / expand(entry.file) for i, entry in enumerate(settings.experiments)}
     hashes = {key: storage.sha256_of_file(path) for key, path in files.items()}
