@@ -29,8 +29,8 @@ _RANGES = {
     "link.youngs_modulus_Pa": (1e6, 2e12),
 }
 _LARGEST = 1e9
-# Of 93 recorded cases with effects of every kind, all records together correlate by 0.45 at least and move between
-# 0.29 and 1.6 times as far as predicted.
+# Of 93 recorded cases with effects of every kind, all records together correlate by 0.45 at least and move
+# between 0.29 and 1.6 times as far as predicted.
 _LEAST, _LEAST_OF_ONE = 0.3, 0.8
 _FARTHER, _LESS = 6.0, 1 / 15
 _ACCELERATION_FARTHER, _ACCELERATION_LESS = 4.0, 1 / 6
@@ -41,7 +41,7 @@ _ALIKE = 8.0
 _FOLLOWED, _EXCHANGED, _UNEXPLAINED, _EXPLAINED = 0.6, 0.85, 0.3, 0.5
 _FASTEST_HZ, _OF_NYQUIST = 30.0, 0.6
 _CLIPPED_ROWS, _FROZEN_ROWS = 5, 50
-_ABRUPT = 0.3
+_ABRUPT, _REPEATED = 0.3, 5e-3
 
 _DEGREES = (180 / np.pi, "degrees per radian")
 _FACTORS: dict[str, tuple[tuple[float, str], ...]] = {
@@ -129,9 +129,9 @@ def _refuse_exchange(compare: _Comparison, given: Sequence[int]) -> None:
         better = compare.worst(order, compare.fast_Hz)
         if slow < _LEAST or (better > _EXCHANGED and 1 - better < _UNEXPLAINED * (1 - fast)):
             raise ValueError(
-                f"the columns of {compare.names[a]} and {compare.names[b]} look exchanged: the other way round "
-                f"the records correlate with the rig's prediction by {better:.2f}, as given by {fast:.2f}; see "
-                "[columns]"
+                f"the columns of {compare.names[a]} and {compare.names[b]} look exchanged: the other way "
+                f"round the records correlate with the rig's prediction by {better:.2f}, as given by "
+                f"{fast:.2f}; see [columns]"
             )
 
 
@@ -151,7 +151,7 @@ def _refuse_sensors(experiment: Experiment) -> None:
     """Outputs that stop dead and stay at exactly one value: of a limit again and again, or for long.
 
     A motion that turns, or comes to rest, is slow before; a limit is met at speed. Of a coarse encoder, one
-    or two steps are no speed.
+    or two steps are no speed. Where no value but a limit comes twice in a row, two are enough.
     """
     what = f"experiment {experiment.name}"
     readings = experiment.output if experiment.readings is None else experiment.readings
@@ -161,17 +161,21 @@ def _refuse_sensors(experiment: Experiment) -> None:
         lengths = np.diff(np.r_[starts, len(y)])
         before = np.where(starts > 1, speed[np.maximum(starts - 2, 0)], 0.0)
         abrupt = (before > _ABRUPT * np.quantile(speed, 0.9)) & (before > 2.5 * np.min(speed[speed > 0]))
+        inside = (y[1:] != np.max(y)) & (y[1:] != np.min(y))
+        fine = np.count_nonzero(speed[inside] == 0) < _REPEATED * len(y)
+        met = (lengths >= 2) if fine else abrupt & (lengths >= _CLIPPED_ROWS)
+        met[-1] = False  # What does not come back may as well be dead.
         for bound in (np.max(y), np.min(y)):
-            clipped = abrupt & (lengths >= _CLIPPED_ROWS) & (y[starts] == bound)
-            if np.count_nonzero(clipped) > 1 or np.any(lengths[clipped] >= 4 * _CLIPPED_ROWS):
+            clipped = met & (y[starts] == bound)
+            if np.count_nonzero(clipped) > 1 or np.any(abrupt & clipped & (lengths >= 4 * _CLIPPED_ROWS)):
                 raise ValueError(
-                    f"{what}: {name} runs into {bound:.6g} and stays there for {lengths[clipped].sum()} samples, "
-                    f"from sample {starts[clipped][0]} on: is it clipped? Expected a range that holds the motion"
+                    f"{what}: {name} runs into {bound:.6g} and stays there for {lengths[clipped].sum()} "
+                    f"samples, from sample {starts[clipped][0]} on: is it clipped? Expected a wider range"
                 )
         if np.any(frozen := abrupt & (lengths >= _FROZEN_ROWS)):
             raise ValueError(
                 f"{what}: {name} stops in full motion at {y[starts[frozen][0]]:.6g} for {lengths[frozen][0]} "
-                f"samples, from sample {starts[frozen][0]} on: is the sensor dead?"
+                f"samples, from sample {starts[frozen][0]} on: is the sensor dead, or at its limit?"
             )
 
 
@@ -184,8 +188,9 @@ def _fault(case: Case, found: Sequence[_Match], least: float) -> str:
         suspects = ("voltage_V",) if len(against) == len(case.outputs) > 1 else (*either, *against)
         return (
             f"{' and '.join(against)} against the rig's prediction (correlation "
-            f"{min(followed[name].correlation for name in against):.2f}): wrong sign of {' or '.join(suspects)}? "
-            "Expected: a positive voltage turns hub and tip to positive angles"
+            f"{min(followed[name].correlation for name in against):.2f}): wrong sign of "
+            f"{' or '.join(suspects)}? Expected: a positive voltage turns hub and tip to positive angles; "
+            "see scale in [columns]"
         )
     ratios = {name: m.ratio for name, m in followed.items()}
     far = {name: ratio for name, ratio in ratios.items() if not _LESS < ratio < _FARTHER}
@@ -216,7 +221,7 @@ def _factors(quantity: str, rig: Rig) -> tuple[tuple[float, str], ...]:
 
 
 def _speed(signal: Real, dt_s: float, highest_Hz: float) -> Spectrum:
-    """Spectrum of the rate of a signal (T,) less its straight line, tapered: above drift, up to a frequency."""
+    """Spectrum of the rate of a signal (T,) less its straight line, tapered: above drift, to a frequency."""
     n = len(signal)
     k = np.linspace(-1.0, 1.0, n)
     line = np.polynomial.polynomial.polyfit(k, signal, 1)
