@@ -167,11 +167,12 @@ class EmbeddingOptions(BaseModel):
         default="average",
         description="average the kernel over a grid weighted by restricted likelihood, or take the largest",
     )
-    prior_no_remainder: float = Field(
-        default=0.5,
+    prior_no_remainder: float | None = Field(
+        default=None,
         ge=0.0,
         lt=1.0,
-        description="prior probability that the poles explain everything (alpha = 0)",
+        description="prior probability that the poles explain everything (alpha = 0); none given: 1/2, and 0 "
+        "where the order was stated, for no machine ends where somebody stopped counting its modes",
     )
     estimate_offset: bool = Field(default=True, description="a constant on each record's output")
     estimate_initial_state: bool = Field(
@@ -193,6 +194,14 @@ class EmbeddingOptions(BaseModel):
         description="the order was stated, not chosen from these data: as likely as not it leaves out "
         "what a choice would have kept; none given: no, or as the identification beside it says",
     )
+
+    @property
+    def no_remainder(self) -> float:
+        """Prior probability that the poles explain everything."""
+        if self.prior_no_remainder is not None:
+            return self.prior_no_remainder
+        return 0.0 if self.order_given else 0.5
+
     feedthrough: bool | None = Field(
         default=None, description="direct term; none given: as the model has one or not"
     )

@@ -220,7 +220,7 @@ def embed_response(
     block = RegressionBlock(nothing, regressors[measured], data.whiten(taps)[measured], data.y[measured])
     reduced = reduce_regression([block])
     grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
-    kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
+    kernel = averaged_posterior(grid, options.no_remainder, options.hyperparameters)
     mean, factor = joint_factor(reduced, kernel)
     widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
     factor = np.column_stack([widening * factor, shared_gain_std * mean])
@@ -297,13 +297,13 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     while True:
         reduced = reduce_regression(rows.blocks())
         grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
-        kernel = averaged_posterior(grid, options.prior_no_remainder, options.hyperparameters)
+        kernel = averaged_posterior(grid, options.no_remainder, options.hyperparameters)
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
         candidates = candidate_pairs(max(record.n_samples for record in rows.records))
         statistics = pair_statistics(rows.pair_blocks(), reduced, candidates.poles)
         odds = options.prior_missed_mode / (1 - options.prior_missed_mode)
-        log_rest = total_log_evidence(grid, options.prior_no_remainder)
+        log_rest = total_log_evidence(grid, options.no_remainder)
         missed = pair_mixture(candidates, statistics, reduced.degrees_of_freedom, log_rest, odds)
         if missed.visible is None or n_added == _MOST_ADDED:
             return _Solved(rows, reduced, kernel, missed)

@@ -47,24 +47,30 @@ def test_tangent_covers_and_classical_does_not():
     assert per_band(classical_hits).min() < 0.6
 
 
-def test_a_damped_mode_near_the_nyquist_frequency_that_nobody_asked_for_is_inside():
-    """Too weak to be seen, and where a slow kernel has least."""
-    slow, hidden, size = 0.93 * np.exp(0.25j), 0.45 * np.exp(2.8j), 0.002
-    numerator, denominators = [0, 0.02, 0.015], [np.poly([p, np.conj(p)]).real for p in (slow, hidden)]
-    omega = np.linspace(0.4, 0.95, 12) * np.pi / DT
+def test_a_damped_mode_that_nobody_asked_for_is_inside():
+    """Too weak to be seen: 20 noise variances of energy, of 32 that an order selection asks for. The last one
+    stands near the Nyquist frequency, where a slow kernel has least."""
+    slow, numerator, n = 0.93 * np.exp(0.25j), [0, 0.02, 0.015], 3000
+    known = np.poly([slow, np.conj(slow)]).real
+    omega = np.linspace(0.05, 0.95, 24) * np.pi / DT
     z = np.exp(1j * omega * DT)
-    truth = np.polyval(numerator, z) / np.polyval(denominators[0], z) + size * z / np.polyval(
-        denominators[1], z
-    )
-    hits, given = [], EmbeddingOptions(order_given=True)
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        u = signal.lfilter([0.3], [1, -0.7], rng.standard_normal(3000))
-        y = signal.lfilter(numerator, denominators[0], u) + signal.lfilter([0, size], denominators[1], u)
-        record = Record("", u[:, None], (y + 0.05 * rng.standard_normal(3000))[:, None], DT, ("u",), ("y",))
-        model = GobfModel(Poles(np.zeros(0), np.array([slow])), np.zeros(2), DT)
-        hits.append(tangent([record], model, given).at(omega).contains(truth))
-    assert np.mean(hits) > 0.88  # 97 % in 30 seeds
+    given, shares = EmbeddingOptions(order_given=True), []
+    for hidden in (0.5 * np.exp(1.2j), 0.56 * np.exp(2.1j), 0.45 * np.exp(2.8j)):
+        unknown, hits = np.poly([hidden, np.conj(hidden)]).real, []
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            u = signal.lfilter([0.3], [1, -0.7], rng.standard_normal(n))
+            more = signal.lfilter([0, 1], unknown, u)
+            size = 0.05 * np.sqrt(20 / np.sum(more**2))
+            y = signal.lfilter(numerator, known, u) + size * more + 0.05 * rng.standard_normal(n)
+            truth = np.polyval(numerator, z) / np.polyval(known, z) + size * z / np.polyval(unknown, z)
+            model = GobfModel(Poles(np.zeros(0), np.array([slow])), np.zeros(2), DT)
+            found = tangent([Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], model, given)
+            hits.append(found.at(omega).contains(truth))
+        shares.append(np.mean(hits))
+    # 91, 93 and 96 % measured; 77, 87 and 90 where half of the prior says that nothing is left out.
+    assert min(shares) > 0.86
+    assert np.mean(shares) > 0.9
 
 
 def test_coloured_noise_needs_the_noise_model():
