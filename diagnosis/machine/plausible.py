@@ -163,6 +163,7 @@ def _refuse_sensors(experiment: Experiment) -> None:
         abrupt = (before > _ABRUPT * np.quantile(speed, 0.9)) & (before > 2.5 * np.min(speed[speed > 0]))
         inside = (y[1:] != np.max(y)) & (y[1:] != np.min(y))
         fine = np.count_nonzero(speed[inside] == 0) < _REPEATED * len(y)
+        fine &= np.unique(y).size > len(y) / 4  # Not so of an arm that rests, read by a coarse encoder.
         met = (lengths >= 2) if fine else abrupt & (lengths >= _CLIPPED_ROWS)
         met[-1] = False  # What does not come back may as well be dead.
         for bound in (np.max(y), np.min(y)):
