@@ -5,7 +5,7 @@ Friction acts where the motor's torque does, so that the position is G (u - f) w
 friction is simulated between the samples, and everything is one least-squares problem in the law of the
 friction and the coefficients of the arm on its poles, each taken twice: Gauss-Newton steps from derivatives
 of the simulation, in which a change of the arm also changes the friction. The poles come from the search of
-`ident.identify` on the records with the friction taken off their input; both are repeated until the residual
+`ident.one_input` on the records with the friction taken off their input; both are repeated until the residual
 no longer falls. Friction that falls with speed (Stribeck) is tried afterwards, and stays where it lowers the
 residual by more than an order criterion asks for. Viscous friction is part of the arm and its poles.
 
@@ -28,6 +28,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import filter_input
+from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw, less_friction
@@ -60,7 +61,7 @@ def fit_friction(
     Raises ValueError where the shaft does not move, there is more than one integrator or a direct term, or
     `identify` refuses the records.
     """
-    options = options or IdentOptions()
+    options = _swinging(options or IdentOptions())
     report = progress or (lambda fraction, message: None)
     for record in records:
         if not np.ptp(record.output[:, 0]) > 0:
@@ -85,6 +86,15 @@ def fit_friction(
         best = _with_stribeck(best, records, presliding, least)
     report(1.0, "friction identified")
     return best
+
+
+def _swinging(options: IdentOptions) -> IdentOptions:
+    """Pairs that can be modes: one that does not swing follows what a wrong level leaves, in the place of a
+    mode and for good, because the level then fits the pair."""
+    if (options.zeta_min or 0.0) >= LARGEST_DAMPING:
+        return options
+    largest = min(options.zeta_max or LARGEST_DAMPING, LARGEST_DAMPING)
+    return options.model_copy(update={"zeta_max": largest})
 
 
 def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:
