@@ -71,7 +71,7 @@ _FASTEST_MODE_HZ = 300.0
 # Substeps: enough for stability and a local error far below the noise; contacts want more.
 _FEWEST, _FEWEST_CONTACT, _MOST = 16, 128, 2000
 # A workshop's imperfections are far larger than what the fifth mode and finer steps add.
-_MODES_WORKSHOP, _FEWEST_WORKSHOP = 4, 8
+_MODES_WORKSHOP, _FEWEST_WORKSHOP = 4, 4
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,15 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from validation.blind.rigs import Rig
 from validation.blind.truth import Background, Real, Truth
 
-_ITERATIONS = 3
+# Weight of a sample: its noise and this share of the motion. What a model misses is no noise, and 25 samples
+# of it tell no more than one, so that tolerances still count; beyond four of them no value is believed.
+_SHARE, _PER_ONE, _FARTHEST = 0.05, 25.0, 4.0
 _STEP = 1e-4
-# Weight of a sample: its noise and this share of the motion, so that tolerances still count.
-_SHARE = 0.02
+_ENOUGH, _MOST = 1e-3, 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,7 @@ class Nominal:
     def __init__(self, tolerances: Mapping[str, float], logs: Sequence[Log], acceleration: bool, noise: Real):
         self.keys = list(tolerances)
         self.spread = np.array([tolerances[key] for key in self.keys])
+        self.prior = self.spread / np.sqrt(_PER_ONE)
         self.logs, self.acceleration = logs, acceleration
         motion = np.array([np.std(log.output, axis=0) for log in logs])
         self.weights = 1 / np.hypot(noise, _SHARE * np.sqrt(np.mean(motion**2, axis=0)))
@@ -142,25 +145,20 @@ class Nominal:
 
     def refit(self, rig: Rig) -> Refit:
         """Stated values fitted to the estimation records, within what their tolerances make of them."""
-        p = np.zeros(len(self.keys))
+        zero = np.zeros(len(self.keys))
 
         def stacked(at: Real) -> Real:
             parts = [(r * self.weights).ravel() for r in self.residuals(rig, at, only_fitted=True)]
-            return np.concatenate([*parts, at / self.spread])
+            return np.concatenate([*parts, at / self.prior])
 
-        now = stacked(p)
-        for _ in range(_ITERATIONS):
-            J = np.column_stack([(stacked(p + _STEP * e) - now) / _STEP for e in np.eye(p.size)])
-            step = np.clip(-np.linalg.lstsq(J, now, rcond=None)[0], -4 * self.spread, 4 * self.spread)
-            moved = False
-            for share in (1.0, 0.4, 0.1):
-                then = stacked(p + share * step)
-                if then @ then < now @ now:
-                    moved, gain = True, 1 - (then @ then) / (now @ now)
-                    p, now = p + share * step, then
-                    break
-            if not moved or gain < 2e-3:
-                break
+        def slopes(at: Real) -> Real:
+            now = stacked(at)
+            return np.column_stack([(stacked(at + _STEP * e) - now) / _STEP for e in np.eye(at.size)])
+
+        most = _FARTHEST * self.spread
+        p = least_squares(
+            stacked, zero, slopes, bounds=(-most, most), x_scale=self.spread, ftol=_ENOUGH, max_nfev=_MOST
+        ).x
         return Refit(self.residuals(rig, p), p)
 
     def linear_refit(self, rig: Rig, gaps: Sequence[Real]) -> list[Real]:
@@ -183,7 +181,7 @@ class Nominal:
         fitted = [k for k, log in enumerate(self.logs) if not log.held_out]
         J = np.concatenate(
             [np.column_stack([(s * self.weights).ravel() for s in slopes[k]]) for k in fitted]
-            + [np.diag(1 / self.spread)]
+            + [np.diag(1 / self.prior)]
         )
         target = np.concatenate([*((left[k] * self.weights).ravel() for k in fitted), zero])
         found = np.linalg.lstsq(J, target, rcond=None)[0]
