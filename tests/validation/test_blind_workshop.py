@@ -203,6 +203,8 @@ def test_scores_of_folders(tmp_path):
     (found / "b.json").unlink()
     assert score_folders(labelled, found)["n_cases"] == 4
     assert score_folders(labelled, found, partial=True)["n_cases"] == 3
+    with pytest.raises(InputError, match="no diagnosis is there"):
+        score_folders(labelled, labelled)
     answered(e=("none", []))
     with pytest.raises(InputError, match="e is none of the cases"):
         score_folders(labelled, found)

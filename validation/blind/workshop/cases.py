@@ -30,6 +30,7 @@ _MAJOR = (3.5, 8.0)  # over the background
 _REALISED = (2.0, 16.0)
 _CLOSE_ENOUGH = 0.12  # in the logarithm of a wanted size
 _TRIES = 40
+_SHARE_WITH_LOST_ROWS = 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +208,7 @@ def _recorded(
             quantities["tip_acceleration_m_s2"] = felt[before:]
         if run.plan.feedback:
             quantities["reference_rad"] = run.plan.feedback.reference_rad[before:]
-        lost = []
-        if rng.random() < 0.12:
-            count = int(rng.integers(1, 4))
-            lost = sorted(int(k) for k in rng.choice(np.arange(20, rows - before - 20), count, replace=False))
+        lost = _lost_rows(quantities["voltage_V"], rng)
         samples.append(Sample(run, quantities, lost))
         held = run.plan.role == "held_out"
         clean_logs.append(Log(clean.voltage_V, bench.output(clean, before), held))
@@ -233,3 +231,14 @@ def _recorded(
         for s in samples
     }
     return WorkshopCase(machine, closed, tuple(samples), answer)
+
+
+def _lost_rows(voltage_V: Real, rng: np.random.Generator) -> list[int]:
+    """Seldom some rows, none of them with a jump of the voltage that nobody could know of."""
+    if rng.random() >= _SHARE_WITH_LOST_ROWS:
+        return []
+    steps = np.abs(np.diff(voltage_V)) < 0.1 * np.std(voltage_V)
+    calm = 1 + np.flatnonzero(steps[:-1] & steps[1:])
+    calm = calm[(calm >= 20) & (calm < voltage_V.size - 20)]
+    count = min(int(rng.integers(1, 4)), calm.size)
+    return sorted(rng.choice(calm, count, replace=False).tolist())

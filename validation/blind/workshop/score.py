@@ -61,9 +61,9 @@ def score_folders(labelled: Path, found: Path, *, partial: bool = False) -> dict
     strange = sorted(documents.keys() - answers.keys())
     if strange:
         raise InputError(f"{found}: {strange[0]} is none of the cases labelled in {labelled}")
+    if not documents:
+        raise InputError(f"{found}: no diagnosis is there; expected the --out of flexlink diagnose")
     names = [name for name in answers if name in documents or not partial]
-    if not names:
-        raise InputError(f"{found}: no diagnosis of a case in {labelled}")
     said = [documents.get(name) or failed(name, "no diagnosis") for name in names]
     return scores(said, [answers[name] for name in names], FAMILIES)
 
