@@ -182,6 +182,13 @@ SPOILT = {
         lambda folder: edit(folder / "experiments/01_prbs.csv", "\n0.5,", "\n0.4,"),
         ["01_prbs.csv, line 102", "goes from 0.495 to 0.4 s"],
     ),
+    "millivolts as volts": (
+        _case(
+            "[[experiments]]",
+            '[columns]\nvoltage_V = { column = "voltage_V", scale = 1e3 }\n\n[[experiments]]',
+        ),
+        ["case.toml: all records", "hub_angle_rad and tip_m", "voltage_V off by 1000"],
+    ),
     "scale of nothing": (
         _case("[[experiments]]", '[columns]\ntip_m = { column = "tip_m", scale = 0 }\n\n[[experiments]]'),
         ["case.toml", "columns.tip_m", "scale must not be 0"],
