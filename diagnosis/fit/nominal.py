@@ -66,3 +66,11 @@ class NominalParameters:
 
     def within(self, deviations: Real) -> Real:
         return np.clip(deviations, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+
+
+class LogNormalParameters(NominalParameters):
+    """true = stated exp(t d): up and down alike, and no value grows without bound."""
+
+    def factors(self, deviations: Real) -> dict[str, float]:
+        pairs = zip(self.stated.tolerances.items(), deviations, strict=True)
+        return {key: float(np.exp(tolerance * d)) for (key, tolerance), d in pairs}

@@ -101,4 +101,4 @@ class Case(RecordedCase[Experiment]):
     @property
     def machine(self) -> FlexibleArm:
         """The rig in the form that fits and evidence ask for (see `diagnosis.machine.machine_protocol`)."""
-        return FlexibleArm(self.rig, self.outputs)
+        return FlexibleArm(self.rig, self.outputs, self.model_error)

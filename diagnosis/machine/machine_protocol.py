@@ -47,6 +47,35 @@ class Weighing:
         return float(np.sqrt(self.correlation_samples * (1 + self.model_error**2)))
 
 
+@dataclass(frozen=True, eq=False)
+class UnknownStart:
+    """What nobody knows about the start of a record and the zeros of its sensors.
+
+    state_spread : (S,) prior standard deviations of the states at the start; the first one is free.
+    zero_spread : (Z,) the same of zeros, which all records share. zero_outputs : (Z, Y) outputs per zero.
+    state_per_zero : (S, Z) what a zero moves of a start that was read off the measurement.
+    guess : record -> (S,) start as its first samples say.
+    responses : effects, samples -> S arrays (T, Y): outputs per unit of a state, of the linear part.
+    """
+
+    state_spread: Real
+    zero_spread: Real
+    zero_outputs: Real
+    state_per_zero: Real
+    guess: Callable[[Any], Real]
+    responses: Callable[[Sequence[Any], int], list[Real]]
+
+
+KNOWN_START = UnknownStart(
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros((0, 0)),
+    np.zeros((0, 0)),
+    lambda record: np.zeros(0),
+    lambda effects, samples: [],
+)
+
+
 class Machine(Protocol):
     """A machine that can be simulated, as its makers know it; stated parameters may be off."""
 
@@ -68,8 +97,18 @@ class Machine(Protocol):
     def description(self) -> Any:
         """What a user gets back as the repaired machine."""
 
-    def simulator(self, effects: Sequence[Any]) -> Callable[[Real], Real]:
-        """Inputs (T, U) -> outputs (T, Y) without noise; effects as its own candidates make them."""
+    @property
+    def unknown_start(self) -> UnknownStart: ...
+
+    def simulator(self, effects: Sequence[Any]) -> Callable[..., Real]:
+        """Inputs (T, U) -> outputs (T, Y) without noise; effects as its own candidates make them.
+
+        Further arguments, where a start is unknown: states (S,), zeros (Z,).
+        """
+
+    def torque_response(self, samples: int) -> tuple[Real, float] | None:
+        """(T, Y) outputs after a torque of one on the hub over the first sample, and the sampling period [s];
+        None for a machine without a hub."""
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
         """Effects that may be missing, as search spaces with ranges that fit the records."""

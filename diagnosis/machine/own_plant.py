@@ -23,10 +23,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from diagnosis.machine.machine_protocol import (
+    KNOWN_START,
     Real,
     RecordedCase,
     RecordOfMachine,
     Role,
+    UnknownStart,
     Weighing,
     check_record,
 )
@@ -117,6 +119,9 @@ class PlantEffect:
     # Which of its own parameters an effect multiplies nobody said.
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None
+    adds_to: ClassVar[str | None] = None
+    contains: ClassVar[str | None] = None
+    absolute_angle: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", tuple(self.parameters))
@@ -218,12 +223,20 @@ class Plant:
         moved = {key: value * factors.get(key, 1.0) for key, value in self.parameters.items()}
         return replace(self, parameters=moved)
 
-    def simulator(self, effects: Sequence[Change]) -> Callable[[Real], Real]:
+    @property
+    def unknown_start(self) -> UnknownStart:
+        """None: a simulation of one's own starts as it says."""
+        return replace(KNOWN_START, zero_outputs=np.zeros((0, self.noise.size)))
+
+    def torque_response(self, samples: int) -> None:
+        return None
+
+    def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
         given = {effect.id: effect.values for effect in effects}
         far = _RUNAWAY * self.noise
 
-        def outputs(inputs: Real) -> Real:
+        def outputs(inputs: Real, *_start: Real) -> Real:
             found = np.asarray(self.simulation(self.parameters, given, inputs))
             return np.clip(np.where(np.isnan(found), far, found), -far, far)
 

@@ -18,6 +18,7 @@ class InputDelay(Effect):
     id = "input_delay"
     words = "a delay of the command"
     group = "actuator"
+    adds_to = "sampling.transport_delay_s"
 
     delay_s: NotNegative = Field(le=60.0, description="delay of the voltage; every sample of it is stored")
 

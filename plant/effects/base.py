@@ -48,6 +48,9 @@ class Effect(BaseModel, ABC):
         The torque is a sine of the hub angle or of time: amplitude and phase follow by linear least squares.
     look_alike_of : str or None
         Not an answer of a diagnosis, but what the effect of this id may be mistaken for.
+    adds_to : str or None. Key of the stated value that it adds to.
+    contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
+    absolute_angle : bool. It depends on the true hub angle: where an encoder has its zero matters.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -62,6 +65,9 @@ class Effect(BaseModel, ABC):
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None
     look_alike_of: ClassVar[str | None] = None
+    adds_to: ClassVar[str | None] = None
+    contains: ClassVar[str | None] = None
+    absolute_angle: ClassVar[bool] = False
 
     @abstractmethod
     def modify(self, machine: Machine) -> Machine:

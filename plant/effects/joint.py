@@ -64,6 +64,7 @@ class StribeckFriction(Effect):
     id = "stribeck_friction"
     words = "dry friction that falls with speed (Stribeck)"
     group = "joint"
+    contains = "coulomb_friction"
     friction = True
     neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
     dependence = "continuous"
@@ -118,6 +119,7 @@ class ViscousFriction(Effect):
     id = "viscous_friction"
     words = "additional viscous friction"
     group = "joint"
+    adds_to = "hub.viscous_friction_Nms"
     friction = True
 
     coefficient_Nms: NotNegative = Field(description="added to the rig's viscous friction")
@@ -207,6 +209,7 @@ class HardeningSpring(Effect):
     id = "hardening_spring"
     words = "a hardening spring at the hub (cable, hose)"
     group = "joint"
+    absolute_angle = True
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
 

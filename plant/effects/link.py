@@ -18,6 +18,7 @@ class TipPayload(Effect):
     id = "tip_payload"
     words = "an additional mass at the tip"
     group = "link"
+    adds_to = "payload.mass_kg"
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
 
@@ -67,6 +68,7 @@ class Gravity(Effect):
     words = "gravity in a tilted plane"
     group = "link"
     environment = True
+    absolute_angle = True
 
     acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
 

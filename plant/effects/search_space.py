@@ -104,6 +104,15 @@ class EffectKind(Protocol):
     @property
     def harmonic(self) -> Harmonic | None: ...
 
+    @property
+    def adds_to(self) -> str | None: ...
+
+    @property
+    def contains(self) -> str | None: ...
+
+    @property
+    def absolute_angle(self) -> bool: ...
+
     def from_search(self, values: Mapping[str, float], sign: int) -> Any:
         """The effect at the values of the axes; it has `parameters()`."""
 

@@ -1,0 +1,146 @@
+"""The diagnosis of a machine with a stated model error: search, verdict, and the record of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from diagnosis.answer import DetailVerdict, Diagnosis, NamedEffect, Verdict, held_out_gap, share_closed
+from diagnosis.imperfect import verdict as judging
+from diagnosis.imperfect.descent import Descent, normal_equations
+from diagnosis.imperfect.search import Explanation, Progress, Search
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+
+_SURE, _POSSIBLE, _FAR_OFF = 0.8, 0.05, 3.0
+_DRAWS = 1000
+_FLOOR = 1.0
+
+
+def beside_imperfections(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:
+    """Diagnose a case whose machine states a model error."""
+    search = Search(case, progress)
+    search.run()
+    listed = case.machine.weighing.listed
+    found = judging.judged(search, listed)
+    progress(1.0, "done")
+    refit = search.base
+    accepted = next(
+        (
+            one.explanation
+            for one in found.judged
+            if found.accepted and set(found.accepted) <= set(one.explanation.names)
+        ),
+        refit,
+    )
+    before = _whitened(case, search.stated())
+    moved, after = _whitened(case, refit), _whitened(case, accepted)
+    closed, interval = share_closed(case, moved, after, rng, _FLOOR)
+    kind: Verdict = found.answer if found.answer in ("none", "unknown") else "effect"
+    ambiguous = _ambiguous(found)
+    keys = search.records.nominal.keys
+    return Diagnosis(
+        case=case,
+        verdict=kind,
+        detail_verdict=_detail(kind, found, ambiguous, accepted),
+        probabilities=found.probabilities.cause,
+        sets=found.probabilities.sets,
+        effects=_named(search, found, accepted, listed, rng),
+        combination=found.accepted,
+        ambiguous_with=ambiguous,
+        gap_before=held_out_gap(case, before),
+        gap_refit=held_out_gap(case, moved),
+        gap_after=held_out_gap(case, after),
+        noise_floor=_FLOOR,
+        gap_closed=closed,
+        gap_closed_interval=interval,
+        deviations=dict(zip(keys, map(float, accepted.end.deviations), strict=True)),
+        rig=search.records.nominal.at(accepted.end.deviations).description,
+        repair=accepted.end.effects,
+        residuals_before=before,
+        residuals_refit=moved,
+        residuals_after=after,
+        simulations=search.simulations,
+    )
+
+
+def _whitened(case: CaseOfMachine, explanation: Explanation) -> dict[str, Real]:
+    records = (*case.estimation, *case.held_out)
+    left = (*explanation.left, *explanation.left_held_out)
+    named = {e.name: part / case.noise for e, part in zip(records, left, strict=True)}
+    return {e.name: named[e.name] for e in case.experiments}
+
+
+def _ambiguous(found: judging.Verdict) -> tuple[str, ...]:
+    weighed = found.probabilities
+    share = {name: p for name, p in weighed.presence.items() if name not in found.accepted}
+    share |= {name: weighed.cause[name] for name in ("none", "unknown")}
+    share.pop(found.answer, None)
+    return tuple(name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _POSSIBLE)
+
+
+def _detail(
+    kind: Verdict, found: judging.Verdict, ambiguous: Sequence[str], accepted: Explanation
+) -> DetailVerdict:
+    if kind == "unknown":
+        return "unknown"
+    if kind == "none":
+        far = np.max(np.abs(accepted.end.deviations), initial=0.0) > _FAR_OFF
+        return "parametric" if far else "none"
+    return "ambiguous" if found.probabilities.cause[found.answer] < _SURE or ambiguous else "effect"
+
+
+def _named(
+    search: Search,
+    found: judging.Verdict,
+    accepted: Explanation,
+    listed: Sequence[str],
+    rng: np.random.Generator,
+) -> tuple[NamedEffect, ...]:
+    weighed, case = found.probabilities, search.case
+    entries = []
+    for name in listed:
+        holding = [e for e in search.found if name in e.names]
+        parameters: dict[str, float] = {}
+        intervals: dict[str, tuple[float, float]] = {}
+        gap = float("nan")
+        if holding:
+            best = accepted if name in accepted.names else max(holding, key=lambda e: e.evidence)
+            k = best.names.index(name)
+            parameters = best.end.candidates[k].parameters(best.end.coordinates_of(k))
+            intervals = _intervals(search, best.end, k, rng)
+            gap = held_out_gap(case, _whitened(case, best))
+        entries.append(
+            NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
+        )
+    for name in ("none", "unknown"):
+        entries.append(NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan")))
+    order = {found.answer: -1, **{name: k for k, name in enumerate(found.accepted)}}
+    last = {"none", "unknown"} - {found.answer}
+    return tuple(sorted(entries, key=lambda e: (e.name in last, order.get(e.name, len(order)), -e.presence)))
+
+
+def _intervals(
+    search: Search, end: Descent, k: int, rng: np.random.Generator
+) -> Mapping[str, tuple[float, float]]:
+    """95 % intervals of the parameters of the k-th effect, from Gaussian draws of its coordinates."""
+    records, candidate = search.records, end.candidates[k]
+    weights = records.levels.weights(end.left)
+    equations = normal_equations(
+        records, weights, end.jacobian, end.columns, end.deviations, end.start, end.left
+    )
+    first = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
+    rows = slice(first, first + len(candidate.axes))
+    covariance = np.linalg.pinv(equations.hessian, hermitian=True)[rows, rows] * judging.TEMPER
+    values, vectors = np.linalg.eigh(covariance)
+    x = end.coordinates_of(k)
+    draws = x + rng.standard_normal((_DRAWS, x.size)) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    sampled = [candidate.parameters(draw) for draw in np.clip(draws, *candidate.box)]
+    found = {}
+    for key, value in candidate.parameters(x).items():
+        spread = np.array([p[key] for p in sampled]) - value
+        if key == "phase_rad":
+            spread = np.mod(spread + np.pi, 2 * np.pi) - np.pi
+        low, high = np.quantile(spread, [0.025, 0.975])
+        found[key] = (float(value + low), float(value + high))
+    return found

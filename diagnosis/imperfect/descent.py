@@ -1,0 +1,218 @@
+"""Maximum a posteriori fit of deviations, effects, starts and zeros under levels that the residuals show.
+
+Levenberg-Marquardt on the reweighted squares: `Levels.weights` of the present residuals majorise the concave
+likelihood, so that a step that lowers the weighted squares lowers the loss (iteratively reweighted least
+squares). Derivatives by difference quotients; those by starts from the linear part of the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from diagnosis.fit.fit import box, effects_at, quotients
+from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
+from diagnosis.imperfect.records import Records, Start, StartColumns
+from diagnosis.machine.machine_protocol import Real
+from plant.effects.search_space import Candidate
+
+# A nominal value is never believed to be off by more tolerances than this: it then is a finding.
+FARTHEST = 5.0
+_DEVIATION_STEP, _SMALLEST_STEP = 1e-3, 1e-4
+_LARGEST_STEP, _LARGEST_MOVE = 2.0, 1.5
+_AGAIN = (2, 5, 8, 11)
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """End of a fit: deviations (P,), coordinates (A,) of the candidates, start, coefficients (N,) left.
+
+    jacobian (N, P + A). loss: -log posterior density; prior: the part of it that deviations and start pay.
+    """
+
+    candidates: tuple[Candidate, ...]
+    deviations: Real
+    coordinates: Real
+    start: Start
+    left: Real
+    jacobian: Real
+    columns: StartColumns
+    loss: float
+    prior: float
+    converged: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.effect for c in self.candidates)
+
+    @property
+    def effects(self) -> tuple[Any, ...]:
+        return effects_at(self.candidates, self.coordinates)
+
+    def coordinates_of(self, k: int) -> Real:
+        """Those of the k-th candidate."""
+        first = sum(len(c.axes) for c in self.candidates[:k])
+        return self.coordinates[first : first + len(self.candidates[k].axes)]
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Weighted, in (d, x, zeros, states of record 1, 2, ...): hessian (M, M), gradient (M,)."""
+
+    hessian: Real
+    gradient: Real
+
+
+def normal_equations(
+    records: Records,
+    weights: Real,
+    jacobian: Real,
+    columns: StartColumns,
+    deviations: Real,
+    start: Start,
+    e: Real,
+) -> Normal:
+    shared = np.column_stack([jacobian, columns.zeros])
+    P, k = deviations.size, shared.shape[1]
+    R, S = start.states.shape
+    weighted = shared * weights[:, None]
+    H, g = np.zeros((k + R * S, k + R * S)), np.zeros(k + R * S)
+    H[:k, :k], g[:k] = shared.T @ weighted, weighted.T @ e
+    free = np.concatenate([np.zeros(min(S, 1)), 1 / records.state_spread[1:] ** 2])
+    for r, (part, own) in enumerate(zip(records.parts, columns.states, strict=True)):
+        at = slice(k + r * S, k + (r + 1) * S)
+        own_weighted = own * weights[part, None]
+        H[at, at] = own.T @ own_weighted + np.diag(free)
+        H[:k, at] = weighted[part].T @ own
+        H[at, :k] = H[:k, at].T
+        g[at] = own_weighted.T @ e[part] + free * start.states[r]
+    H[range(P), range(P)] += prior_curvature(deviations)
+    g[:P] += prior_slope(deviations)
+    zeros = range(jacobian.shape[1], k)
+    H[zeros, zeros] += 1 / records.zero_spread**2
+    g[jacobian.shape[1] : k] += start.zeros / records.zero_spread**2
+    return Normal(H, g)
+
+
+def loss_at(records: Records, e: Real, deviations: Real, start: Start) -> tuple[float, float]:
+    """-log posterior density of a point, and the part of it that the prior of deviations and start is."""
+    prior = 0.5 * (prior_cost(deviations) + records.prior_cost(start))
+    return records.levels.loss(e) + prior, prior
+
+
+def descend(
+    records: Records,
+    candidates: Sequence[Candidate],
+    deviations: Real,
+    coordinates: Real,
+    start: Start,
+    *,
+    nominal_jacobian: Real | None = None,
+    columns: StartColumns | None = None,
+    iterations: int = 10,
+    tolerance: float = 0.5,
+) -> Descent:
+    """Descend from a point; the Jacobian by the deviations and the start columns may be those of a point
+    nearby, and are renewed on the way."""
+    P, A = deviations.size, coordinates.size
+    low, high = box(candidates)
+    d, x = deviations.copy(), np.clip(coordinates, low, high)
+    steps = np.array([max(axis.step, _SMALLEST_STEP) for c in candidates for axis in c.axes])
+
+    def left(d: Real, x: Real, start: Start) -> Real:
+        return records.coefficients(d, effects_at(candidates, x), start)
+
+    e = left(d, x, start)
+    loss, prior = loss_at(records, e, d, start)
+    damping, converged = 1e-3, False
+    by_effects = np.zeros((e.size, A))
+    for iteration in range(iterations):
+        if nominal_jacobian is None or iteration in _AGAIN:
+            step = np.full(P, _DEVIATION_STEP)
+            nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
+        if columns is None or iteration == _AGAIN[0]:
+            columns = records.start_columns(d, effects_at(candidates, x))
+        by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
+        jacobian = np.column_stack([nominal_jacobian, by_effects])
+        equations = normal_equations(records, records.levels.weights(e), jacobian, columns, d, start, e)
+        H, g = equations.hessian, equations.gradient
+        held = ((x <= low) & (g[P : P + A] > 0)) | ((x >= high) & (g[P : P + A] < 0))
+        free = np.setdiff1d(np.arange(g.size), P + np.flatnonzero(held))
+        reached = None
+        for _ in range(7):
+            damped = H + damping * np.diag(np.diag(H) + 1e-9)
+            damped[range(P, P + A), range(P, P + A)] += 1e2 * damping
+            step = np.zeros(g.size)
+            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], g[free])
+            d2 = np.clip(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP), -FARTHEST, FARTHEST)
+            x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_MOVE, _LARGEST_MOVE), low, high)
+            start2 = start.moved(step[P + A :])
+            e2 = left(d2, x2, start2)
+            loss2, prior2 = loss_at(records, e2, d2, start2)
+            if loss2 < loss:
+                reached = loss2
+                break
+            damping = max(6 * damping, 1e-4)
+        if reached is None:
+            converged = True
+            break
+        gain = loss - reached
+        d, x, start, e, loss, prior = d2, x2, start2, e2, loss2, prior2
+        damping *= 0.2
+        if gain < tolerance:
+            converged = True
+            break
+    assert nominal_jacobian is not None
+    assert columns is not None
+    jacobian = np.column_stack([nominal_jacobian, by_effects])
+    return Descent(tuple(candidates), d, x, start, e, jacobian, columns, loss, prior, converged)
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A point after deviations, sizes of the effects, zeros and states have followed linearly: loss, d, x."""
+
+    loss: float
+    deviations: Real
+    coordinates: Real
+
+
+def follow(records: Records, around: Descent, e: Real, start: Start) -> Followed:
+    """What the loss of coefficients e (N,) becomes once everything that `around` holds has followed."""
+    P = around.deviations.size
+    weights = records.levels.weights(around.left)
+    equations = normal_equations(
+        records, weights, around.jacobian, around.columns, around.deviations, start, e
+    )
+    H = equations.hessian + np.diag(1e-9 * np.diag(equations.hessian) + 1e-12)
+    step = -np.linalg.solve(H, equations.gradient)
+    step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
+    moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
+    d, start2 = around.deviations + step[:P], start.moved(step[around.jacobian.shape[1] :])
+    S = start.states.shape[1]
+    first = step.size - start.states.size
+    for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
+        moved[part] += own @ step[first + r * S : first + (r + 1) * S]
+    loss, _ = loss_at(records, moved, d, start2)
+    return Followed(loss, np.clip(d, -FARTHEST, FARTHEST), around.coordinates)
+
+
+def occam(records: Records, end: Descent) -> float:
+    """log of the prior density of the effects' coordinates times the volume that the records leave them."""
+    equations = normal_equations(
+        records,
+        records.levels.weights(end.left),
+        end.jacobian,
+        end.columns,
+        end.deviations,
+        end.start,
+        end.left,
+    )
+    scale = np.sqrt(np.diag(equations.hessian) + 1e-12)
+    scaled = equations.hessian / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
+    logdet = np.linalg.slogdet(scaled)[1] + 2 * float(np.sum(np.log(scale)))
+    density = sum(c.log_density(end.coordinates_of(k)) for k, c in enumerate(end.candidates))
+    return float(density - 0.5 * logdet + 0.5 * end.coordinates.size * np.log(2 * np.pi))

@@ -1,0 +1,102 @@
+"""Simulation of records that start anywhere, with an encoder whose zero nobody knows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from diagnosis.fit.nominal import LogNormalParameters
+from diagnosis.imperfect.levels import Levels, coefficients
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What is fitted beside parameters: states (R, S) at the start of each record, zeros (Z,) of the sensors."""
+
+    states: Real
+    zeros: Real
+
+    def moved(self, step: Real) -> Start:
+        """step: (Z + R S,)."""
+        Z = self.zeros.size
+        return Start(self.states + step[Z:].reshape(self.states.shape), self.zeros + step[:Z])
+
+    def with_zeros(self, zeros: Real, columns: Real) -> Start:
+        """The same measured start with other zeros; columns (S, Z): states per unit of a zero."""
+        return Start(self.states - (zeros - self.zeros) @ columns.T, zeros)
+
+
+@dataclass(frozen=True, eq=False)
+class StartColumns:
+    """Derivatives of the coefficients by a `Start`: zeros (N, Z), states of every record (T Y, S) each."""
+
+    zeros: Real
+    states: tuple[Real, ...]
+
+
+class Records:
+    """Some records of a case as coefficients (N,); counts its simulations."""
+
+    def __init__(self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine]) -> None:
+        self.case, self.experiments = case, tuple(experiments)
+        self.nominal = LogNormalParameters(case.machine)
+        self.levels = Levels.of(experiments, case.noise, case.machine.weighing.model_error)
+        self.simulations = 0
+        ends = np.cumsum([e.output.size for e in experiments])
+        self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
+        unknown = case.machine.unknown_start
+        self.state_spread, self.zero_spread = unknown.state_spread, unknown.zero_spread
+
+    def at_rest(self) -> Start:
+        """Starts as the first samples say, sensors at their zeros."""
+        guess = self.case.machine.unknown_start.guess
+        return Start(np.array([guess(e) for e in self.experiments]), np.zeros(self.zero_spread.size))
+
+    def residuals(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
+        """measured - model (T, Y) of every record, in the outputs' units."""
+        simulate = self.nominal.at(deviations).simulator(effects)
+        self.simulations += len(self.experiments)
+        found = []
+        for experiment, state in zip(self.experiments, start.states, strict=True):
+            e = experiment.output - simulate(experiment.input, state, start.zeros)
+            missing = list(getattr(experiment, "missing", ()))
+            if missing:
+                kept = np.setdiff1d(np.arange(len(e)), missing)
+                for column in e.T:
+                    column[missing] = np.interp(missing, kept, column[kept])
+            far = 1e6 * np.std(experiment.output, axis=0)
+            found.append(np.clip(np.where(np.isnan(e), far, e), -far, far))
+        return found
+
+    def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
+        return np.concatenate([coefficients(e) for e in self.residuals(deviations, effects, start)])
+
+    def start_columns(self, deviations: Real, effects: Sequence[Any]) -> StartColumns:
+        """Of the linear part of the machine."""
+        longest = max(len(e.output) for e in self.experiments)
+        outputs = self.case.noise.size
+        by_state = self.nominal.at(deviations).unknown_start.responses(effects, longest)
+        states, zeros = [], []
+        for e in self.experiments:
+            T = len(e.output)
+            columns = [coefficients(response[:T]) for response in by_state]
+            states.append(-np.array(columns).reshape(-1, T * outputs).T)
+            shapes = self.case.machine.unknown_start.zero_outputs
+            constant = [coefficients(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
+            zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
+        return StartColumns(np.concatenate(zeros), tuple(states))
+
+    def prior_cost(self, start: Start) -> float:
+        """-2 log prior density of a start."""
+        free = start.states[:, 1:] / self.state_spread[1:]
+        return float(np.sum(free**2) + np.sum((start.zeros / self.zero_spread) ** 2))
+
+    def shares(self, residuals: Sequence[Real]) -> Real:
+        """(Y,) RMS left over the RMS of the motion (about the mean of each record), all records together."""
+        left = sum(np.sum(e**2, axis=0) for e in residuals)
+        motion = sum(len(e.output) * np.var(e.output, axis=0) for e in self.experiments)
+        return np.sqrt(left / motion)

@@ -1,0 +1,285 @@
+"""Sets of effects that explain the records of a machine beside what no effect explains."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from diagnosis.fit.nominal import prior_cost
+from diagnosis.imperfect.descent import Descent, descend, loss_at, occam
+from diagnosis.imperfect.records import Records, Start
+from diagnosis.imperfect.starts import Point, beside, points_of
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from plant.effects.search_space import Candidate
+
+Progress = Callable[[float, str], None]
+
+# Starts descended from alone; parents extended and effects fitted beside each, by size of the set.
+_ALONE, _BESIDE_POINTS = 2, 4
+_PARENTS, _TRIED = {2: 3, 3: 1}, {2: 6, 3: 4}
+_FINISHED = 6
+# Beside values pulled this far (tolerances), effects that multiply one are tried as well.
+_PULLED = 1.8
+_HELD_OUT_STEPS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A fitted set of effects and what it leaves.
+
+    gain : what the records gain over the nominal alone, estimation and held-out, in log likelihood.
+    prior : log prior of deviations, start and effects with the volume the records leave them.
+    left, left_held_out : experiment residuals (T, Y) in the outputs' units.
+    shares : (2, Y) RMS left over the motion: estimation records, held-out records.
+    """
+
+    end: Descent
+    log_likelihood: float
+    log_prior: float
+    log_volume: float
+    left: tuple[Real, ...]
+    left_held_out: tuple[Real, ...]
+    shares: Real
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.end.names
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return tuple(sorted(self.names))
+
+    @property
+    def evidence(self) -> float:
+        return self.log_likelihood + self.log_prior + self.log_volume
+
+
+@dataclass(eq=False)
+class Search:
+    """All that was fitted to a case, the nominal alone first."""
+
+    case: CaseOfMachine
+    progress: Progress
+    deadline_s: float = np.inf
+    found: list[Explanation] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.records = Records(self.case, self.case.estimation)
+        self.held_out = Records(self.case, self.case.held_out)
+        self.points: list[tuple[Candidate, list[Point]]] = []
+
+    @property
+    def base(self) -> Explanation:
+        return self.found[0]
+
+    @property
+    def simulations(self) -> int:
+        return self.records.simulations + self.held_out.simulations
+
+    def run(self) -> None:
+        """The nominal, every effect alone, then sets of two and three beside the likeliest."""
+        P = self.records.nominal.count
+        nominal = descend(self.records, (), np.zeros(P), np.zeros(0), self.records.at_rest(), iterations=12)
+        self.add(nominal)
+        self._alone()
+        self._containing()
+        for count in (2, 3):
+            self._together(count)
+
+    def _late(self, what: str) -> bool:
+        if time.process_time() < self.deadline_s:
+            return False
+        if what not in self.left_out:
+            self.left_out.append(what)
+        return True
+
+    def _alone(self) -> None:
+        around = self.base.end
+        spaces = self.case.machine.candidates(self.case.experiments)
+        ends: list[Descent] = []
+        for k, candidate in enumerate(spaces):
+            self.progress(0.05 + 0.4 * k / len(spaces), f"fitting {candidate.effect}")
+            if candidate.kind.contains is not None or self._late(candidate.effect):
+                continue
+            points = points_of(self.records, around, candidate)
+            if not points:
+                continue
+            self.points.append((candidate, points))
+            ends.append(self._descended(around, candidate, points, around.jacobian))
+        for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
+            if k < _FINISHED and not end.converged:
+                end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
+            self.add(end)
+
+    def _descended(
+        self, around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
+    ) -> Descent:
+        chosen = [points[0]]
+        for point in points[1:]:
+            if len(chosen) == _ALONE or point.loss > self.base.end.loss + 5:
+                break
+            if point.far_from(chosen[0]):
+                chosen.append(point)
+        ends = [self._from(around, candidate, point, nominal) for point in chosen]
+        return min(ends, key=lambda end: end.loss)
+
+    def _from(self, around: Descent, candidate: Candidate, point: Point, nominal: Real) -> Descent:
+        return descend(
+            self.records,
+            (*around.candidates, candidate),
+            point.deviations,
+            np.concatenate([around.coordinates, point.coordinates]),
+            point.start,
+            nominal_jacobian=nominal,
+            columns=around.columns,
+            iterations=9,
+        )
+
+    def _containing(self) -> None:
+        """Effects that contain a simpler one (Stribeck friction Coulomb's), from where that has ended."""
+        for candidate in self.case.machine.candidates(self.case.experiments):
+            simple = [e for e in self.found if e.names == (candidate.kind.contains,)]
+            if candidate.kind.contains is None or not simple or self._late(candidate.effect):
+                continue
+            inner = max(simple, key=lambda e: e.evidence).end
+            size = inner.coordinates[0]
+            ends = [
+                descend(
+                    self.records,
+                    (candidate,),
+                    inner.deviations,
+                    np.array([size, *further]),
+                    inner.start,
+                    nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
+                    columns=inner.columns,
+                    iterations=6,
+                )
+                for further in sorted({x[1:] for x in candidate.starts})[::2]
+            ]
+            best = min(ends, key=lambda end: end.loss)
+            self.points.append((candidate, [_point(best)]))
+            self.add(best)
+
+    def _together(self, count: int) -> None:
+        pool = sorted((e for e in self.found if len(e.names) == count - 1), key=lambda e: -e.evidence)
+        parents: dict[tuple[str, ...], Explanation] = {}
+        for explanation in pool:
+            if len(parents) < _PARENTS[count]:
+                parents.setdefault(explanation.key, explanation)
+        for k, parent in enumerate(parents.values()):
+            words = f"fitting more beside {' and '.join(parent.names)}"
+            self.progress(0.45 + 0.25 * (count - 2) + 0.25 * k / len(parents), words)
+            if self._late(f"further effects beside {' and '.join(parent.names)}"):
+                return
+            self._beside(parent.end, _TRIED[count])
+
+    def _beside(self, parent: Descent, most: int) -> None:
+        trials: list[tuple[Candidate, Point]] = []
+        held = {name for c in parent.candidates for name in (c.effect, c.kind.contains)} - {None}
+        for candidate, points in self.points:
+            if candidate.effect in held or candidate.kind.contains in held:
+                continue
+            near = (
+                points_of(self.records, parent, candidate)[:1]
+                if candidate.kind.harmonic
+                else beside(self.records, parent, candidate, _spread(points))
+            )
+            trials += [(candidate, near[0])] if near else []
+        trials.sort(key=lambda trial: trial[1].loss)
+        chosen: dict[str, tuple[Candidate, Point]] = {}
+        for candidate, point in trials:
+            pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
+            if len(chosen) < most or pulled:
+                chosen.setdefault(candidate.effect, (candidate, point))
+        for candidate, point in chosen.values():
+            nominal = parent.jacobian[:, : parent.deviations.size]
+            self.add(self._from(parent, candidate, point, nominal))
+
+    def without(self, explanation: Explanation, k: int) -> Explanation:
+        """The best explanation by the same effects but the k-th."""
+        end = explanation.end
+        rest = tuple(c for j, c in enumerate(end.candidates) if j != k)
+        key = tuple(sorted(c.effect for c in rest))
+        if rest:
+            x = np.concatenate([end.coordinates_of(j) for j in range(len(end.candidates)) if j != k])
+            self.add(descend(self.records, rest, end.deviations, x, end.start))
+        return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)
+
+    def stated(self) -> Explanation:
+        """The nominal as stated: only the starts are fitted."""
+        end = self.base.end
+        stated = np.zeros(end.deviations.size)
+        start, e = self._started(self.records, stated, (), end.start)
+        loss, prior = loss_at(self.records, e, stated, start)
+        return self._explanation(replace(end, deviations=stated, start=start, left=e, loss=loss, prior=prior))
+
+    def add(self, end: Descent) -> Explanation:
+        """The explanation with what it predicts of the held-out records, their starts fitted."""
+        explanation = self._explanation(end)
+        self.found.append(explanation)
+        return explanation
+
+    def _explanation(self, end: Descent) -> Explanation:
+        records, held = self.records, self.held_out
+        start, e = self._started(held, end.deviations, end.effects, end.start)
+        left = tuple(records.residuals(end.deviations, end.effects, end.start))
+        left_held_out = tuple(held.residuals(end.deviations, end.effects, start))
+        held_out_loss = held.levels.loss(e) + 0.5 * float(
+            np.sum((start.states[:, 1:] / held.state_spread[1:]) ** 2)
+        )
+        return Explanation(
+            end,
+            -records.levels.loss(end.left) - held_out_loss,
+            -end.prior,
+            occam(records, end),
+            left,
+            left_held_out,
+            np.array([records.shares(left), held.shares(left_held_out)]),
+        )
+
+    def _started(self, held: Records, d: Real, effects: Sequence[Any], fitted: Start) -> tuple[Start, Real]:
+        """Records from states that fit them best, everything else as fitted: start, coefficients."""
+        start = held.at_rest()
+        if start.zeros.size:
+            columns = self.case.machine.unknown_start.state_per_zero
+            start = start.with_zeros(fitted.zeros, columns)
+        e = held.coefficients(d, effects, start)
+        S = start.states.shape[1]
+        if not S:
+            return start, e
+        loss, _ = loss_at(held, e, d, start)
+        columns = held.start_columns(d, effects)
+        free = np.concatenate([[0.0], 1 / held.state_spread[1:] ** 2])
+        for _ in range(_HELD_OUT_STEPS):
+            weights = held.levels.weights(e)
+            step = np.zeros((len(held.parts), S))
+            for r, (part, own) in enumerate(zip(held.parts, columns.states, strict=True)):
+                weighted = own * weights[part, None]
+                gradient = weighted.T @ e[part] + free * start.states[r]
+                step[r] = -np.linalg.solve(own.T @ weighted + np.diag(free), gradient)
+            moved = Start(start.states + step, start.zeros)
+            e2 = held.coefficients(d, effects, moved)
+            loss2, _ = loss_at(held, e2, d, moved)
+            if not loss2 < loss - 0.2:
+                break
+            start, e, loss = moved, e2, loss2
+        return start, e
+
+
+def _spread(points: Sequence[Point]) -> Sequence[Point]:
+    """The best and, because beside another effect any size may be right, some of the rest."""
+    rest = points[_BESIDE_POINTS:]
+    return [*points[:_BESIDE_POINTS], *rest[:: max(1, len(rest) // _BESIDE_POINTS)]]
+
+
+def _point(end: Descent) -> Point:
+    return Point(end.loss, end.coordinates, end.deviations, end.start)
+
+
+def deviation_cost(explanation: Explanation) -> float:
+    return prior_cost(explanation.end.deviations)

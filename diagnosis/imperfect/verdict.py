@@ -1,0 +1,163 @@
+"""From fitted sets to an answer: which effects matter, what remains, and how sure that is.
+
+"None", "exactly these effects" and "unknown" are all false for a real machine; what is asked is which effect
+carries a part of the gap that interests (more than the stated model error), and whether what then remains is no
+more than imperfections leave. Both are judged on shares of the motion, of estimation and held-out records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.special import expit, softmax
+
+from diagnosis.evidence.hypotheses import Probabilities
+from diagnosis.imperfect.search import Explanation, Search
+
+# Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
+# `flexlink blind --workshop`); prior densities of stated values count whole.
+TEMPER = 4.0
+_VOLUME = 0.5
+_LOG_PRIOR = {0: np.log(0.25), 1: np.log(0.5 / 23), 2: np.log(0.14 / 253), 3: np.log(0.02 / 1771)}
+# An effect interests from this many model errors on; what remains is more than imperfections above that many.
+# Both limits are soft: widths in natural logarithms.
+_INTERESTS, _REMAINS = 1.2, 1.6
+_INTERESTS_WIDTH, _REMAINS_WIDTH = 0.12, 0.12
+# Log odds by which a wrong stated value has to be preferred to values within their tolerances.
+_PARAMETRIC = 8.0
+# What an effect that contains a simpler one has to gain over it.
+_CONTAINING = 3.0
+# Sets this far behind in score take no part.
+_BEHIND, _MOST_SETS = 8.0, 8
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one effect of a set carries: share of the motion, probability that it matters."""
+
+    name: str
+    share: float
+    matters: float
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A set with its parts, its score and the probability that it leaves no more than imperfections."""
+
+    explanation: Explanation
+    parts: tuple[Part, ...]
+    score: float
+    complete: float
+
+    @property
+    def major(self) -> tuple[str, ...]:
+        """Effects that matter, the one that carries most first."""
+        parts = sorted(self.parts, key=lambda part: -part.share)
+        return tuple(part.name for part in parts if part.matters > 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """probabilities; judged: the sets that were weighed, best first; answer: names that are accepted."""
+
+    probabilities: Probabilities
+    judged: tuple[Judged, ...]
+    answer: str
+    accepted: tuple[str, ...]
+
+
+def score_of(explanation: Explanation) -> float:
+    candidates = explanation.end.candidates
+    further = sum(len(c.axes) - 1 for c in candidates)
+    further += _CONTAINING * sum(c.kind.contains is not None for c in candidates)
+    return (
+        explanation.log_likelihood / TEMPER
+        + explanation.log_prior
+        + _VOLUME * explanation.log_volume
+        + float(_LOG_PRIOR[len(explanation.names)])
+        - further
+    )
+
+
+def judged(search: Search, listed: Sequence[str]) -> Verdict:
+    """The answer from everything that a search has fitted; fits the best set without each of its effects."""
+    model_error = search.case.machine.weighing.model_error
+    best: dict[tuple[str, ...], Explanation] = {}
+    for explanation in search.found:
+        known = best.get(explanation.key)
+        if known is None or explanation.evidence > known.evidence:
+            best[explanation.key] = explanation
+    ranked = sorted(best.values(), key=lambda e: -score_of(e))
+    top = score_of(ranked[0])
+    chosen = [e for e in ranked[:_MOST_SETS] if score_of(e) > top - _BEHIND]
+    sets = tuple(_judged(search, e, best, model_error, fit=k == 0) for k, e in enumerate(chosen))
+    probabilities = _probabilities(sets, listed)
+    answer = probabilities.answer
+    if answer in ("none", "unknown"):
+        return Verdict(probabilities, sets, answer, ())
+    found = max((key for key in probabilities.sets if answer in key), key=lambda key: probabilities.sets[key])
+    main = next(s for s in sets if set(found) <= {p.name for p in s.parts})
+    accepted = tuple(p.name for p in sorted(main.parts, key=lambda p: -p.share) if p.name in found)
+    return Verdict(probabilities, sets, answer, accepted)
+
+
+def _judged(
+    search: Search,
+    explanation: Explanation,
+    best: Mapping[tuple[str, ...], Explanation],
+    model_error: float,
+    *,
+    fit: bool,
+) -> Judged:
+    parts = []
+    for k, name in enumerate(explanation.names):
+        key = tuple(sorted(n for n in explanation.names if n != name))
+        rest = search.without(explanation, k) if fit and key else best.get(key, search.base)
+        carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
+        share = float(np.sqrt(np.mean(np.max(carried, axis=1) ** 2)))
+        matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
+        if explanation.end.candidates[k].kind.multiplies is not None:
+            gained = explanation.evidence - rest.evidence
+            matters = max(matters, float(expit(gained - _PARAMETRIC)))
+        parts.append(Part(name, share, matters))
+    remains = float(np.max(explanation.shares[1]))
+    complete = 1.0 - _soft(remains / (_REMAINS * model_error), _REMAINS_WIDTH)
+    at_edge = any(
+        c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
+        for k, c in enumerate(explanation.end.candidates)
+    )
+    return Judged(explanation, tuple(parts), score_of(explanation), 0.0 if at_edge else complete)
+
+
+def _soft(ratio: float, width: float) -> float:
+    return float(expit(np.log(max(ratio, 1e-6)) / width))
+
+
+def _probabilities(sets: Sequence[Judged], listed: Sequence[str]) -> Probabilities:
+    """Every set shared out: unknown where it is not complete, else those of its effects that matter."""
+    weights = softmax([s.score for s in sets])
+    shared: dict[tuple[str, ...], float] = {}
+    cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
+    presence = dict.fromkeys(listed, 0.0)
+    for weight, one in zip(weights, sets, strict=True):
+        shared[("unknown",)] = shared.get(("unknown",), 0.0) + weight * (1 - one.complete)
+        cause["unknown"] += weight * (1 - one.complete)
+        for count in range(len(one.parts) + 1):
+            for chosen in combinations(one.parts, count):
+                share = weight * one.complete
+                for part in one.parts:
+                    share *= part.matters if part in chosen else 1 - part.matters
+                names = tuple(sorted(part.name for part in chosen))
+                shared[names] = shared.get(names, 0.0) + share
+                lead = max(chosen, key=lambda part: part.share).name if chosen else "none"
+                cause[lead] += share
+                for name in names:
+                    presence[name] += share
+    return Probabilities(
+        {name: float(p) for name, p in cause.items()},
+        {names: float(p) for names, p in shared.items()},
+        {name: float(p) for name, p in presence.items()},
+    )
