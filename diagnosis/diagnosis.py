@@ -20,7 +20,6 @@ from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilitie
 from diagnosis.evidence.look_alikes import look_alikes
 from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit
-from diagnosis.fit.model_error import at_its_own_level
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.imperfect.answered import beside_imperfections
 from diagnosis.machine.case import Case
@@ -233,11 +232,8 @@ def _intervals(
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
 
-    What is left beyond the noise widens them in proportion, its correlation too where the machine states one,
-    and so does what solvers may disagree about.
+    What is left beyond the noise widens them in proportion, and so does what solvers may disagree about.
     """
-    if end.weighing.model_error > 0:
-        end = at_its_own_level(end)
     candidate: Candidate = end.candidates[k]
     at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(at, at + len(candidate.axes))

@@ -31,11 +31,10 @@ def confronted(
     """The hypotheses as held-out records leave them; None if these confirm the accepted one.
 
     The log density with which each possible answer predicts them is added to its weights, and to those of an
-    unknown rest besides what such a rest gains by them. Where a machine states a model error of its
-    own nothing changes: what held-out records leave over is what that error allows.
+    unknown rest besides what such a rest gains by them.
     """
     case = model.case
-    if accepted.fit.weighing.model_error > 0 or not case.held_out:
+    if not case.held_out:
         return None
     first = _prediction(model, accepted.fit)
     if first.unknown_gain < _CONFIRMED and not _contradicted(model, hypotheses, accepted, first):

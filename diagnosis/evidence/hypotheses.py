@@ -14,7 +14,6 @@ import numpy as np
 
 from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.fit import Fit, log_evidence
-from diagnosis.fit.model_error import log_evidence_with_model_error
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
 from plant.effects import EFFECTS
 
@@ -82,9 +81,6 @@ class Hypothesis:
         allowed = BESIDE_NON_SMOOTH * beside if fit.non_smooth else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
         prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
-        if fit.weighing.model_error > 0:
-            exactly, besides = log_evidence_with_model_error(fit)
-            return cls(fit, exactly + prior, besides + prior + _UNKNOWN_BESIDE)
         evidence = log_evidence(fit) + drift.log_gain
         exactly = evidence + disagreement_gain(fit, left) + prior - allowed
         besides = evidence + left.log_gain_some + prior - allowed + _UNKNOWN_BESIDE

@@ -116,8 +116,7 @@ class Screening:
 
     def _size(self, change: Real) -> float:
         parts, outputs = np.split(change, self._parts), self.model.case.noise.size
-        largest = float(max(np.max(np.sqrt(np.mean(p.reshape(-1, outputs) ** 2, axis=0))) for p in parts))
-        return largest * self.model.scale
+        return float(max(np.max(np.sqrt(np.mean(p.reshape(-1, outputs) ** 2, axis=0))) for p in parts))
 
     def _harmonic(self, candidate: Candidate, rig: Rig) -> list[Start]:
         """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""

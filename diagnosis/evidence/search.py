@@ -167,13 +167,7 @@ def _further(
 
 
 def _least_promise(parent: Fit) -> float:
-    """Beside backlash a further effect has to gain more (in log weight; half of that in linear estimates).
-
-    Where a machine states a model error, what is left over is weighed by the size that it shows in the end: a
-    small promise may gain much.
-    """
-    if parent.weighing.model_error > 0:
-        return -np.inf
+    """Beside backlash a further effect has to gain more (in log weight; half of that in linear estimates)."""
     return _PROMISE + (BESIDE_NON_SMOOTH if parent.non_smooth else 0.0)
 
 

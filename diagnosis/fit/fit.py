@@ -145,10 +145,10 @@ def fit(
         gain, cost = cost - reached, reached
         d, x, e = trial_d, trial_x, trial_e
         damping *= 0.2
-        if gain < tolerance / model.scale:
+        if gain < tolerance:
             # A short step is no end where the valley bends: there it is damping that shortens it.
             left = float(gu @ np.linalg.solve(Hu + 1e-10 * np.diag(size**2), gu)) if exact else 0.0
-            if left < _LEFT / model.scale:
+            if left < _LEFT:
                 converged = True
                 break
     J = _jacobian(model, candidates, d, x, e, nominal_jacobian)

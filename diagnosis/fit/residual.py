@@ -25,20 +25,17 @@ class ResidualModel:
         self.nominal = NominalParameters(case.machine)
         self.simulations = 0
         self.steps = case.steps
-        self.scale = case.machine.weighing.scale
 
     def of(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
     ) -> Real:
         """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs.
 
-        Over `scale`, so that nominal parameters and records weigh what they should beside a model error.
         Rounded outputs enter by the chance of their cells (`diagnosis.machine.quantisation_grid`).
         """
         experiments = self.case.estimation if experiments is None else experiments
         simulator = self.nominal.at(deviations).simulator(effects)
-        whole = np.concatenate([self._weighed(simulator, experiment).ravel() for experiment in experiments])
-        return whole if self.scale == 1.0 else whole / self.scale
+        return np.concatenate([self._weighed(simulator, experiment).ravel() for experiment in experiments])
 
     def by_experiment(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None

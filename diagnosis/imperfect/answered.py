@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,18 +25,13 @@ def beside_imperfections(case: CaseOfMachine, progress: Progress, rng: np.random
     found = judging.judged(search, listed)
     progress(1.0, "done")
     refit = search.base
-    accepted = next(
-        (
-            one.explanation
-            for one in found.judged
-            if found.accepted and set(found.accepted) <= set(one.explanation.names)
-        ),
-        refit,
-    )
+    holding = [one.explanation for one in found.judged if set(found.accepted) <= set(one.explanation.names)]
+    accepted = holding[0] if found.accepted else refit
     before = _whitened(case, search.stated())
     moved, after = _whitened(case, refit), _whitened(case, accepted)
     closed, interval = share_closed(case, moved, after, rng, _FLOOR)
-    kind: Verdict = found.answer if found.answer in ("none", "unknown") else "effect"
+    named: dict[str, Verdict] = {"none": "none", "unknown": "unknown"}
+    kind = named.get(found.answer, "effect")
     ambiguous = _ambiguous(found)
     keys = search.records.nominal.keys
     return Diagnosis(
@@ -122,7 +117,7 @@ def _named(
 
 def _intervals(
     search: Search, end: Descent, k: int, rng: np.random.Generator
-) -> Mapping[str, tuple[float, float]]:
+) -> dict[str, tuple[float, float]]:
     """95 % intervals of the parameters of the k-th effect, from Gaussian draws of its coordinates."""
     records, candidate = search.records, end.candidates[k]
     weights = records.levels.weights(end.left)

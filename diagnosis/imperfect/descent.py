@@ -188,7 +188,7 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> Followed
         records, weights, around.jacobian, around.columns, around.deviations, start, e
     )
     H = equations.hessian + np.diag(1e-9 * np.diag(equations.hessian) + 1e-12)
-    step = -np.linalg.solve(H, equations.gradient)
+    step = np.asarray(-np.linalg.solve(H, equations.gradient), dtype=np.float64)
     step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
     moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
     d, start2 = around.deviations + step[:P], start.moved(step[around.jacobian.shape[1] :])

@@ -1,17 +1,17 @@
 """The likelihood of residuals whose levels nobody knows: one level per record, output and octave.
 
 Residuals of a good model of a real machine are coloured, far above the sensor noise, and different in size
-from band to band and record to record. In the orthonormal cosine transform (which no drift leaks out of) the
-coefficients of an octave are taken as independent with one variance; with an inverse-gamma prior that variance
-is integrated out (Whittle likelihood, Whittle 1953; levels integrated as in Rover, Meyer & Christensen 2011),
-which leaves
+from band to band and record to record. In the orthonormal cosine transform (which no drift leaks out of)
+the coefficients of an octave are taken as independent with one variance; with an inverse-gamma prior that
+variance is integrated out of the Whittle likelihood (Roever, Meyer and Christensen 2011), which leaves
 
     -log p = 1/2 sum_b n_b log(1 + E_b / F_b),
 
-E_b being the energy of the residuals in band b, F_b the energy that does not interest there: sensor noise, and
-the stated model error spread evenly over the octaves. A band that nothing explains stops counting; removing a
-share of one counts whatever its size. Coefficients of one band are not as many independent witnesses as they
-are numbers where what is left is a deterministic function of the motion: no band counts more than `_MOST`.
+E_b being the energy of the residuals in band b, F_b the energy that does not interest there: sensor noise,
+and the stated model error spread evenly over the octaves. A band that nothing explains stops counting;
+removing a share of one counts whatever its size. Coefficients of one band are not as many independent
+witnesses as they are numbers where what is left is a deterministic function of the motion: no band counts
+more than `_MOST`.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def coefficients(residuals: Real) -> Real:
 class Levels:
     """Bands of the coefficients of some records.
 
-    band : (N,) index of the band of every coefficient. counted : (B,) independent values of a band. floor : (B,)
-    energy F_b.
+    band : (N,) index of the band of every coefficient. counted : (B,) independent values of a band.
+    floor : (B,) energy F_b.
     """
 
     band: npt.NDArray[np.int64]
@@ -68,7 +68,7 @@ class Levels:
         return cls(np.concatenate(bands), np.concatenate(counted), np.concatenate(floors))
 
     def energy(self, e: Real) -> Real:
-        return np.bincount(self.band, e * e, minlength=self.floor.size)
+        return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 
     def loss(self, e: Real) -> float:
         """-log likelihood of coefficients (N,), up to a constant of the records."""

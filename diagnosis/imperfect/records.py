@@ -15,7 +15,7 @@ from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMach
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What is fitted beside parameters: states (R, S) at the start of each record, zeros (Z,) of the sensors."""
+    """What is fitted beside parameters: states (R, S) at the start of every record, zeros (Z,) of sensors."""
 
     states: Real
     zeros: Real
@@ -99,4 +99,4 @@ class Records:
         """(Y,) RMS left over the RMS of the motion (about the mean of each record), all records together."""
         left = sum(np.sum(e**2, axis=0) for e in residuals)
         motion = sum(len(e.output) * np.var(e.output, axis=0) for e in self.experiments)
-        return np.sqrt(left / motion)
+        return np.asarray(np.sqrt(left / motion))

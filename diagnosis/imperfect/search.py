@@ -246,8 +246,8 @@ class Search:
         """Records from states that fit them best, everything else as fitted: start, coefficients."""
         start = held.at_rest()
         if start.zeros.size:
-            columns = self.case.machine.unknown_start.state_per_zero
-            start = start.with_zeros(fitted.zeros, columns)
+            per_zero = self.case.machine.unknown_start.state_per_zero
+            start = start.with_zeros(fitted.zeros, per_zero)
         e = held.coefficients(d, effects, start)
         S = start.states.shape[1]
         if not S:

@@ -24,7 +24,7 @@ _APART = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A point to descend from beside a fit: loss once all else has followed, coordinates, deviations, start."""
+    """To descend from beside a fit: loss once all else has followed, coordinates, deviations, start."""
 
     loss: float
     coordinates: Real

@@ -1,8 +1,8 @@
 """From fitted sets to an answer: which effects matter, what remains, and how sure that is.
 
 "None", "exactly these effects" and "unknown" are all false for a real machine; what is asked is which effect
-carries a part of the gap that interests (more than the stated model error), and whether what then remains is no
-more than imperfections leave. Both are judged on shares of the motion, of estimation and held-out records.
+carries a part of the gap that interests (more than the stated model error), and whether what then remains is
+no more than imperfections leave. Both are judged on shares of the motion, of estimation and held-out records.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Verdict:
 
 def score_of(explanation: Explanation) -> float:
     candidates = explanation.end.candidates
-    further = sum(len(c.axes) - 1 for c in candidates)
+    further = float(sum(len(c.axes) - 1 for c in candidates))
     further += _CONTAINING * sum(c.kind.contains is not None for c in candidates)
     return (
         explanation.log_likelihood / TEMPER

@@ -11,8 +11,8 @@ import numpy as np
 from diagnosis.machine.machine_protocol import KNOWN_START, Real, RecordOfMachine, UnknownStart, Weighing
 from plant.effects import EFFECTS, Effect, make_machine
 from plant.effects.search_space import Candidate, Scales
-from plant.rig import Rig
 from plant.plan import SUBSTEP_S
+from plant.rig import Rig
 from plant.simulate import Simulator, Start
 
 Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2"]

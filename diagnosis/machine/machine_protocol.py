@@ -29,22 +29,12 @@ class Weighing:
     """How residuals of a machine are weighed.
 
     listed : tuple of str. Effects that are looked for; prior probabilities are shared among them.
-    model_error : float. What even the right set of effects may leave over, in noise deviations (scale of a
-        half-normal prior, RMS over all samples). Zero where the simulation is as good as the sensors.
-    correlation_samples : float
-        Samples per independent value of what is left over; counts only beside a model error.
+    model_error : float. Share of the motion (RMS of an output about its mean) that a good model may miss;
+        zero where the simulation is as good as the sensors.
     """
 
     listed: tuple[str, ...] = tuple(EFFECTS)
     model_error: float = 0.0
-    correlation_samples: float = 1.0
-
-    @property
-    def scale(self) -> float:
-        """Residuals count by this much less than white noise of the sensors would."""
-        if not self.model_error > 0:
-            return 1.0
-        return float(np.sqrt(self.correlation_samples * (1 + self.model_error**2)))
 
 
 @dataclass(frozen=True, eq=False)

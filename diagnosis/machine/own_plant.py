@@ -165,12 +165,9 @@ class Plant:
     output_names : (Y,)
     noise : (Y,). Noise standard deviations, from repeats of an experiment where there are any.
     effects : tuple of PlantEffect
-    model_error : float. What the simulation may leave over even with the right effects, in noise deviations
-        (RMS, scale of a half-normal prior). No simulation of a real machine reaches its noise; with zero here
-        what is left over makes the answer "unknown".
-    correlation_samples : float
-        Samples per independent value of what is left over (`diagnosis.fit.model_error.correlation_length` of
-        the residuals, times the passes of a repeated motion). Counts only beside a model error.
+    model_error : float. Share of the motion (RMS of an output about its mean) that the simulation may miss
+        even with the right effects. No simulation of a real machine reaches its noise; with zero here what is
+        left over makes the answer "unknown".
     """
 
     simulation: Simulate
@@ -180,7 +177,6 @@ class Plant:
     noise: Real
     effects: tuple[PlantEffect, ...]
     model_error: float = 0.0
-    correlation_samples: float = 1.0
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -195,8 +191,6 @@ class Plant:
             )
         if not self.model_error >= 0:
             raise ValueError(f"plant: model_error must not be negative; got {self.model_error}")
-        if not self.correlation_samples >= 1:
-            raise ValueError(f"plant: correlation_samples must be at least 1; got {self.correlation_samples}")
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
                 raise ValueError(f"plant: tolerance of {key}, which is no parameter of it")
@@ -212,7 +206,7 @@ class Plant:
     @cached_property
     def weighing(self) -> Weighing:
         names = tuple(effect.name for effect in self.effects)
-        return Weighing(names, float(self.model_error), float(self.correlation_samples))
+        return Weighing(names, float(self.model_error))
 
     @property
     def description(self) -> Plant:

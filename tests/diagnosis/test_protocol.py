@@ -9,8 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
-from diagnosis.fit.fit import Fit
-from diagnosis.fit.model_error import at_its_own_level, correlation_length, log_evidence_with_model_error
 from diagnosis.machine.machine_protocol import Weighing
 from examples import own_plant
 from plant import simulate
@@ -90,8 +88,7 @@ def test_a_stated_model_error_is_no_unknown_cause():
     # The same tone, small beside what is stated that the simulation may miss.
     case = _case(
         lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 0.1 * np.sin(25 * t)) / 2.0,
-        model_error=10.0,
-        correlation_samples=10.0,
+        model_error=0.05,
     )
     found = diagnose(case)
     assert (found.verdict, found.combination) == ("none", ())
@@ -131,42 +128,6 @@ def test_the_flexible_arm_answers_by_the_same_protocol():
     assert case.machine.tolerances == RIG.tolerances
 
 
-def test_model_error_makes_the_evidence_of_many_samples_that_of_few():
-    rng = np.random.default_rng(2)
-    better, worse = (size * rng.standard_normal(4000) for size in (5.0, 6.0))
-
-    def weight(e, c):
-        weighing = Weighing(model_error=5.0, correlation_samples=c)
-        scaled = e / weighing.scale
-        cost = float(scaled @ scaled)
-        fit = Fit((), np.zeros(0), (), scaled, np.zeros((e.size, 0)), cost, True, weighing)
-        return np.array(log_evidence_with_model_error(fit))
-
-    many, few = (weight(better, c) - weight(worse, c) for c in (1.0, 100.0))
-    # N log(ratio of sizes) to leading order, the prior of the size aside.
-    assert many[0] == pytest.approx(4000 * np.log(6 / 5), rel=0.1)
-    assert few[0] == pytest.approx(many[0] / 100, rel=0.2)
-
-
-def test_a_fit_is_weighed_at_the_level_that_it_shows():
-    rng = np.random.default_rng(3)
-    weighing = Weighing(model_error=10.0, correlation_samples=4.0)
-    e = 3.0 * rng.standard_normal(20000) / weighing.scale
-    fit = Fit((), np.zeros(0), (), e, np.zeros((e.size, 0)), float(e @ e), True, weighing)
-    # Variance nine per sample, one independent value in four: a mean square of a quarter at its own level.
-    assert at_its_own_level(fit).rms ** 2 == pytest.approx(1 / 4, rel=0.05)
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.8, 0.97])
-def test_correlation_length_of_an_autoregression(rho):
-    rng = np.random.default_rng(4)
-    e = np.zeros(200_000)
-    for k, w in enumerate(rng.standard_normal(e.size - 1)):
-        e[k + 1] = rho * e[k] + w
-    # (1 + rho)/(1 - rho); the estimate wanders by a few lengths over the root of the samples.
-    assert correlation_length(e) == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
-
-
 GOOD = PlantExperiment("a", "estimation", np.ones((30, 1)), np.arange(30.0)[:, None])
 PLANT = Plant(
     lambda parameters, effects, inputs: parameters["k"] * inputs,
@@ -192,7 +153,6 @@ PLANT = Plant(
         (lambda: replace(PLANT, effects=()), "lists no effect"),
         (lambda: replace(PLANT, effects=PLANT.effects * 2), "listed twice"),
         (lambda: replace(PLANT, model_error=-1.0), "model_error"),
-        (lambda: replace(PLANT, correlation_samples=0.5), "correlation_samples"),
         (lambda: EffectParameter("y", 2.0, 1.0), "low < high"),
         (lambda: EffectParameter("y", 0.0, 1.0), "above zero on a log scale"),
         (lambda: EffectParameter("y", 1.0, 2.0, (3.0,)), "start 3 is outside 1 to 2"),

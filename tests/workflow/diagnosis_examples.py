@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.diagnosis import Diagnosis, NamedEffect
+from diagnosis.answer import Diagnosis, NamedEffect
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
 from diagnosis.next_experiment.discrimination import CompetingHypothesis

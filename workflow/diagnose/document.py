@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from diagnosis.diagnosis import Diagnosis
+from diagnosis.answer import Diagnosis
 from workflow.diagnose.case_files import LoadedCase
 from workflow.engine import codec
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diagnosis.diagnosis import Diagnosis
+from diagnosis.answer import Diagnosis
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits

@@ -11,7 +11,8 @@ from typing import Any
 
 import tomlkit
 
-from diagnosis.diagnosis import Diagnosis, diagnose
+from diagnosis.answer import Diagnosis
+from diagnosis.diagnosis import diagnose
 from diagnosis.machine.case import Case
 from diagnosis.where.findings import Where
 from diagnosis.where.where import where

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from diagnosis.diagnosis import Diagnosis
+from diagnosis.answer import Diagnosis
 from plant.effects import in_words
 from workflow.figures import gap_style, style
 from workflow.figures.registry import drawing

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
-from diagnosis.diagnosis import Diagnosis
+from diagnosis.answer import Diagnosis
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
