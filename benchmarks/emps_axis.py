@@ -238,7 +238,7 @@ def case(
         ("force_N",),
         np.array([noise]),
         effects(simulated == "loop", refined),
-        model_error=MODEL_ERROR * float(np.std(data[:, 4])) / noise,
+        model_error=MODEL_ERROR,
     )
 
     def experiment(role: Role, piece: slice) -> PlantExperiment:

@@ -1,30 +1,22 @@
-"""What the simulations of the real machines share: weights, effects by name, a delayed command."""
+"""What the simulations of the real machines share: effects by name, a delayed command."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 from scipy.linalg import expm
 
-from diagnosis import EffectParameter, PlantCase
+from diagnosis import EffectParameter
 
 Real = npt.NDArray[np.float64]
 
 # Coulomb friction as a share of the static one.
 SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear")
-# Share of the outputs' RMS that the simulation of a real machine may miss.
-MODEL_ERROR = 0.1
-
-
-def weighed(case: PlantCase, correlation_samples: float, model_error: float = MODEL_ERROR) -> PlantCase:
-    """The case with another correlation length [samples] and model error [share of the outputs' RMS]."""
-    allowed = case.plant.model_error * (model_error / MODEL_ERROR)
-    plant = replace(case.plant, model_error=allowed, correlation_samples=correlation_samples)
-    return replace(case, plant=plant)
+# Share of the motion that the simulation of a real machine may miss: below that nothing interests.
+MODEL_ERROR = 0.05
 
 
 def given(effects: Mapping[str, Mapping[str, float]]) -> Callable[..., float]:

@@ -2,10 +2,9 @@
 
     FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.real_machine_gaps
 
-Per machine: noise from repeats of one motion; model error allowed, 10 % of the outputs' RMS for every one;
-correlation length of what the accepted model leaves, times the passes of one motion that are fitted (first
-guess 100, repeated until it settles): that many samples count as one. Gaps are the pooled RMS of (measured -
-model)/noise on held-out records. "closed" is relative to the model as stated with its values moved.
+Per machine: noise from repeats of one motion; below 5 % of the motion nothing interests, for every one. Gaps
+are the pooled RMS of (measured - model)/noise on held-out records. "closed" is relative to the model as
+stated with its values moved.
 """
 
 from __future__ import annotations
@@ -16,38 +15,18 @@ import numpy as np
 
 from benchmarks import emps_axis, ruler_robot, serial_link_stage
 from benchmarks.harness import Print, data_folder, main
-from benchmarks.own_plant import weighed
-from diagnosis import Diagnosis, PlantCase, diagnose, pooled_rms
-from diagnosis.fit.model_error import correlation_length
+from diagnosis import Diagnosis, diagnose, pooled_rms
 
 
-def settled(case: PlantCase, passes: float = 1.0) -> tuple[Diagnosis, float]:
-    """Diagnosis with the correlation length that its own residuals show."""
-    length = 100.0
-    for _ in range(5):
-        found = diagnose(weighed(case, length))
-        shown = correlation_of(found, passes)
-        if abs(np.log(shown / length)) < 0.1:
-            break
-        length = shown
-    return found, length
-
-
-def correlation_of(found: Diagnosis, passes: float) -> float:
-    """Mean over records and outputs of the estimation residuals, times passes."""
-    columns = [c for e in found.case.estimation for c in found.residuals_after[e.name].T]
-    return max(1.0, passes * float(np.mean([correlation_length(c) for c in columns])))
-
-
-def tell(out: Print, found: Diagnosis, length: float) -> None:
+def tell(out: Print, found: Diagnosis) -> None:
     plant = found.case.plant
     noise = ", ".join(
         f"{name} {value:.3g}" for name, value in zip(plant.output_names, plant.noise, strict=True)
     )
     out(
-        f"  noise {noise}; allowed model error {plant.model_error:.1f} noise deviations; {length:.0f} samples"
+        f"  noise {noise}; below {100 * plant.model_error:.0f} % of the motion nothing interests. "
+        f"Verdict {found.verdict} ({found.detail_verdict}): {_names(found.combination)}"
     )
-    out(f"  count as one. Verdict {found.verdict} ({found.detail_verdict}): {_names(found.combination)}")
     sets = sorted(found.sets.items(), key=lambda item: -item[1])[:4]
     out("  probable sets: " + "; ".join(f"{_names(names)} {p:.3f}" for names, p in sets))
     if found.ambiguous_with:
@@ -73,13 +52,13 @@ def _names(names: tuple[str, ...]) -> str:
 def emps(out: Print, folder: Path) -> None:
     out("EMPS axis: mass with viscous friction refitted to the records, no dry friction, no offset")
     for simulated, refined in (("forces", False), ("forces", True), ("loop", False)):
-        for held_out, passes in (("passes", 2.0), ("fast", 3.5)):
+        for held_out in ("passes", "fast"):
             listed = "; direction and speed dependence of viscous friction listed too" if refined else ""
             out("")
             out(f"{_SIMULATED[simulated]}; {_HELD_OUT[held_out]}{listed}")
             case = emps_axis.case(folder, held_out, simulated, refined=refined)
-            found, length = settled(case, passes)
-            tell(out, found, length)
+            found = diagnose(case)
+            tell(out, found)
             if not refined:
                 against_published(out, found)
 
@@ -126,10 +105,10 @@ def quanser(out: Print, folder: Path) -> None:
         )
     windows = {1: (150, 1400), 2: (1450, 2650)}
     for stage, window in windows.items():
-        found, length = settled(serial_link_stage.case(folder, stage))
+        found = diagnose(serial_link_stage.case(folder, stage))
         out("")
         out(f"Stage {stage}")
-        tell(out, found, length)
+        tell(out, found)
         e, part = found.case.experiments[0], slice(*window)
         alpha, noise = e.output[part, 1], found.case.noise[1]
         model = alpha - found.residuals_before[e.name][part, 1] * noise
@@ -159,10 +138,10 @@ def slfr(out: Print, folder: Path) -> None:
             error = ruler_robot.simulate(fit, {}, data[:, :1])[:, 0] - data[:, 1]
             out(f"    fitted at {a}, repeat 2 at {b}: RMS error {np.sqrt(np.mean(error**2)):.3f} counts")
     for fitted in ((50, 75), (50,)):
-        found, length = settled(ruler_robot.case(folder, fitted))
+        found = diagnose(ruler_robot.case(folder, fitted))
         out("")
         out(f"Fitted at {' and '.join(map(str, fitted))}, judged at both (second repeats)")
-        tell(out, found, length)
+        tell(out, found)
         for e in found.case.held_out:
             gaps = [pooled_rms(r[e.name]) for r in (found.residuals_refit, found.residuals_after)]
             out(f"    {e.name}: gap {gaps[0]:.2f} values moved, {gaps[1]:.2f} repaired")

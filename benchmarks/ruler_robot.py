@@ -172,7 +172,6 @@ def case(folder: Path, fitted: tuple[int, ...] = (50, 75), judged: tuple[int, ..
     repeats = {amplitude: [record(folder, amplitude, r) for r in (1, 2, 3)] for amplitude in (50, 75)}
     variances = [np.var([r[:, 1] for r in three], axis=0, ddof=1) for three in repeats.values()]
     noise = float(np.sqrt(np.mean(variances)))
-    level = float(np.std(np.concatenate([repeats[a][0][:, 1] for a in fitted])))
     stated = linear_fit(repeats[50][2])
     plant = Plant(
         simulate,
@@ -181,7 +180,7 @@ def case(folder: Path, fitted: tuple[int, ...] = (50, 75), judged: tuple[int, ..
         ("theta_counts",),
         np.array([noise]),
         effects(),
-        model_error=MODEL_ERROR * level / noise,
+        model_error=MODEL_ERROR,
     )
     roles: tuple[tuple[Role, int, tuple[int, ...]], ...] = (
         ("estimation", 1, fitted),

@@ -219,7 +219,6 @@ def case(folder: Path, stage: int) -> PlantCase:
     output = data[:, at + 1 : at + 3]
     first, second = slice(0, PERIOD), slice(PERIOD, 2 * PERIOD)
     noise = np.sqrt(np.mean((output[first] - output[second]) ** 2, axis=0) / 2)
-    level = float(np.sqrt(np.mean((np.std(output, axis=0) / noise) ** 2)))
     plant = Plant(
         simulation(gains),
         MANUFACTURER[stage],
@@ -227,7 +226,7 @@ def case(folder: Path, stage: int) -> PlantCase:
         ("theta_rad", "alpha_rad"),
         noise,
         effects(),
-        model_error=MODEL_ERROR * level,
+        model_error=MODEL_ERROR,
     )
     return PlantCase(
         f"Quanser serial flexible link, stage {stage}",

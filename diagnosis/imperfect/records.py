@@ -12,6 +12,8 @@ from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 
+_NOISE_ALLOWED = 1.5
+
 
 @dataclass(frozen=True, eq=False)
 class Start:
@@ -27,7 +29,7 @@ class Start:
 
     def with_zeros(self, zeros: Real, columns: Real) -> Start:
         """The same measured start with other zeros; columns (S, Z): states per unit of a zero."""
-        return Start(self.states - (zeros - self.zeros) @ columns.T, zeros)
+        return Start(self.states + (zeros - self.zeros) @ columns.T, zeros)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,11 @@ class Records:
         return float(np.sum(free**2) + np.sum((start.zeros / self.zero_spread) ** 2))
 
     def shares(self, residuals: Sequence[Real]) -> Real:
-        """(Y,) RMS left over the RMS of the motion (about the mean of each record), all records together."""
-        left = sum(np.sum(e**2, axis=0) for e in residuals)
+        """(Y,) RMS left beyond sensor noise over the RMS of the motion (about the mean), all records.
+
+        Noise is allowed half as much again as a data sheet says.
+        """
+        noise = (_NOISE_ALLOWED * self.case.noise) ** 2
+        left = sum(np.maximum(np.sum(e**2, axis=0) - len(e) * noise, 0.0) for e in residuals)
         motion = sum(len(e.output) * np.var(e.output, axis=0) for e in self.experiments)
         return np.asarray(np.sqrt(left / motion))

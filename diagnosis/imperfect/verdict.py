@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import comb
 
 import numpy as np
 from scipy.special import expit, softmax
@@ -21,15 +22,14 @@ from diagnosis.imperfect.search import Explanation, Search
 # `flexlink blind --workshop`); prior densities of stated values count whole.
 TEMPER = 4.0
 _VOLUME = 0.5
-_LOG_PRIOR = {0: np.log(0.25), 1: np.log(0.5 / 23), 2: np.log(0.14 / 253), 3: np.log(0.02 / 1771)}
+# Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
+_PRIOR_COUNT = {0: 0.2, 1: 0.35, 2: 0.3, 3: 0.15}
 # An effect interests from this many model errors on; what remains is more than imperfections above that many.
 # Both limits are soft: widths in natural logarithms.
 _INTERESTS, _REMAINS = 1.2, 1.6
 _INTERESTS_WIDTH, _REMAINS_WIDTH = 0.12, 0.12
-# Log odds by which a wrong stated value has to be preferred to values within their tolerances.
-_PARAMETRIC = 8.0
 # What an effect that contains a simpler one has to gain over it.
-_CONTAINING = 3.0
+_CONTAINING = 2.0
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS = 8.0, 8
 
@@ -69,7 +69,8 @@ class Verdict:
     accepted: tuple[str, ...]
 
 
-def score_of(explanation: Explanation) -> float:
+def score_of(explanation: Explanation, listed: int) -> float:
+    """Log weight of a set out of so many effects that are listed."""
     candidates = explanation.end.candidates
     further = float(sum(len(c.axes) - 1 for c in candidates))
     further += _CONTAINING * sum(c.kind.contains is not None for c in candidates)
@@ -77,7 +78,7 @@ def score_of(explanation: Explanation) -> float:
         explanation.log_likelihood / TEMPER
         + explanation.log_prior
         + _VOLUME * explanation.log_volume
-        + float(_LOG_PRIOR[len(explanation.names)])
+        + float(np.log(_PRIOR_COUNT[len(candidates)] / comb(listed, len(candidates))))
         - further
     )
 
@@ -90,10 +91,11 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
         known = best.get(explanation.key)
         if known is None or explanation.evidence > known.evidence:
             best[explanation.key] = explanation
-    ranked = sorted(best.values(), key=lambda e: -score_of(e))
-    top = score_of(ranked[0])
-    chosen = [e for e in ranked[:_MOST_SETS] if score_of(e) > top - _BEHIND]
-    sets = tuple(_judged(search, e, best, model_error, fit=k == 0) for k, e in enumerate(chosen))
+    score = {key: score_of(explanation, len(listed)) for key, explanation in best.items()}
+    ranked = sorted(best.values(), key=lambda e: -score[e.key])
+    top = score[ranked[0].key]
+    chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
+    sets = tuple(_judged(search, e, best, model_error, len(listed), fit=k == 0) for k, e in enumerate(chosen))
     probabilities = _probabilities(sets, listed)
     answer = probabilities.answer
     if answer in ("none", "unknown"):
@@ -109,6 +111,7 @@ def _judged(
     explanation: Explanation,
     best: Mapping[tuple[str, ...], Explanation],
     model_error: float,
+    listed: int,
     *,
     fit: bool,
 ) -> Judged:
@@ -119,9 +122,10 @@ def _judged(
         carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
         share = float(np.sqrt(np.mean(np.max(carried, axis=1) ** 2)))
         matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
-        if explanation.end.candidates[k].kind.multiplies is not None:
-            gained = explanation.evidence - rest.evidence
-            matters = max(matters, float(expit(gained - _PARAMETRIC)))
+        kind = explanation.end.candidates[k].kind
+        if kind.multiplies is not None or kind.adds_to is not None:
+            # A stated value in itself: what it changes may be imitated by the others within their tolerances.
+            matters = max(matters, float(expit(score_of(explanation, listed) - score_of(rest, listed))))
         parts.append(Part(name, share, matters))
     remains = float(np.max(explanation.shares[1]))
     complete = 1.0 - _soft(remains / (_REMAINS * model_error), _REMAINS_WIDTH)
@@ -129,7 +133,8 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    return Judged(explanation, tuple(parts), score_of(explanation), 0.0 if at_edge else complete)
+    score = score_of(explanation, listed)
+    return Judged(explanation, tuple(parts), score, 0.0 if at_edge else complete)
 
 
 def _soft(ratio: float, width: float) -> float:

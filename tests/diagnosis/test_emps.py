@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from benchmarks import emps_axis
-from benchmarks.own_plant import weighed
-from benchmarks.real_machine_gaps import fitted_values, settled
+from benchmarks.real_machine_gaps import fitted_values
 from diagnosis import diagnose
 
 PUBLISHED = emps_axis.PUBLISHED
 
 
 def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flexlink_data):
-    found, length = settled(emps_axis.case(flexlink_data, "passes"), passes=2.0)
+    found = diagnose(emps_axis.case(flexlink_data, "passes"))
     assert found.verdict == "effect"
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     assert found.probabilities["coulomb_friction"] > 0.9
@@ -29,31 +28,23 @@ def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flex
     for name, key in (("coulomb_friction", "coulomb_N"), ("constant_offset", "offset_N")):
         low, high = intervals[name]
         assert low < PUBLISHED[key] < high
-    # What is left is coloured: far fewer independent values than samples.
-    assert 50 < length < 2000
 
 
 def test_the_same_two_explain_a_faster_motion_that_no_fit_has_seen(flexlink_data):
-    found = diagnose(weighed(emps_axis.case(flexlink_data, "fast"), 100.0))
+    found = diagnose(emps_axis.case(flexlink_data, "fast"))
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     assert found.gap_closed > 0.9
 
 
-def test_a_larger_allowance_for_the_model_does_not_lose_the_offset(flexlink_data):
-    # Weighed by the error that is allowed the offset promises little, by the one that is left much.
-    found = diagnose(weighed(emps_axis.case(flexlink_data, "passes"), 200.0, 0.2))
-    assert set(found.combination) == {"coulomb_friction", "constant_offset"}
-
-
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):
     # Not in the published model: half the sum of forces at plus and minus one speed grows with the speed.
-    found = diagnose(weighed(emps_axis.case(flexlink_data, "passes", refined=True), 100.0))
+    found = diagnose(emps_axis.case(flexlink_data, "passes", refined=True))
     assert {"coulomb_friction", "viscous_asymmetry"} <= set(found.combination)
 
 
 @pytest.mark.slow
 def test_the_simulated_loop_names_the_same_two(flexlink_data):
-    found = diagnose(weighed(emps_axis.case(flexlink_data, "passes", "loop"), 400.0))
+    found = diagnose(emps_axis.case(flexlink_data, "passes", "loop"))
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     for key, value in fitted_values(found).items():
         # The loop weighs frequencies otherwise; what the model lacks then moves values by up to 4 %.

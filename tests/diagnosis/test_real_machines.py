@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks import ruler_robot, serial_link_stage
-from benchmarks.own_plant import weighed
 from diagnosis import diagnose, pooled_rms
 
 
@@ -32,7 +31,7 @@ def test_stage_model_is_the_manufacturers(flexlink_data, stage):
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", [1, 2])
 def test_each_stage_of_the_serial_link_feels_the_other(flexlink_data, stage):
-    found = diagnose(weighed(serial_link_stage.case(flexlink_data, stage), 150.0))
+    found = diagnose(serial_link_stage.case(flexlink_data, stage))
     by_name = {effect.name: effect for effect in found.effects}
     assert found.combination[0] == "other_stage"
     assert by_name["other_stage"].presence > 0.95
@@ -42,7 +41,7 @@ def test_each_stage_of_the_serial_link_feels_the_other(flexlink_data, stage):
 
 @pytest.mark.slow
 def test_ruler_robot_friction_and_offset_found_at_one_amplitude_hold_at_the_other(flexlink_data):
-    found = diagnose(weighed(ruler_robot.case(flexlink_data, (50,), (75,)), 100.0))
+    found = diagnose(ruler_robot.case(flexlink_data, (50,), (75,)))
     assert "drive_offset" in found.combination
     assert {"coulomb_friction", "stribeck_friction"} & set(found.combination)
     before, after = (
