@@ -42,6 +42,29 @@ class NamedEffect:
     gap_after: float
 
 
+@dataclass(frozen=True)
+class Shares:
+    """What effects carry of the gap of a machine with a model error, on held-out records.
+
+    names : of the outputs. before, after : RMS left beyond sensor noise over that of the motion, per output:
+        nominal values re-estimated, effects added. interests : share of the motion from which on a gap does.
+    carried : effect -> (share of the gap's energy over noise that it closes, whatever the order in which
+        effects are added, with its 95 % interval).
+    small : effects in the repaired model that carry less than what interests.
+    closes : (effects, share of the gap closed by them alone), most first; also where the answer is unknown.
+    not_tried : what a time limit left out.
+    """
+
+    names: tuple[str, ...]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+    interests: float
+    carried: dict[str, tuple[float, float, float]]
+    small: tuple[str, ...]
+    closes: tuple[tuple[tuple[str, ...], float], ...]
+    not_tried: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """What is wrong with a model, as far as its records tell.
@@ -69,6 +92,7 @@ class Diagnosis:
         cause beyond the list that looks like one of it, with whatever it acts beside.
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
         first, for `next_experiment`; only for a flexible link.
+    shares : Shares or None. Only of a machine with a stated model error.
     """
 
     case: Any
@@ -95,6 +119,7 @@ class Diagnosis:
     held_out_decided: bool = False
     unlisted: tuple[Any, ...] = ()
     competing: tuple[CompetingHypothesis, ...] = ()
+    shares: Shares | None = None
 
     @property
     def probability(self) -> float:

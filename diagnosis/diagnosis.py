@@ -46,17 +46,23 @@ _DRAWS = 4000
 
 
 def diagnose(
-    case: CaseOfMachine, *, progress: Progress | None = None, rng: np.random.Generator | None = None
+    case: CaseOfMachine,
+    *,
+    progress: Progress | None = None,
+    rng: np.random.Generator | None = None,
+    time_limit_s: float = np.inf,
 ) -> Diagnosis:
     """Search, weigh, and answer.
 
     case : A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
     progress : Called with the share done (0 to 1) and what is being done.
+    time_limit_s : After it nothing more is tried, and the answer says what was not; only of a machine that
+        states a model error.
     rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     if case.machine.weighing.model_error > 0:
-        return beside_imperfections(case, progress or (lambda fraction, message: None), rng)
+        return beside_imperfections(case, progress or (lambda fraction, message: None), rng, time_limit_s)
     found = search(case, progress)
     model = ResidualModel(case)
     every: Sequence[Hypothesis]

@@ -17,6 +17,7 @@ from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.case import Case
 from plant.effects import LOOK_ALIKES, Effect
 from plant.effects.search_space import Candidate, log_axis
+from plant.rig import Rig
 
 # Of unknown causes this share is a look-alike of an effect: a third as probable as the effect itself.
 _SHARE = 0.06
@@ -44,12 +45,17 @@ def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fi
     return tuple(found)
 
 
+def look_alike(kind: type[Effect], of: Candidate, rig: Rig) -> tuple[Candidate, float]:
+    """Search of a look-alike, and its size's coordinate less that of what it looks like."""
+    scale, axis = kind.look_alike_scale(rig), of.axes[0]
+    size = log_axis(next(iter(kind.model_fields)), axis.low * scale, axis.high * scale, axis.step)
+    return Candidate(kind, (size,), ()), float(np.log(scale))
+
+
 def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> Fit:
     """The fit with the look-alike in place of the effect of this name; first parameters are sizes."""
     k = end.names.index(name)
-    scale = kind.look_alike_scale(model.nominal.at(end.deviations).description)
-    axis = end.candidates[k].axes[0]
-    size = log_axis(next(iter(kind.model_fields)), axis.low * scale, axis.high * scale, axis.step)
-    candidates = (*end.candidates[:k], Candidate(kind, (size,), ()), *end.candidates[k + 1 :])
-    x = (*end.coordinates[:k], end.coordinates[k] + np.log(scale), *end.coordinates[k + 1 :])
+    other, shift = look_alike(kind, end.candidates[k], model.nominal.at(end.deviations).description)
+    candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
+    x = (*end.coordinates[:k], end.coordinates[k] + shift, *end.coordinates[k + 1 :])
     return fit(model, candidates, x, end.deviations, iterations=_ITERATIONS)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
 
 from diagnosis.answer import DetailVerdict, Diagnosis, NamedEffect, Verdict, held_out_gap, share_closed
 from diagnosis.imperfect import verdict as judging
+from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent, normal_equations
 from diagnosis.imperfect.search import Explanation, Progress, Search
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
@@ -17,9 +19,11 @@ _DRAWS = 1000
 _FLOOR = 1.0
 
 
-def beside_imperfections(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:
-    """Diagnose a case whose machine states a model error."""
-    search = Search(case, progress)
+def beside_imperfections(
+    case: CaseOfMachine, progress: Progress, rng: np.random.Generator, time_limit_s: float = np.inf
+) -> Diagnosis:
+    """Diagnose a case whose machine states a model error; what a time limit leaves out is said."""
+    search = Search(case, progress, time.monotonic() + time_limit_s)
     search.run()
     listed = case.machine.weighing.listed
     found = judging.judged(search, listed)
@@ -56,6 +60,7 @@ def beside_imperfections(case: CaseOfMachine, progress: Progress, rng: np.random
         residuals_refit=moved,
         residuals_after=after,
         simulations=search.simulations,
+        shares=shares_of(search, found, accepted, rng),
     )
 
 

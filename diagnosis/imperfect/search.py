@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.fit.nominal import prior_cost
+from diagnosis.evidence.look_alikes import look_alike
 from diagnosis.imperfect.descent import Descent, descend, loss_at, occam
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.imperfect.starts import Point, beside, points_of
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
 Progress = Callable[[float, str], None]
@@ -90,9 +91,10 @@ class Search:
         self._containing()
         for count in (2, 3):
             self._together(count)
+        self._look_alikes()
 
     def _late(self, what: str) -> bool:
-        if time.process_time() < self.deadline_s:
+        if time.monotonic() < self.deadline_s:
             return False
         if what not in self.left_out:
             self.left_out.append(what)
@@ -200,6 +202,20 @@ class Search:
             nominal = parent.jacobian[:, : parent.deviations.size]
             self.add(self._from(parent, candidate, point, nominal))
 
+    def _look_alikes(self) -> None:
+        """Causes beyond the list in place of what they look like, wherever that may be the answer."""
+        ranked = sorted(self.found, key=lambda e: -e.evidence)[:_FINISHED]
+        for kind in LOOK_ALIKES.values():
+            for explanation in [e for e in ranked if kind.look_alike_of in e.names]:
+                end = explanation.end
+                k = end.names.index(str(kind.look_alike_of))
+                rig = self.records.nominal.at(end.deviations).description
+                other, shift = look_alike(kind, end.candidates[k], rig)
+                x = end.coordinates.copy()
+                x[sum(len(c.axes) for c in end.candidates[:k])] += shift
+                candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
+                self.add(descend(self.records, candidates, end.deviations, x, end.start))
+
     def without(self, explanation: Explanation, k: int) -> Explanation:
         """The best explanation by the same effects but the k-th."""
         end = explanation.end
@@ -279,7 +295,3 @@ def _spread(points: Sequence[Point]) -> Sequence[Point]:
 
 def _point(end: Descent) -> Point:
     return Point(end.loss, end.coordinates, end.deviations, end.start)
-
-
-def deviation_cost(explanation: Explanation) -> float:
-    return prior_cost(explanation.end.deviations)

@@ -30,6 +30,8 @@ _INTERESTS, _REMAINS = 1.2, 1.6
 _INTERESTS_WIDTH, _REMAINS_WIDTH = 0.12, 0.12
 # What an effect that contains a simpler one has to gain over it.
 _CONTAINING = 2.0
+# A cause beyond the list that looks like an effect is a third as probable as that.
+_UNLISTED = 1.1
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS = 8.0, 8
 
@@ -69,8 +71,8 @@ class Verdict:
     accepted: tuple[str, ...]
 
 
-def score_of(explanation: Explanation, listed: int) -> float:
-    """Log weight of a set out of so many effects that are listed."""
+def score_of(explanation: Explanation, listed: Sequence[str]) -> float:
+    """Log weight of a set of effects, out of those that are listed."""
     candidates = explanation.end.candidates
     further = float(sum(len(c.axes) - 1 for c in candidates))
     further += _CONTAINING * sum(c.kind.contains is not None for c in candidates)
@@ -78,8 +80,9 @@ def score_of(explanation: Explanation, listed: int) -> float:
         explanation.log_likelihood / TEMPER
         + explanation.log_prior
         + _VOLUME * explanation.log_volume
-        + float(np.log(_PRIOR_COUNT[len(candidates)] / comb(listed, len(candidates))))
+        + float(np.log(_PRIOR_COUNT[len(candidates)] / comb(len(listed), len(candidates))))
         - further
+        - _UNLISTED * sum(name not in listed for name in explanation.names)
     )
 
 
@@ -91,11 +94,11 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
         known = best.get(explanation.key)
         if known is None or explanation.evidence > known.evidence:
             best[explanation.key] = explanation
-    score = {key: score_of(explanation, len(listed)) for key, explanation in best.items()}
+    score = {key: score_of(explanation, listed) for key, explanation in best.items()}
     ranked = sorted(best.values(), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
-    sets = tuple(_judged(search, e, best, model_error, len(listed), fit=k == 0) for k, e in enumerate(chosen))
+    sets = tuple(_judged(search, e, best, model_error, listed, fit=k == 0) for k, e in enumerate(chosen))
     probabilities = _probabilities(sets, listed)
     answer = probabilities.answer
     if answer in ("none", "unknown"):
@@ -111,7 +114,7 @@ def _judged(
     explanation: Explanation,
     best: Mapping[tuple[str, ...], Explanation],
     model_error: float,
-    listed: int,
+    listed: Sequence[str],
     *,
     fit: bool,
 ) -> Judged:
@@ -134,7 +137,8 @@ def _judged(
         for k, c in enumerate(explanation.end.candidates)
     )
     score = score_of(explanation, listed)
-    return Judged(explanation, tuple(parts), score, 0.0 if at_edge else complete)
+    beyond = at_edge or any(name not in listed for name in explanation.names)
+    return Judged(explanation, tuple(parts), score, 0.0 if beyond else complete)
 
 
 def _soft(ratio: float, width: float) -> float:
@@ -150,6 +154,8 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str]) -> Probabiliti
     for weight, one in zip(weights, sets, strict=True):
         shared[("unknown",)] = shared.get(("unknown",), 0.0) + weight * (1 - one.complete)
         cause["unknown"] += weight * (1 - one.complete)
+        if one.complete == 0.0:
+            continue
         for count in range(len(one.parts) + 1):
             for chosen in combinations(one.parts, count):
                 share = weight * one.complete

@@ -42,6 +42,10 @@ class FlexibleArm:
     model_error: float = 0.0
 
     @property
+    def output_names(self) -> Sequence[str]:
+        return self.outputs
+
+    @property
     def noise(self) -> Real:
         return np.array([self.rig.value(f"sensors.{NOISE[name]}") for name in self.outputs])
 

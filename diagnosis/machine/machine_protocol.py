@@ -77,6 +77,9 @@ class Machine(Protocol):
         """The same with these parameters multiplied."""
 
     @property
+    def output_names(self) -> Sequence[str]: ...
+
+    @property
     def noise(self) -> Real:
         """(Y,) noise standard deviations in the outputs' units."""
 

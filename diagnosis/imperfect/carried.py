@@ -1,0 +1,90 @@
+"""Which effect carries how much of the held-out gap, with intervals, and what closes a part of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from math import factorial
+
+import numpy as np
+
+from diagnosis.answer import Shares
+from diagnosis.imperfect.search import Explanation, Search
+from diagnosis.imperfect.verdict import Verdict
+from diagnosis.machine.machine_protocol import Real
+
+# Blocks of the bootstrap [samples]; draws; partial answers that are told.
+_BLOCK, _DRAWS, _MOST_TOLD = 50, 1000, 5
+_LEAST_CLOSED = 0.02
+
+
+def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.random.Generator) -> Shares:
+    """Shares of the energy of the held-out residuals over noise, of the nominal values re-estimated alone.
+
+    Carried is the Shapley value of every accepted effect: what it closes, averaged over the orders in which
+    they could be added, so that it depends on none; intervals by bootstrap over blocks of samples.
+    """
+    base, names = search.base, found.accepted
+    subsets = {
+        chosen: _best(search, accepted, chosen)
+        for count in range(len(names) + 1)
+        for chosen in combinations(names, count)
+    }
+    blocks = {chosen: _blocks(search, explanation) for chosen, explanation in subsets.items()}
+    drawn = rng.integers(0, blocks[()].size, (_DRAWS, blocks[()].size))
+    carried = {}
+    for name in names:
+        value = _shapley(name, names, {c: b.sum(keepdims=True) for c, b in blocks.items()})[0]
+        spread = _shapley(name, names, {c: b[drawn].sum(axis=1) for c, b in blocks.items()})
+        low, high = np.quantile(spread, [0.025, 0.975])
+        carried[name] = (float(value), float(low), float(high))
+    whole = float(np.sum(blocks[()]))
+    closed = {
+        e.key: 1 - float(np.sum(_blocks(search, e))) / whole for e in search.found if 0 < len(e.names) < 3
+    }
+    told = sorted(((c, key) for key, c in closed.items() if c > _LEAST_CLOSED), reverse=True)[:_MOST_TOLD]
+    return Shares(
+        names=tuple(search.case.machine.output_names),
+        before=tuple(map(float, base.shares[1])),
+        after=tuple(map(float, accepted.shares[1])),
+        interests=search.case.machine.weighing.model_error,
+        carried=carried,
+        small=tuple(name for name in accepted.names if name not in names),
+        closes=tuple((key, c) for c, key in told),
+        not_tried=tuple(search.left_out),
+    )
+
+
+def _best(search: Search, accepted: Explanation, chosen: Sequence[str]) -> Explanation:
+    """The accepted explanation itself, or the best one by these effects alone."""
+    if accepted.names and set(accepted.names) >= set(chosen) and len(chosen) == len(accepted.names):
+        return accepted
+    key = tuple(sorted(chosen))
+    known = [e for e in search.found if e.key == key]
+    if known:
+        return max(known, key=lambda e: e.evidence)
+    holding = min(
+        (e for e in search.found if set(chosen) <= set(e.names)), key=lambda e: (len(e.names), -e.evidence)
+    )
+    while holding.key != key:
+        k = next(k for k, name in enumerate(holding.names) if name not in chosen)
+        holding = search.without(holding, k)
+    return holding
+
+
+def _blocks(search: Search, explanation: Explanation) -> Real:
+    """Energy over noise of blocks of the held-out residuals."""
+    noise = search.case.noise
+    whitened = [np.sum((part / noise) ** 2, axis=1) for part in explanation.left_held_out]
+    return np.concatenate([np.add.reduceat(e, np.arange(0, e.size, _BLOCK)) for e in whitened])
+
+
+def _shapley(name: str, names: Sequence[str], energy: dict[tuple[str, ...], Real]) -> Real:
+    others = [n for n in names if n != name]
+    total = np.zeros_like(energy[()])
+    for count in range(len(names)):
+        weight = factorial(count) * factorial(len(names) - count - 1) / factorial(len(names))
+        for before in combinations(others, count):
+            after = tuple(n for n in names if n in (*before, name))
+            total = total + weight * (energy[tuple(n for n in names if n in before)] - energy[after])
+    return np.asarray(total / energy[()])
