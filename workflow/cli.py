@@ -414,6 +414,14 @@ def diagnose(
     controller: Annotated[
         bool, typer.Option(help="Compare controllers designed on the nominal rig and on the repaired one.")
     ] = True,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            min=1.0,
+            help="Seconds after which a case with a model error tries nothing more; its page says what was "
+            "left out. [default: none]",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
@@ -431,6 +439,7 @@ def diagnose(
             resume=resume,
             replace=replace,
             controller=controller,
+            time_limit_s=time_limit,
             progress=progress,
         )
     if as_json:

@@ -79,24 +79,27 @@ def diagnose_cases(
     resume: bool = False,
     replace: bool = False,
     controller: bool = True,
+    time_limit_s: float | None = None,
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> DiagnosisRun:
     """Diagnose every case into `out`.
 
     rig: file in each case folder that is read in place of the one its case file names. jobs: processes
-    (default: one per processor). A case that fails does not lose the others; one that fails alone raises
+    (default: one per processor). time_limit_s: see `diagnosis.diagnose`. A case that
+    fails does not lose the others; one that fails alone raises
     InputError or StageError. Raises InputError (one line, nothing written) if no case can be read, two have
     one name, or `out` cannot be used.
     """
     progress = progress or Progress()
     loaded, unreadable = _load(places, rig)
     code = code_digest("diagnosis", drawing=True)
-    work = [Work(one, controller, code, engine or Engine()) for one in loaded]
+    engine = engine or (Engine() if time_limit_s is None else Engine(time_limit_s=time_limit_s))
+    work = [Work(one, controller, code, engine) for one in loaded]
     directory = DiagnosisDirectory.begin(
         out,
         inputs={one.case.name: one.input_sha256 for one in loaded},
-        options={"controller": controller},
+        options={"controller": controller, **engine.options},
         resume=resume,
         replace=replace,
     )

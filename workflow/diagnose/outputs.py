@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any
 
@@ -32,11 +32,19 @@ from workflow.report.rendering import render_page
 _ENGINE, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
 
 
+@dataclass(frozen=True)
 class Engine:
     """What computes a diagnosis; tests put a quick one in its place."""
 
+    time_limit_s: float = field(default=float("inf"), kw_only=True)
+
+    @property
+    def options(self) -> dict[str, float]:
+        """What of it an answer depends on."""
+        return {} if self.time_limit_s == float("inf") else {"time_limit_s": self.time_limit_s}
+
     def __call__(self, case: Case, *, progress: Report | None = None) -> Diagnosis:
-        return diagnose(case, progress=progress)
+        return diagnose(case, progress=progress, time_limit_s=self.time_limit_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +62,7 @@ class Work:
         return {
             "input_sha256": self.loaded.input_sha256,
             "code_sha256": self.code_sha256,
-            "options": {"controller": self.controller},
+            "options": {"controller": self.controller, **self.engine.options},
         }
 
     def run(self, report: Report) -> tuple[dict[str, bytes], float]:
