@@ -135,6 +135,8 @@ def descend(
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
         if columns is None or iteration == _AGAIN[0]:
             columns = records.start_columns(d, effects_at(candidates, x))
+        if columns.zeros.shape[1] and any(c.kind.absolute_angle for c in candidates):
+            columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
         by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
         jacobian = np.column_stack([nominal_jacobian, by_effects])
         equations = normal_equations(records, records.levels.weights(e), jacobian, columns, d, start, e)

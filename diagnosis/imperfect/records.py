@@ -13,6 +13,7 @@ from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 
 _NOISE_ALLOWED = 1.5
+_ANGLE_STEP_RAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +92,20 @@ class Records:
             constant = [coefficients(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
             zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
         return StartColumns(np.concatenate(zeros), tuple(states))
+
+    def with_true_angles(
+        self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: Start, e: Real
+    ) -> StartColumns:
+        """The columns with those by the first state (the true hub angle) as difference quotients: what an
+        effect does with that angle is in them. e (N,): coefficients at the point."""
+        shift = np.zeros_like(start.states)
+        shift[:, 0] = _ANGLE_STEP_RAD
+        moved = self.coefficients(deviations, effects, Start(start.states + shift, start.zeros)) - e
+        states = tuple(
+            np.column_stack([moved[part] / _ANGLE_STEP_RAD, own[:, 1:]])
+            for part, own in zip(self.parts, columns.states, strict=True)
+        )
+        return StartColumns(columns.zeros, states)
 
     def prior_cost(self, start: Start) -> float:
         """-2 log prior density of a start."""

@@ -122,10 +122,11 @@ class Search:
         self, around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
     ) -> Descent:
         chosen = [points[0]]
+        turned = candidate.kind.absolute_angle and not self.case.machine.unknown_start.zero_seen
         for point in points[1:]:
-            if len(chosen) == _ALONE or point.loss > self.base.end.loss + 5:
+            if len(chosen) == (2 * _ALONE if turned else _ALONE) or point.loss > self.base.end.loss + 5:
                 break
-            if point.far_from(chosen[0]):
+            if all(point.far_from(other) for other in chosen):
                 chosen.append(point)
         ends = [self._from(around, candidate, point, nominal) for point in chosen]
         return min(ends, key=lambda end: end.loss)

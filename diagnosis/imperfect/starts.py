@@ -15,7 +15,7 @@ from diagnosis.imperfect.records import Records, Start
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
-# Zeros of a hub angle that is the only output are tried all around where a torque depends on the true one.
+# Zeros that no other output tells are tried all around where a torque depends on the true one.
 _ZEROS_AROUND = 6
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
 _HIGHEST_HZ, _LINES_PER_PERIOD = 60.0, 0.4
@@ -73,8 +73,7 @@ def point_at(records: Records, around: Descent, candidate: Candidate, x: Real, s
 
 
 def _turned(records: Records, start: Start, candidate: Candidate) -> list[Start]:
-    unknown = start.zeros.size and records.case.noise.size == 1
-    if not (unknown and getattr(candidate.kind, "absolute_angle", False)):
+    if records.case.machine.unknown_start.zero_seen or not candidate.kind.absolute_angle:
         return [start]
     turns = np.arange(_ZEROS_AROUND) * 2 * np.pi / _ZEROS_AROUND - np.pi
     return [_with_zeros(records, start, start.zeros + turn) for turn in turns]

@@ -24,10 +24,12 @@ TEMPER = 4.0
 _VOLUME = 0.5
 # Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
 _PRIOR_COUNT = {0: 0.2, 1: 0.35, 2: 0.3, 3: 0.15}
-# An effect interests from this many model errors on; what remains is more than imperfections above that many.
-# Both limits are soft: widths in natural logarithms.
-_INTERESTS, _REMAINS = 1.2, 1.6
-_INTERESTS_WIDTH, _REMAINS_WIDTH = 0.12, 0.12
+# An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
+_INTERESTS, _INTERESTS_WIDTH = 1.2, 0.12
+# What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms of
+# shares of the motion, normal; any size above its median for an unknown cause), and the prior of the latter.
+_IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.5, 0.5
+_UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
 # What an effect that contains a simpler one has to gain over it.
 _CONTAINING = 2.0
 # A cause beyond the list that looks like an effect is a third as probable as that.
@@ -71,8 +73,13 @@ class Verdict:
     accepted: tuple[str, ...]
 
 
-def score_of(explanation: Explanation, listed: Sequence[str]) -> float:
+def score_of(explanation: Explanation, listed: Sequence[str], model_error: float) -> float:
     """Log weight of a set of effects, out of those that are listed."""
+    return _gain(explanation, listed) + float(np.log(sum(_remaining(explanation, model_error))))
+
+
+def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
+    """Without what is left of the motion."""
     candidates = explanation.end.candidates
     further = float(sum(len(c.axes) - 1 for c in candidates))
     further += _CONTAINING * sum(c.kind.contains is not None for c in candidates)
@@ -94,7 +101,7 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
         known = best.get(explanation.key)
         if known is None or explanation.evidence > known.evidence:
             best[explanation.key] = explanation
-    score = {key: score_of(explanation, listed) for key, explanation in best.items()}
+    score = {key: score_of(explanation, listed, model_error) for key, explanation in best.items()}
     ranked = sorted(best.values(), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
@@ -128,17 +135,25 @@ def _judged(
         kind = explanation.end.candidates[k].kind
         if kind.multiplies is not None or kind.adds_to is not None:
             # A stated value in itself: what it changes may be imitated by the others within their tolerances.
-            matters = max(matters, float(expit(score_of(explanation, listed) - score_of(rest, listed))))
+            matters = max(matters, float(expit(_gain(explanation, listed) - _gain(rest, listed))))
         parts.append(Part(name, share, matters))
-    remains = float(np.max(explanation.shares[1]))
-    complete = 1.0 - _soft(remains / (_REMAINS * model_error), _REMAINS_WIDTH)
     at_edge = any(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    score = score_of(explanation, listed)
     beyond = at_edge or any(name not in listed for name in explanation.names)
-    return Judged(explanation, tuple(parts), score, 0.0 if beyond else complete)
+    enough, more = _remaining(explanation, model_error)
+    complete = 0.0 if beyond else enough / (enough + more)
+    return Judged(explanation, tuple(parts), score_of(explanation, listed, model_error), complete)
+
+
+def _remaining(explanation: Explanation, model_error: float) -> tuple[float, float]:
+    """Densities of what is left of held-out motion after a complete answer, and beside an unknown cause."""
+    size = np.log(max(float(np.max(explanation.shares[1])) / model_error, 1e-3))
+    z = max(size - np.log(_IMPERFECTIONS), 0.0) / _IMPERFECTIONS_WIDTH
+    u = min(size - np.log(_UNKNOWN), 0.0) / _UNKNOWN_WIDTH
+    enough = (1 - _PRIOR_UNKNOWN) / _IMPERFECTIONS_WIDTH * np.exp(-0.5 * z**2)
+    return float(enough), float(_PRIOR_UNKNOWN / _UNKNOWN_WIDTH * np.exp(-0.5 * u**2))
 
 
 def _soft(ratio: float, width: float) -> float:

@@ -73,7 +73,13 @@ class FlexibleArm:
         hub = np.eye(len(self.outputs))[:1]
         per_zero = -np.eye(len(spread))[:, :1]
         return UnknownStart(
-            np.array(spread), np.array([np.pi]), hub, per_zero, self._first_sample, self._responses
+            np.array(spread),
+            np.array([np.pi]),
+            hub,
+            per_zero,
+            self._first_sample,
+            self._responses,
+            zero_seen=_TIP in self.outputs,
         )
 
     def _first_sample(self, record: RecordOfMachine) -> Real:

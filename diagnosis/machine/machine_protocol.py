@@ -46,6 +46,7 @@ class UnknownStart:
     state_per_zero : (S, Z) what a zero moves of a start that was read off the measurement.
     guess : record -> (S,) start as its first samples say.
     responses : effects, samples -> S arrays (T, Y): outputs per unit of a state, of the linear part.
+    zero_seen : bool. Another output tells the zero; else it matters only to what depends on the true angle.
     """
 
     state_spread: Real
@@ -54,6 +55,7 @@ class UnknownStart:
     state_per_zero: Real
     guess: Callable[[Any], Real]
     responses: Callable[[Sequence[Any], int], list[Real]]
+    zero_seen: bool = True
 
 
 KNOWN_START = UnknownStart(
