@@ -213,8 +213,14 @@ def occam(records: Records, end: Descent) -> float:
         end.start,
         end.left,
     )
-    scale = np.sqrt(np.diag(equations.hessian) + 1e-12)
-    scaled = equations.hessian / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
+    # What the records say nothing about keeps the width of its range.
+    low, high = box(end.candidates)
+    width = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
+    hessian, P = equations.hessian.copy(), end.deviations.size
+    rows = range(P, P + width.size)
+    hessian[rows, rows] += 12 / width**2
+    scale = np.sqrt(np.diag(hessian) + 1e-12)
+    scaled = hessian / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
     logdet = np.linalg.slogdet(scaled)[1] + 2 * float(np.sum(np.log(scale)))
     density = sum(c.log_density(end.coordinates_of(k)) for k, c in enumerate(end.candidates))
     return float(density - 0.5 * logdet + 0.5 * end.coordinates.size * np.log(2 * np.pi))

@@ -26,8 +26,8 @@ _VOLUME = 0.5
 _PRIOR_COUNT = {0: 0.2, 1: 0.35, 2: 0.3, 3: 0.15}
 # An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
 _INTERESTS, _INTERESTS_WIDTH = 1.2, 0.12
-# What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms of
-# shares of the motion, normal; any size above its median for an unknown cause), and the prior of the latter.
+# What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
+# of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.5, 0.5
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
 # What an effect that contains a simpler one has to gain over it.
