@@ -25,7 +25,9 @@ _VOLUME = 0.5
 # Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
 _PRIOR_COUNT = {0: 0.2, 1: 0.35, 2: 0.3, 3: 0.15}
 # An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
-_INTERESTS, _INTERESTS_WIDTH = 1.2, 0.12
+_INTERESTS, _INTERESTS_WIDTH = 1.15, 0.06
+# A wrong stated value interests from this many tolerances on.
+_FAR_OFF, _FAR_OFF_WIDTH = 3.8, 0.12
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.5, 0.5
@@ -132,10 +134,11 @@ def _judged(
         carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
         share = float(np.sqrt(np.mean(np.max(carried, axis=1) ** 2)))
         matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
-        kind = explanation.end.candidates[k].kind
-        if kind.multiplies is not None or kind.adds_to is not None:
+        off = _tolerances_off(search, explanation, k)
+        if off is not None:
             # A stated value in itself: what it changes may be imitated by the others within their tolerances.
-            matters = max(matters, float(expit(_gain(explanation, listed) - _gain(rest, listed))))
+            preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
+            matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
         parts.append(Part(name, share, matters))
     at_edge = any(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
@@ -145,6 +148,25 @@ def _judged(
     enough, more = _remaining(explanation, model_error)
     complete = 0.0 if beyond else enough / (enough + more)
     return Judged(explanation, tuple(parts), score_of(explanation, listed, model_error), complete)
+
+
+def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float | None:
+    """How far the k-th effect and the deviations together move the value it changes; None for others."""
+    end, machine = explanation.end, search.case.machine
+    kind = end.candidates[k].kind
+    key = kind.multiplies or kind.adds_to
+    if key is None:
+        return None
+    if key not in machine.tolerances:
+        return np.inf
+    tolerance, stated = machine.tolerances[key], machine.description.value(key)
+    if not stated > 0:
+        return np.inf
+    deviation = float(end.deviations[search.records.nominal.keys.index(key)])
+    moved = stated * np.exp(tolerance * deviation)
+    size = next(iter(end.effects[k].parameters().values()))
+    moved = moved * size if kind.multiplies else moved + size
+    return abs(float(np.log(moved / stated))) / tolerance
 
 
 def _remaining(explanation: Explanation, model_error: float) -> tuple[float, float]:
