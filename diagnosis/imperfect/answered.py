@@ -17,6 +17,8 @@ from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 _SURE, _POSSIBLE, _FAR_OFF = 0.8, 0.05, 3.0
 _DRAWS = 1000
 _FLOOR = 1.0
+# Small effects stay in the repaired model from this share of the model error on.
+_LEAST_KEPT = 0.3
 
 
 def beside_imperfections(
@@ -29,8 +31,12 @@ def beside_imperfections(
     found = judging.judged(search, listed)
     progress(1.0, "done")
     refit = search.base
-    holding = [one.explanation for one in found.judged if set(found.accepted) <= set(one.explanation.names)]
-    accepted = holding[0] if found.accepted else refit
+    accepted = refit
+    if found.accepted:
+        whole = next(one for one in found.judged if set(found.accepted) <= {p.name for p in one.parts})
+        least = _LEAST_KEPT * case.machine.weighing.model_error
+        kept = [p.name for p in whole.parts if p.name in found.accepted or p.share > least]
+        accepted = search.finished(search.by_these(kept, whole.explanation))
     before = _whitened(case, search.stated())
     moved, after = _whitened(case, refit), _whitened(case, accepted)
     closed, interval = share_closed(case, moved, after, rng, _FLOOR)

@@ -26,7 +26,7 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
     """
     base, names = search.base, found.accepted
     subsets = {
-        chosen: _best(search, accepted, chosen)
+        chosen: search.by_these(chosen, accepted)
         for count in range(len(names) + 1)
         for chosen in combinations(names, count)
     }
@@ -53,23 +53,6 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
     )
-
-
-def _best(search: Search, accepted: Explanation, chosen: Sequence[str]) -> Explanation:
-    """The accepted explanation itself, or the best one by these effects alone."""
-    if accepted.names and set(accepted.names) >= set(chosen) and len(chosen) == len(accepted.names):
-        return accepted
-    key = tuple(sorted(chosen))
-    known = [e for e in search.found if e.key == key]
-    if known:
-        return max(known, key=lambda e: e.evidence)
-    holding = min(
-        (e for e in search.found if set(chosen) <= set(e.names)), key=lambda e: (len(e.names), -e.evidence)
-    )
-    while holding.key != key:
-        k = next(k for k, name in enumerate(holding.names) if name not in chosen)
-        holding = search.without(holding, k)
-    return holding
 
 
 def _blocks(search: Search, explanation: Explanation) -> Real:

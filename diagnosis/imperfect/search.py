@@ -26,6 +26,7 @@ _FINISHED = 6
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
 _HELD_OUT_STEPS = 5
+_LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,6 +227,31 @@ class Search:
             x = np.concatenate([end.coordinates_of(j) for j in range(len(end.candidates)) if j != k])
             self.add(descend(self.records, rest, end.deviations, x, end.start))
         return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)
+
+    def by_these(self, chosen: Sequence[str], within: Explanation) -> Explanation:
+        """The best explanation by these effects alone, `within` itself where it has no others."""
+        key = tuple(sorted(chosen))
+        if within.key == key:
+            return within
+        while not any(e.key == key for e in self.found):
+            k = next(k for k, name in enumerate(within.names) if name not in chosen)
+            within = self.without(within, k)
+        return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)
+
+    def finished(self, explanation: Explanation) -> Explanation:
+        """Descended to its end."""
+        end = explanation.end
+        return self.add(
+            descend(
+                self.records,
+                end.candidates,
+                end.deviations,
+                end.coordinates,
+                end.start,
+                iterations=_LAST_ITERATIONS,
+                tolerance=_LAST_TOLERANCE,
+            )
+        )
 
     def stated(self) -> Explanation:
         """The nominal as stated: only the starts are fitted."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import ruler_robot, serial_link_stage
-from diagnosis import diagnose, pooled_rms
+from diagnosis import diagnose
 
 
 def test_the_joints_of_the_serial_link_stand_under_currents_of_both_signs(flexlink_data):
@@ -29,24 +29,19 @@ def test_stage_model_is_the_manufacturers(flexlink_data, stage):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", [1, 2])
-def test_each_stage_of_the_serial_link_feels_the_other(flexlink_data, stage):
-    found = diagnose(serial_link_stage.case(flexlink_data, stage))
-    by_name = {effect.name: effect for effect in found.effects}
-    assert found.combination[0] == "other_stage"
-    assert by_name["other_stage"].presence > 0.95
-    # The repaired model is still far from the noise: no word about what else is missing.
-    assert found.gap_after > 50
+def test_the_first_stage_of_the_serial_link_feels_the_other(flexlink_data):
+    found = diagnose(serial_link_stage.case(flexlink_data, 1))
+    # Something is missing besides: the other stage and friction close seven tenths together.
+    assert found.verdict == "unknown"
+    assert found.shares is not None
+    assert all("other_stage" in names and closed > 0.6 for names, closed in found.shares.closes)
 
 
 @pytest.mark.slow
-def test_ruler_robot_friction_and_offset_found_at_one_amplitude_hold_at_the_other(flexlink_data):
+def test_the_offset_of_the_ruler_robot_found_at_one_amplitude_holds_at_the_other(flexlink_data):
     found = diagnose(ruler_robot.case(flexlink_data, (50,), (75,)))
-    assert "drive_offset" in found.combination
-    assert {"coulomb_friction", "stribeck_friction"} & set(found.combination)
-    before, after = (
-        pooled_rms(np.concatenate([residuals[e.name].ravel() for e in found.case.held_out]))
-        for residuals in (found.residuals_refit, found.residuals_after)
-    )
+    assert found.combination == ("drive_offset",)
+    assert found.shares is not None
+    assert "coulomb_friction" in found.shares.small
     # An amplitude no fit has seen: half of the explainable energy is gone at least.
-    assert after**2 - 1 < 0.5 * (before**2 - 1)
+    assert found.gap_closed > 0.5
