@@ -18,7 +18,7 @@ from scipy.stats import f as fisher
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.findings import SENSORS, FrequencyResponseBand, LineGroup, PeriodicFinding
+from diagnosis.where.findings import FrequencyResponseBand, LineGroup, PeriodicFinding, sensors_of
 from diagnosis.where.where_energy import band_edges_Hz
 from ident.data.distortion import period_of
 
@@ -61,9 +61,10 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     frequency = lines / (period * dt)
     banded = [(low, high, excited & (frequency >= low) & (frequency < high)) for low, high in pairwise(edges)]
     banded = [(low, high, chosen) for low, high, chosen in banded if np.count_nonzero(chosen) >= _LEAST_LINES]
-    tests = len(SENSORS) * (len(groups) + len(banded))
+    sensors = sensors_of(case)
+    tests = len(sensors) * (len(groups) + len(banded))
     bands, shown, unrepeated = [], [], []
-    for s, sensor in enumerate(SENSORS):
+    for s, sensor in enumerate(sensors):
         mean, rest = _split(spectra[:, :, s])
         for low, high, chosen in banded:
             p_value = _p_value(mean, rest, chosen, count)
@@ -111,7 +112,7 @@ def _without_trend(e: Real) -> Real:
 
 
 def _lines(signal: Real, period: int, count: int, lines: npt.NDArray[np.int64]) -> ComplexArray:
-    """(M, L, 2) orthonormal spectra of the last whole periods of a signal (T, 2)."""
+    """(M, L, Y) orthonormal spectra of the last whole periods of a signal (T, Y)."""
     last = signal[signal.shape[0] - count * period :].reshape(count, period, -1)
     return np.asarray(np.fft.rfft(last, axis=1)[:, lines] / np.sqrt(period))
 

@@ -13,9 +13,16 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2, norm
 
+from diagnosis.machine.case import Case
+from diagnosis.machine.flexible_arm import Output
+
 Interval = tuple[float, float]
-# Sensors in the order of the output columns, as records name them.
-SENSORS = ("hub_angle", "tip")
+# What is measured -> its sensor, as findings name it, and the unit of its slope.
+SENSORS: dict[Output, tuple[str, str]] = {
+    "hub_angle_rad": ("hub_angle", "rad/s"),
+    "tip_m": ("tip", "m/s"),
+    "tip_acceleration_m_s2": ("tip_acceleration", "m/s^3"),
+}
 
 _Z95 = float(norm.ppf(0.975))
 # A statement about where "most" of the gap lies covers at least this share of it.
@@ -28,6 +35,11 @@ _LINEAR, _NOT_LINEAR = 0.9, 0.5
 _LINE = 0.2
 # A drift that explains less of a gap is not worth a sentence.
 _LEAST_DRIFT = 0.1
+
+
+def sensors_of(case: Case) -> tuple[str, ...]:
+    """Names of the sensors in the order of the output columns."""
+    return tuple(SENSORS[output][0] for output in case.outputs)
 
 
 @dataclass(frozen=True)
@@ -60,7 +72,7 @@ class SensorGap:
 
 @dataclass(frozen=True)
 class ExperimentGap:
-    """Gap of one experiment, both sensors together and apart (order of `SENSORS`)."""
+    """Gap of one experiment, all sensors together and apart (in their order)."""
 
     experiment: str
     gap: PartGap
@@ -347,7 +359,9 @@ class Where:
 
     @property
     def dominant_sensor(self) -> str | None:
-        """The sensor that alone shows the gap, if the other one shows none or next to none of it."""
+        """The sensor that alone shows the gap, if the other ones show none or next to none of it."""
+        if len(self.sensors) == 1:
+            return None
         shown = [s for s in self.sensors if s.gap.found]
         for s in shown:
             if s.gap.share_interval[0] > 0.95 or (len(shown) == 1 and s.gap.share > 0.9):

@@ -22,15 +22,14 @@ from scipy.stats import chi2
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.findings import EquivalentCurve
+from diagnosis.where.findings import EquivalentCurve, sensors_of
 from diagnosis.where.regimes import Motion
-from plant.simulate import simulate
 
 _SHIFTS = 39
 # Axes that explain less than this are not worth the shifts.
 _LEAST_SHARE = 0.3
 _LEAST_SAMPLES = 60
-_VARIABLES: dict[str, tuple[Callable[[Motion], Real], str]] = {
+_VARIABLES: dict[str, tuple[Callable[[Motion], Real | None], str]] = {
     "speed": (lambda m: m.speed_rad_s, "rad/s"),
     "angle": (lambda m: m.angle_rad, "rad"),
     "command": (lambda m: m.command_V, "V"),
@@ -60,23 +59,29 @@ def missing_functions(
     level: float,
     rng: np.random.Generator,
 ) -> tuple[EquivalentCurve, ...]:
-    """Every route and axis; together they raise a false alarm with chance `level` when there is only noise.
+    """Every route that is measured and its axes.
+
+    Together they raise a false alarm with chance `level` when there is only noise.
 
     Found also asks for a share of 30 % and that no shift in time of the function's variable explains as much
     (39 shifts), which guards against slow residuals that any slow function would fit.
     """
     squares = sum(float(np.sum(e**2)) for e in residuals.values())
     gap = squares - sum(e.size for e in residuals.values())
-    torque = _torque_response(case)
-    tests = sum(len(axes) for _, axes, _ in _ROUTES)
+    # In noise deviations, (T, Y): of the nominal machine, wherever a record starts.
+    response, _ = case.machine.torque_response(max(e.voltage_V.size for e in case.experiments))
+    torque, sensors = response / case.noise, sensors_of(case)
+    routes = [route for route in _ROUTES if route[0] in ("hub_torque", *sensors)]
+    tests = sum(len(axes) for _, axes, _ in routes)
     bases = {axis: _basis(axis, moved) for axis in _VARIABLES}
     found = []
-    for route, axes, value_unit in _ROUTES:
+    for route, axes, value_unit in routes:
+        at = sensors.index(route) if route in sensors else None
         for axis in axes:
             basis = bases[axis]
             if basis is None:
                 continue
-            gram, moment = _normal_equations(route, basis.functions, residuals, torque, case.noise)
+            gram, moment = _normal_equations(at, basis.functions, residuals, torque, case.noise)
             explained, rank, values, errors = _solve(gram, moment)
             p_value = float(chi2.sf(explained, rank))
             share = float((explained - rank) / gap) if gap > 0 else 0.0
@@ -88,7 +93,7 @@ def missing_functions(
                         name: np.roll(f, _shift(f.shape[0], rng), axis=0)
                         for name, f in basis.functions.items()
                     }
-                    again = _solve(*_normal_equations(route, moved_on, residuals, torque, case.noise))
+                    again = _solve(*_normal_equations(at, moved_on, residuals, torque, case.noise))
                     shares[k] = (again[0] - again[1]) / gap
                 by_chance = float(np.quantile(shares, 0.95))
                 p_value = max(p_value, (1 + np.count_nonzero(shares >= share)) / (_SHIFTS + 1))
@@ -117,16 +122,11 @@ def _shift(n_samples: int, rng: np.random.Generator) -> int:
     return int(rng.integers(least, n_samples - least))
 
 
-def _torque_response(case: Case) -> Real:
-    """(T, 2) response of the nominal rig to a hub torque of 1 Nm over one sample, in noise deviations."""
-    T = max(e.voltage_V.size for e in case.experiments)
-    pulse = np.zeros(T)
-    pulse[0] = 1.0
-    return np.asarray(simulate(case.rig, np.zeros(T), hub_torque_Nm=pulse).output / case.noise)
-
-
 def _basis(axis: str, moved: Mapping[str, Motion]) -> _Basis | None:
-    values = {name: _VARIABLES[axis][0](m) for name, m in moved.items()}
+    known = {name: _VARIABLES[axis][0](m) for name, m in moved.items()}
+    values = {name: v for name, v in known.items() if v is not None}
+    if not values:
+        return None
     everything = np.concatenate(list(values.values()))
     if axis == "time":
         nodes = np.linspace(0.0, float(everything.max()), 8)
@@ -157,25 +157,31 @@ def _hats(values: Real, nodes: Real) -> Real:
 
 
 def _normal_equations(
-    route: str, functions: Mapping[str, Real], residuals: Mapping[str, Real], torque: Real, noise: Real
+    sensor: int | None,
+    functions: Mapping[str, Real],
+    residuals: Mapping[str, Real],
+    torque: Real,
+    noise: Real,
 ) -> tuple[Real, Real]:
-    """Gram (K, K) and moment (K,) of the regressors' responses in noise deviations."""
+    """Gram (K, K) and moment (K,) of the regressors' responses in noise deviations.
+
+    sensor: index of the output that the functions are added to; None: they are torques on the hub.
+    """
     K = next(iter(functions.values())).shape[1]
     gram, moment = np.zeros((K, K)), np.zeros(K)
     for name, f in functions.items():
         e = residuals[name]
-        if route == "hub_torque":
+        if sensor is None:
             T = f.shape[0]
             n = next_fast_len(2 * T - 1, real=True)
             spectrum = rfft(f.T, n)[None] * rfft(torque[:T].T, n)[:, None]
-            columns = irfft(spectrum, n)[:, :, :T]  # (2, K, T)
+            columns = irfft(spectrum, n)[:, :, :T]  # (Y, K, T)
             for s in range(columns.shape[0]):
                 gram += columns[s] @ columns[s].T
                 moment += columns[s] @ e[:, s]
         else:
-            s = ("hub_angle", "tip").index(route)
-            gram += f.T @ f / noise[s] ** 2
-            moment += f.T @ e[:, s] / noise[s]
+            gram += f.T @ f / noise[sensor] ** 2
+            moment += f.T @ e[:, sensor] / noise[sensor]
     return gram, moment
 
 

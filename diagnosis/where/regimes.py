@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.findings import SENSORS, RegimeBin, RegimeFinding, RegimePeak
+from diagnosis.where.findings import RegimeBin, RegimeFinding, RegimePeak
 
 Integer = npt.NDArray[np.int64]
 _SHIFTS = 4999
@@ -29,12 +29,12 @@ _LEAST_RATIO = 1.25
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Regime variables of one experiment, all (T,), from the model."""
+    """Regime variables of one experiment, all (T,), from the model; the tip's only where it is measured."""
 
     angle_rad: Real
     speed_rad_s: Real
-    deflection_m: Real
-    position_m: Real
+    deflection_m: Real | None
+    position_m: Real | None
     command_V: Real
     time_s: Real
     near_reversal: npt.NDArray[np.bool_]
@@ -43,7 +43,7 @@ class Motion:
 def motions(case: Case, residuals: Mapping[str, Real]) -> dict[str, Motion]:
     """What the model did in every experiment that has residuals.
 
-    Raises ValueError if an experiment of the case has no residuals, or they are not (T, 2) and finite.
+    Raises ValueError if an experiment of the case has no residuals, or they are not (T, Y) and finite.
     """
     dt = case.rig.sampling.dt_s
     reach = case.rig.hub.radius_m + case.rig.link.length_m
@@ -57,12 +57,13 @@ def motions(case: Case, residuals: Mapping[str, Real]) -> dict[str, Motion]:
                 f"case {case.name}: residuals of {experiment.name} must be finite and "
                 f"{experiment.output.shape}; got {e.shape}"
             )
-        angle, tip = (experiment.output - e * case.noise).T
+        modelled = dict(zip(case.outputs, (experiment.output - e * case.noise).T, strict=True))
+        angle, tip = modelled["hub_angle_rad"], modelled.get("tip_m")
         speed = np.gradient(angle, dt)
         found[experiment.name] = Motion(
             angle,
             speed,
-            tip - reach * angle,
+            None if tip is None else tip - reach * angle,
             tip,
             experiment.voltage_V,
             np.arange(angle.size) * dt,
@@ -101,6 +102,7 @@ def regime_axes(moved: Mapping[str, Motion], bins: int = 5) -> tuple[RegimeAxis,
 
     def of(attribute: str, size: bool = False) -> dict[str, Real]:
         values = {name: getattr(moved[name], attribute) for name in names}
+        values = {name: v for name, v in values.items() if v is not None}
         return {name: np.abs(v) for name, v in values.items()} if size else values
 
     speed = of("speed_rad_s")
@@ -139,10 +141,12 @@ def _enough(axis: RegimeAxis) -> bool:
 
 
 def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int) -> RegimeAxis | None:
-    """Bins of about equal count over all experiments; None if all values are equal.
+    """Bins of about equal count over all experiments; None without values or if all are equal.
 
     Many equal values (a binary voltage) make fewer bins, none of them with less than half the mean count.
     """
+    if not values:
+        return None
     everything = np.concatenate(list(values.values()))
     span = float(np.ptp(everything))
     inner: list[float] = []
@@ -173,14 +177,18 @@ def _stretches(time: Mapping[str, Real], bins: int) -> RegimeAxis:
 
 
 def regime_findings(
-    residuals: Mapping[str, Real], axes: Sequence[RegimeAxis], level: float, rng: np.random.Generator
+    residuals: Mapping[str, Real],
+    sensors: Sequence[str],
+    axes: Sequence[RegimeAxis],
+    level: float,
+    rng: np.random.Generator,
 ) -> tuple[RegimeFinding, ...]:
     """One finding per axis and sensor; all of them together raise a false alarm with the chance `level`."""
-    each = level / max(len(axes) * len(SENSORS), 1)
+    each = level / max(len(axes) * len(sensors), 1)
     found = []
     for axis in axes:
         sums, counts = _shifted_energy(residuals, axis, rng)
-        for s, sensor in enumerate(SENSORS):
+        for s, sensor in enumerate(sensors):
             found.append(_finding(axis, sensor, sums[:, s], counts, each))
     return tuple(found)
 
@@ -193,7 +201,8 @@ def _shifted_energy(
     All circular shifts of one experiment are one correlation by FFT; experiments shift independently.
     """
     K = len(axis.titles)
-    sums = np.zeros((_SHIFTS + 1, len(SENSORS), K))
+    outputs = next(iter(residuals.values())).shape[1]
+    sums = np.zeros((_SHIFTS + 1, outputs, K))
     counts = np.zeros(K, dtype=np.int64)
     for name, labels in axis.labels.items():
         T = labels.size

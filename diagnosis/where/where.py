@@ -1,19 +1,22 @@
 """Where the gap between machine and model lies: frequency, regime, time, amplitude, experiment, sensor.
 
 Everything is read from whitened residuals (measured - model) / noise of every experiment, whichever model
-made them: as given, with refitted parameters, or repaired.
+made them: as given, with refitted parameters, or repaired. Beside a model error, what a good model may miss
+of the motion stands in the place of the noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from diagnosis.machine.case import Case
+from diagnosis.machine.flexible_arm import NOISE
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.distortion import periodic_findings
-from diagnosis.where.findings import Where
+from diagnosis.where.findings import Where, sensors_of
 from diagnosis.where.linear_correction import linear_correction
 from diagnosis.where.missing_function import missing_functions
 from diagnosis.where.regimes import motions, regime_axes, regime_findings
@@ -34,7 +37,7 @@ def where(
 ) -> Where:
     """Locate the gap.
 
-    residuals : experiment name -> (T, 2). (measured - model) / noise, standard deviation 1 where the model
+    residuals : experiment name -> (T, Y). (measured - model) / noise, standard deviation 1 where the model
         explains everything; every experiment of the case.
     probabilities : effect id, "none" or "unknown" -> probability, optional
         Of the causes, for the grouping by subsystem.
@@ -47,15 +50,17 @@ def where(
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1; got {level}")
     rng = np.random.default_rng(0) if rng is None else rng
-    moved = motions(case, residuals)
+    if case.model_error > 0:
+        case, residuals = over_levels(case, residuals, case.model_error * motion_of(case))
+    moved, sensors = motions(case, residuals), sensors_of(case)
     e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
     squares = Energy(sum(float(np.sum(v**2)) for v in e.values()), sum(v.size for v in e.values()))
     return Where(
         gap=part_gap(squares, squares, level),
-        sensors=sensor_gaps(e, level),
+        sensors=sensor_gaps(e, sensors, level),
         experiments=experiment_gaps(e, level),
-        bands=band_gaps(e, case.rig.sampling.dt_s, level),
-        regimes=regime_findings(e, regime_axes(moved), level, rng),
+        bands=band_gaps(e, sensors, case.rig.sampling.dt_s, level),
+        regimes=regime_findings(e, sensors, regime_axes(moved), level, rng),
         drift=drift_findings(case, e, level),
         common=common_findings(case, e, level),
         curves=missing_functions(case, e, moved, level, rng),
@@ -65,6 +70,21 @@ def where(
         subsystem=subsystem_mass(probabilities) if probabilities else {},
         level=level,
     )
+
+
+def motion_of(case: Case) -> Real:
+    """(Y,) RMS of the outputs about their means over the held-out records."""
+    held = case.held_out
+    return np.sqrt(
+        np.average([np.var(e.output, axis=0) for e in held], axis=0, weights=[len(e.output) for e in held])
+    )
+
+
+def over_levels(case: Case, residuals: Mapping[str, Real], levels: Real) -> tuple[Case, dict[str, Real]]:
+    """Case and residuals with levels (Y,), in the outputs' units, in the place of the sensor noise."""
+    keys = [f"sensors.{NOISE[output]}" for output in case.outputs]
+    seen = replace(case, rig=case.rig.perturbed(dict(zip(keys, levels, strict=True))))
+    return seen, {name: e * (case.noise / levels) for name, e in residuals.items()}
 
 
 def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:

@@ -16,7 +16,7 @@ from scipy.fft import dct
 from scipy.stats import chi2, norm
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.findings import SENSORS, BandGap, ExperimentGap, PartGap, SensorGap
+from diagnosis.where.findings import BandGap, ExperimentGap, PartGap, SensorGap
 
 _Z95 = float(norm.ppf(0.975))
 # Half a decade a band: edges 1, 3.2, 10, ... Hz, rounded for reading aloud.
@@ -67,26 +67,26 @@ def part_gap(part: Energy, whole: Energy, level: float) -> PartGap:
     return PartGap(rms[0], (rms[1], rms[2]), float(share), interval, part.p_value, bool(part.p_value < level))
 
 
-def sensor_gaps(residuals: Mapping[str, Real], level: float) -> tuple[SensorGap, ...]:
+def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: float) -> tuple[SensorGap, ...]:
     energies = [
         total([Energy(float(np.sum(e[:, s] ** 2)), e.shape[0]) for e in residuals.values()])
-        for s in range(len(SENSORS))
+        for s in range(len(sensors))
     ]
     whole = total(energies)
     return tuple(
-        SensorGap(sensor, part_gap(energy, whole, level / len(SENSORS)))
-        for sensor, energy in zip(SENSORS, energies, strict=True)
+        SensorGap(sensor, part_gap(energy, whole, level / len(sensors)))
+        for sensor, energy in zip(sensors, energies, strict=True)
     )
 
 
 def experiment_gaps(residuals: Mapping[str, Real], level: float) -> tuple[ExperimentGap, ...]:
-    """Every experiment: both sensors together and each; one level for all these tests."""
+    """Every experiment: all sensors together and each; one level for all these tests."""
     energies = {
         name: [Energy(float(np.sum(column**2)), column.size) for column in e.T]
         for name, e in residuals.items()
     }
     whole = total([energy for parts in energies.values() for energy in parts])
-    each = level / (3 * len(energies))
+    each = level / sum(1 + len(parts) for parts in energies.values())
     return tuple(
         ExperimentGap(
             name, part_gap(total(parts), whole, each), tuple(part_gap(part, whole, each) for part in parts)
@@ -106,22 +106,24 @@ def band_edges_Hz(shortest_s: float, dt_s: float) -> tuple[float, ...]:
     return (0.0, *inner, nyquist)
 
 
-def band_gaps(residuals: Mapping[str, Real], dt_s: float, level: float) -> tuple[BandGap, ...]:
+def band_gaps(
+    residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float, level: float
+) -> tuple[BandGap, ...]:
     """Energy per sensor and band, all experiments added up."""
     edges = band_edges_Hz(min(e.shape[0] for e in residuals.values()) * dt_s, dt_s)
-    squares = np.zeros((len(SENSORS), len(edges) - 1))
+    squares = np.zeros((len(sensors), len(edges) - 1))
     counts = np.zeros(len(edges) - 1, dtype=int)
     for e in residuals.values():
         spectrum = dct(e, axis=0, norm="ortho") ** 2
         band = np.searchsorted(edges, np.arange(e.shape[0]) / (2 * e.shape[0] * dt_s), side="right") - 1
         counts += np.bincount(band, minlength=counts.size)
-        for s in range(len(SENSORS)):
+        for s in range(len(sensors)):
             squares[s] += np.bincount(band, weights=spectrum[:, s], minlength=counts.size)
     energies = [[Energy(float(v), int(n)) for v, n in zip(row, counts, strict=True)] for row in squares]
     whole = total([energy for row in energies for energy in row])
     each = level / squares.size
     return tuple(
         BandGap(sensor, edges[b], edges[b + 1], part_gap(energy, whole, each))
-        for sensor, row in zip(SENSORS, energies, strict=True)
+        for sensor, row in zip(sensors, energies, strict=True)
         for b, energy in enumerate(row)
     )

@@ -13,9 +13,16 @@ from scipy.stats import t as student
 from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.where.findings import SENSORS, AmplitudeFinding, CommonFinding, DriftFinding, Growth, Interval
+from diagnosis.where.findings import (
+    SENSORS,
+    AmplitudeFinding,
+    CommonFinding,
+    DriftFinding,
+    Growth,
+    Interval,
+    sensors_of,
+)
 
-_UNITS = ("rad/s", "m/s")
 _DRAWS = 2000
 _BLOCK_S = 0.5
 # Two inputs closer in size than this say nothing about growth.
@@ -44,7 +51,7 @@ def drift_findings(case: Case, residuals: Mapping[str, Real], level: float) -> t
     w, b = np.array(weights), np.array(slopes)
     mean = w @ b / w.sum()
     found = []
-    for s, (sensor, unit) in enumerate(zip(SENSORS, _UNITS, strict=True)):
+    for s, (sensor, unit) in enumerate(SENSORS[output] for output in case.outputs):
         scale = float(case.noise[s])
         rate = float(mean[s] * scale)
         gap = sum(float(np.sum(e[:, s] ** 2)) - e.shape[0] for e in residuals.values())
@@ -55,7 +62,7 @@ def drift_findings(case: Case, residuals: Mapping[str, Real], level: float) -> t
         error = float(np.sqrt(w @ (b[:, s] - mean[s]) ** 2 / ((w.size - 1) * w.sum()))) * scale
         p_value = float(2 * student.sf(abs(rate) / error, w.size - 1)) if error > 0 else 1.0
         half = float(student.ppf(0.975, w.size - 1)) * error
-        beyond = bool(p_value < level / len(SENSORS))
+        beyond = bool(p_value < level / len(case.outputs))
         found.append(DriftFinding(sensor, unit, rate, share, (rate - half, rate + half), p_value, beyond))
     return tuple(found)
 
@@ -83,10 +90,10 @@ def amplitude_finding(
         length = max(round(_BLOCK_S / case.rig.sampling.dt_s), 1)
         blocks = energy[: energy.size // length * length].reshape(-1, length).mean(axis=1)
         index = rng.integers(0, blocks.size, (_DRAWS, blocks.size))
-        gaps.append(float(energy.mean()) - len(SENSORS))
-        draws.append(blocks[index].mean(axis=1) - len(SENSORS))
-        # sum of 2 T squares of unit variance: variance 4 T, of the mean over T samples 4 / T
-        if gaps[-1] < 4 * np.sqrt(4.0 / energy.size):
+        gaps.append(float(energy.mean()) - len(case.outputs))
+        draws.append(blocks[index].mean(axis=1) - len(case.outputs))
+        # sum of Y T squares of unit variance: variance 2 Y T, of the mean over T samples 2 Y / T
+        if gaps[-1] < 4 * np.sqrt(2.0 * len(case.outputs) / energy.size):
             return None
     low, high = (np.maximum(d, 1e-3 * g) for d, g in zip(draws, gaps, strict=True))
     log_ratio = np.log(ratio)
@@ -132,12 +139,12 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
     if len(chosen) < _LEAST_EXPERIMENTS:
         return ()
     length = min(x.voltage_V.size for x in chosen)
-    e = np.stack([residuals[x.name][:length] for x in chosen])  # (n, T, 2)
+    e = np.stack([residuals[x.name][:length] for x in chosen])  # (n, T, Y)
     n, dt = len(chosen), case.rig.sampling.dt_s
     # The first sign is fixed: turning all of them changes nothing.
     signs = np.array([(1.0, *rest) for rest in product((1.0, -1.0), repeat=n - 1)])
     found = []
-    for s, sensor in enumerate(SENSORS):
+    for s, sensor in enumerate(sensors_of(case)):
         # Energy of the mean, over all choices of signs, from the products of the experiments.
         products = e[:, :, s] @ e[:, :, s].T
         energy = np.einsum("ki,ij,kj->k", signs, products, signs) / n
@@ -147,7 +154,7 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
         share = (energy - length) / gap if beyond_noise else np.zeros(energy.size)
         chance = float(np.max(share[1:]))
         yes = bool(
-            p_value < level / len(SENSORS) and share[0] >= _LEAST_SHARE and share[0] > max(chance, 0.0)
+            p_value < level / len(case.outputs) and share[0] >= _LEAST_SHARE and share[0] > max(chance, 0.0)
         )
         peak_Hz, peak_share = _peak(e[:, :, s].mean(axis=0), dt)
         found.append(

@@ -71,8 +71,12 @@ def test_intervals_of_energy_and_share_cover():
     seeds, held = 400, np.zeros(2)
     for _ in range(seeds):
         e = {"one": gap + rng.standard_normal(gap.shape)}
-        tip = sensor_gaps(e, 0.01)[1].gap
-        band = next(b.gap for b in band_gaps(e, DT, 0.01) if b.sensor == "tip" and b.low_Hz == 10)
+        tip = sensor_gaps(e, ("hub_angle", "tip"), 0.01)[1].gap
+        band = next(
+            b.gap
+            for b in band_gaps(e, ("hub_angle", "tip"), DT, 0.01)
+            if b.sensor == "tip" and b.low_Hz == 10
+        )
         held[0] += tip.interval[0] <= np.sqrt(energy[1] / 1000) <= tip.interval[1]
         held[1] += band.share_interval[0] <= share <= band.share_interval[1]
     # Binomial with 400 draws at 0.95: four standard deviations are 0.044.

@@ -47,6 +47,7 @@ def document_of(
         "gap_closed_interval": found.gap_closed_interval,
         "gap_by_experiment": found.gap_by_experiment,
         **(beside or {}),
+        **({} if found.shares is None else {"shares": found.shares}),
         "deviations": found.deviations,
         "repair": {
             "values": {

@@ -27,10 +27,11 @@ class Following:
     """What to run next and why.
 
     advice: look at the machine for the unlisted cause (confirm); repeat the worst experiment, or all of them,
-    to see what an unknown cause follows; nothing (none); the proposal, which separates the competing ones.
+    to see what an unknown cause follows; nothing (none); the proposal, which separates the competing ones;
+    a look at the machine for every cause left (look), where no simulation can promise to separate them.
     """
 
-    advice: Literal["confirm", "repeat_worst", "repeat_all", "none", "separate"]
+    advice: Literal["confirm", "repeat_worst", "repeat_all", "none", "separate", "look"]
     proposal: NextExperiment | None = None
     competing: tuple[CompetingHypothesis, ...] = ()
 
@@ -57,6 +58,8 @@ def following(found: Diagnosis) -> Following:
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
     if found.verdict == "unknown" and not imitated & set(found.ambiguous_with):
         return Following("confirm" if found.unlisted else "repeat_worst")
+    if found.case.model_error > 0 or "tip_m" not in found.case.outputs:
+        return Following("look" if found.ambiguous_with else "none")
     competing = _left(found)
     if len(competing) < 2:
         return Following("repeat_all" if "unknown" in found.ambiguous_with else "none")

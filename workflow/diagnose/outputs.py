@@ -22,6 +22,7 @@ from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.document import document_of
 from workflow.diagnose.following import Following, following
+from workflow.diagnose.per_cent import moved, partial_answers, shown
 from workflow.diagnose.words import FILTERS
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
@@ -83,7 +84,7 @@ class Work:
             check, no_check = _control(found) if self.controller else (None, "not_asked")
         rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
         effects = effects_text(case.name, found.repair) if found.repair else ""
-        rig = rig_text(case.name, case.rig, found.rig, found.deviations, effects_name if effects else "")
+        rig = rig_text(case.name, case.rig, found.rig, moved(found), effects_name if effects else "")
         html = case_page(
             CasePage(loaded, found, place, remains, coming, check, no_check, rig, effects),
             lambda f, m: report(_CONTROLLER + (1 - _CONTROLLER) * f, f"drawing {m}"),
@@ -146,6 +147,9 @@ def case_page(page: CasePage, progress: Callable[[float, str], None] | None = No
         filters=FILTERS.items(),
         title=page.loaded.case.name,
         page=page,
+        shown=shown(page.found),
+        moved=moved(page.found),
+        partial=partial_answers(page.found),
         look_alikes=LOOK_ALIKES,
         versions=[*versions, ("python", sys.version.split()[0])],
     ).html

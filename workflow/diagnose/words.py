@@ -78,7 +78,8 @@ def short_answer(document: Mapping[str, Any]) -> str:
     if document["detail_verdict"] == "not_converged":
         return "not converged"
     if document["verdict"] != "effect":
-        return "no gap" if document["verdict"] == "none" else "outside the list"
+        none = "no gap that interests" if "shares" in document else "no gap"
+        return none if document["verdict"] == "none" else "outside the list"
     names = listing([in_words(name) for name in document["combination"]])
     return f"{names} (ambiguous)" if document["detail_verdict"] == "ambiguous" else names
 

@@ -12,6 +12,7 @@ from diagnosis.answer import Diagnosis
 from plant.effects import in_words
 from workflow.figures import gap_style, style
 from workflow.figures.registry import drawing
+from workflow.text.formats import listing
 
 _MOST_BARS = 8
 _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
@@ -44,8 +45,13 @@ def draw_probabilities(found: Diagnosis) -> Figure:
 
 @drawing("gap_waterfall")
 def draw_waterfall(found: Diagnosis) -> Figure:
-    """Pooled root mean square of (measured - model)/noise: held-out records together, every record alone."""
+    """Pooled root mean square of (measured - model)/noise: held-out records together, every record alone.
+
+    Beside a model error: in per cent of the motion.
+    """
     gaps, rows, floor = found.gaps, found.gap_by_experiment, found.noise_floor
+    rough = found.case.model_error
+    words, line = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS, gap_style.floor_of(rough)
     figure, (left, right) = style.panels(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
     bars = left.bar(
         np.arange(len(gaps)),
@@ -55,20 +61,35 @@ def draw_waterfall(found: Diagnosis) -> Figure:
         tick_label=[gap_style.WORDS[model].replace(" ", "\n") for model in gaps],
     )
     left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
-    left.axhline(floor, **gap_style.FLOOR, zorder=1)
+    left.axhline(floor, **line, zorder=1)
     left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
-    left.set(ylabel=gap_style.RESIDUAL_AXIS, title="Held-out experiments together")
+    left.set(ylabel=words, title="Held-out experiments together")
     left.grid(visible=False, axis="x")
     for model in gaps:
         marker, offset = _LOOKS[model]
         at = np.arange(len(rows)) + offset
         right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
-    right.axvline(floor, **gap_style.FLOOR)
+    right.axvline(floor, **line)
     largest = max(max(entry.values()) for entry in rows.values())
     right.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(largest, 2 * floor)))
     right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
-    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=gap_style.RESIDUAL_AXIS)
+    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words)
     right.set_title("Every experiment alone")
+    return figure
+
+
+@drawing("gap_partial")
+def draw_partial_answers(partial: Sequence[tuple[Sequence[str], float]]) -> Figure:
+    """Bars: share of the held-out gap that effects close by themselves."""
+    names = [style.plain(listing([in_words(name) for name in effects]), 60) for effects, _ in partial]
+    percent = [100 * share for _, share in partial]
+    figure, axes = style.panels(1.0 + 0.34 * len(names))
+    bars = axes.barh(np.arange(len(names)), percent, color=gap_style.PALE, height=0.62, tick_label=names)
+    axes.bar_label(bars, [f"{p:.3g} %" for p in percent], padding=4, fontsize=9)
+    axes.invert_yaxis()
+    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel="of the held-out gap closed [%]")
+    axes.set_title("What effects close by themselves")
+    axes.grid(visible=False, axis="y")
     return figure
 
 

@@ -21,9 +21,7 @@ def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequ
     above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
     above.set(ylabel="voltage [V]", title="Proposed experiment")
     below.axhspan(-2, 2, **gap_style.NOISE_BAND)
-    for signal, colour, words in zip(
-        difference.T, gap_style.SENSOR_COLOURS, gap_style.SENSOR_WORDS, strict=True
-    ):
+    for signal, (words, _, colour) in zip(difference.T, gap_style.OUTPUTS.values(), strict=False):
         below.plot(*outline(time_s, signal), color=colour, lw=1.0, label=words)
     title = f"{style.plain(names[0], 48)} minus {style.plain(names[1], 48)}"
     below.set_title(title, fontweight="normal", fontsize=9.5)

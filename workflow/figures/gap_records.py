@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from diagnosis.answer import Diagnosis
+from diagnosis.fit.residual import pooled_rms
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
@@ -19,19 +20,51 @@ _TRACE_BINS = 250  # a panel is some 400 pixels wide
 _MODES = 3
 
 
+@drawing("gap_measured")
+def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
+    """Held-out record with the largest gap, a column per output in its own unit; residuals below."""
+    case = found.case
+    worst = max(case.held_out, key=lambda e: pooled_rms(found.residuals_before[e.name]))
+    time = np.arange(len(worst.output), dtype=np.float64) * case.rig.sampling.dt_s
+    figure, grid = style.panels(
+        4.6, 2, len(case.outputs), sharex=True, squeeze=False, height_ratios=[1.6, 1.0]
+    )
+    for column, output in enumerate(case.outputs):
+        words, unit, _ = gap_style.OUTPUTS[output]
+        (above, below), measured = grid[:, column], worst.output[:, column]
+        above.plot(*outline(time, measured, _TRACE_BINS), **style.MEASURED_LINE, label="measured")
+        for model in dict.fromkeys(("stated", found.models[-1])):
+            look, name = gap_style.MODELS[model], gap_style.WORDS[model]
+            residual = found.residuals[model][worst.name][:, column] * case.noise[column]
+            above.plot(*outline(time, measured - residual, _TRACE_BINS), **look, label=name)
+            below.plot(*outline(time, residual, _TRACE_BINS), **look)
+        above.set(title=f"{style.plain(worst.name, 30)}: {words}", ylabel=f"{words} [{unit}]")
+        below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
+        above.margins(x=0.01)
+    return figure
+
+
 @drawing("gap_traces")
 def draw_residual_traces(found: Diagnosis) -> Figure:
-    """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise."""
+    """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise.
+
+    Beside a model error residuals are in per cent of the motion, and there is no band.
+    """
     case, models = found.case, dict.fromkeys(("stated", found.models[-1]))
     figure, grid = style.panels(
-        0.9 + 1.25 * len(case.experiments), len(case.experiments), 2, sharex="row", squeeze=False
+        0.9 + 1.25 * len(case.experiments),
+        len(case.experiments),
+        len(case.outputs),
+        sharex="row",
+        squeeze=False,
     )
     for row, experiment in zip(grid, case.experiments, strict=True):
         residuals = {model: found.residuals[model][experiment.name] for model in models}
         time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
         role = " (held out)" if experiment.role == "held_out" else ""
         for column, axes in enumerate(row):
-            axes.axhspan(-2, 2, **gap_style.NOISE_BAND)
+            if not case.model_error > 0:
+                axes.axhspan(-2, 2, **gap_style.NOISE_BAND)
             for model, e in residuals.items():
                 look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
                 axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])
@@ -39,9 +72,10 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
             reach = max(4.0, 1.05 * largest)
             axes.set_ylim(-reach, reach)
             axes.margins(x=0.01)
-            title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.SENSOR_WORDS[column]}"
+            title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.OUTPUTS[case.outputs[column]][0]}"
             axes.set_title(title, fontsize=9, fontweight="normal")
-        row[0].set_ylabel("residual\nover noise [1]", fontsize=8.5)
+        unit = "[% of motion]" if case.model_error > 0 else "over noise [1]"
+        row[0].set_ylabel(f"residual\n{unit}", fontsize=8.5)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
     return figure
@@ -53,11 +87,12 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
 
     The lowest flexible modes of the nominal rig are marked.
     """
-    dt_s = found.case.rig.sampling.dt_s
-    poles = linear_arm(found.case.rig).poles()
+    case = found.case
+    dt_s = case.rig.sampling.dt_s
+    poles = linear_arm(case.rig).poles()
     modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
     figure = style.new_figure(3.7)
-    panels = figure.subplots(1, 2, sharey=True)
+    panels = figure.subplots(1, len(case.outputs), sharey=True, squeeze=False)[0]
     for column, axes in enumerate(panels):
         for model in found.models:
             frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)
@@ -68,7 +103,9 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
                 style.tag_below(axes, mode, f"mode {number}")
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.1), max(high, 10.0))
-        axes.set(xlabel="frequency [Hz]", title=f"Residual of the {gap_style.SENSOR_WORDS[column]}")
+        axes.set(
+            xlabel="frequency [Hz]", title=f"Residual of the {gap_style.OUTPUTS[case.outputs[column]][0]}"
+        )
     panels[0].set_ylabel("power over that of the noise [1]")
     return figure
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from diagnosis.machine.flexible_arm import Output
 from workflow.figures import style
 
 # The three models a gap is measured against, in the order of the waterfall, each with a line style.
@@ -20,8 +21,21 @@ WORDS: Mapping[str, str] = {
     "repaired": "effects added",
 }
 RESIDUAL_AXIS = "residual over noise, RMS [1]"
+SHARE_AXIS = "residual, RMS [% of the motion]"
+UNINTERESTING = "stated not to interest"
 NOISE_BAND = {"color": "#e6e6e6", "lw": 0, "label": "2 standard deviations of the sensor noise"}
-SENSOR_WORDS = ("hub angle", "tip position")
-SENSOR_COLOURS = (style.UNCERTAIN, style.HIGHLIGHT)
+# What is measured: words, unit, colour.
+OUTPUTS: Mapping[Output, tuple[str, str, str]] = {
+    "hub_angle_rad": ("hub angle", "rad", style.UNCERTAIN),
+    "tip_m": ("tip position", "m", style.HIGHLIGHT),
+    "tip_acceleration_m_s2": ("tip acceleration", "m/s²", style.PREDICTED),
+}
+
+
+def floor_of(model_error: float) -> dict[str, Any]:
+    """Look of the line below which no gap is: sensor noise, or what a good model may miss."""
+    return {**FLOOR, "label": UNINTERESTING} if model_error > 0 else FLOOR
+
+
 # Of a share or probability bar that is not the first answer.
 PALE = "#b9c2cc"

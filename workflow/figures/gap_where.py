@@ -9,10 +9,9 @@ from diagnosis.where.findings import SENSORS, RegimeBin, Where
 from workflow.figures import gap_style, style
 from workflow.figures.registry import drawing
 
-_LOOKS = dict(zip(SENSORS, zip(gap_style.SENSOR_WORDS, gap_style.SENSOR_COLOURS, strict=True), strict=True))
+_LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
 _MOST_REGIMES = 6
 _FEW_BINS = 2
-_GAP_AXIS = "gap over noise, RMS [1]"
 _SMALLEST = 0.05  # noise deviations; less is drawn there
 _WHISKER = {"color": "#444444", "lw": 1.0}
 _REGIMES = {
@@ -27,41 +26,49 @@ _REGIMES = {
 _ROUTES = {"hub_torque": "torque on the hub", "hub_angle": "hub angle reading", "tip": "tip reading"}
 
 
-@drawing("gap_bands")
-def draw_bands_and_experiments(where: Where) -> Figure:
-    """Size of the gap, noise taken off, with 95 % intervals: by band and sensor, by experiment and sensor.
+def _size(model_error: float) -> tuple[float, str]:
+    """Factor and words of a gap that `where` found: over the noise, or in per cent of the motion."""
+    return (
+        (100 * model_error, "gap [% of the motion]") if model_error > 0 else (1.0, "gap over noise, RMS [1]")
+    )
 
-    Parts in which nothing is found beyond chance are drawn pale. The frequency panel ends at 0.05 noise
-    deviations; less is drawn at its edge.
+
+@drawing("gap_bands")
+def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure:
+    """Size of the gap, noise (or what a model may miss) taken off: by band and experiment, of every sensor.
+
+    With 95 % intervals. Parts in which nothing is found beyond chance are drawn pale. The frequency panel
+    ends at 0.05 noise deviations; less is drawn at its edge.
     """
-    experiments = where.experiments
+    experiments, (factor, words) = where.experiments, _size(model_error)
     figure, (left, right) = style.panels(
         max(3.7, 1.7 + 0.36 * len(experiments)), 1, 2, width_ratios=[1.25, 1.0]
     )
-    for sensor, shift in zip(SENSORS, (0.97, 1.03), strict=True):
+    sensors = [one.sensor for one in where.sensors]
+    for sensor, shift in zip(sensors, (0.97, 1.03), strict=False):
         name, colour = _LOOKS[sensor]
         for band in (band for band in where.bands if band.sensor == sensor):
             middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
             left.plot(
                 [band.low_Hz, band.high_Hz],
-                [max(band.gap.gap_rms, _SMALLEST)] * 2,
+                [factor * max(band.gap.gap_rms, _SMALLEST)] * 2,
                 color=colour,
                 alpha=1.0 if band.gap.found else 0.35,
                 lw=4.0,
                 solid_capstyle="butt",
             )
-            left.plot([middle, middle], np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
+            left.plot([middle, middle], factor * np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
-    left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=_GAP_AXIS)
-    left.set_ylim(bottom=_SMALLEST)
+    left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
+    left.set_ylim(bottom=factor * _SMALLEST)
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
-        for sensor, part, offset in zip(SENSORS, entry.sensors, (-0.15, 0.15), strict=True):
+        for sensor, part, offset in zip(sensors, entry.sensors, (-0.15, 0.15), strict=False):
             pale = 1.0 if part.found else 0.35
-            right.barh(row + offset, part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
-            right.plot(part.interval, [row + offset] * 2, **_WHISKER)
+            right.barh(row + offset, factor * part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
+            right.plot(factor * np.array(part.interval), [row + offset] * 2, **_WHISKER)
     right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=_GAP_AXIS)
+    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=words)
     right.set_title("By experiment and sensor")
     right.grid(visible=False, axis="y")
     left.plot([], [], **_WHISKER, label="95 % interval")
@@ -69,11 +76,12 @@ def draw_bands_and_experiments(where: Where) -> Figure:
 
 
 @drawing("gap_regimes")
-def draw_regimes(where: Where) -> Figure | None:
+def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
     """Residual energy over a regime variable where it depends on it, with what chance would give."""
     findings = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
     if not findings:
         return None
+    floor = "what does\nnot interest" if model_error > 0 else "the noise"
     figure, panels = style.small_multiples(len(findings), min(3, max(2, len(findings))), 2.6, 0.9)
     for axes, finding in zip(panels, findings, strict=True):
         at, count = np.arange(len(finding.bins)), len(finding.bins)
@@ -83,11 +91,11 @@ def draw_regimes(where: Where) -> Figure | None:
         name, colour = _LOOKS[finding.sensor]
         axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
         axes.set_xticks(at, [_bin_words(one, count) for one in finding.bins], fontsize=8)
-        axes.axhline(1.0, **gap_style.FLOOR)
+        axes.axhline(1.0, **gap_style.floor_of(model_error))
         axes.set_ylim(bottom=0)
         axes.grid(visible=False, axis="x")
         axes.set_xlabel(_with_unit(_REGIMES[finding.axis], finding.unit))
-        axes.set_ylabel("residual energy\nover that of the noise [1]")
+        axes.set_ylabel(f"residual energy\nover that of {floor} [1]")
         axes.set_title(name, fontsize=9.5, fontweight="normal")
     return figure
 
