@@ -27,7 +27,7 @@ _PRIOR_COUNT = {0: 0.2, 1: 0.35, 2: 0.3, 3: 0.15}
 # An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
 _INTERESTS, _INTERESTS_WIDTH = 1.15, 0.06
 # A wrong stated value interests from this many tolerances on.
-_FAR_OFF, _FAR_OFF_WIDTH = 3.8, 0.12
+_FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.5, 0.5
@@ -166,7 +166,7 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
     moved = stated * np.exp(tolerance * deviation)
     size = next(iter(end.effects[k].parameters().values()))
     moved = moved * size if kind.multiplies else moved + size
-    return abs(float(np.log(moved / stated))) / tolerance
+    return abs(float(moved / stated) - 1) / tolerance
 
 
 def _remaining(explanation: Explanation, model_error: float) -> tuple[float, float]:
