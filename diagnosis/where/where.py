@@ -55,11 +55,16 @@ def where(
     moved, sensors = motions(case, residuals), sensors_of(case)
     e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
     squares = Energy(sum(float(np.sum(v**2)) for v in e.values()), sum(v.size for v in e.values()))
+    by_sensor, bands = sensor_gaps(e, sensors, level), band_gaps(e, sensors, case.rig.sampling.dt_s, level)
+    if case.model_error > 0:
+        # What a model may miss is stated for all frequencies together, not for each of them.
+        quiet = [s.sensor for s in by_sensor if not s.gap.found]
+        bands = tuple(replace(b, gap=replace(b.gap, found=False)) if b.sensor in quiet else b for b in bands)
     return Where(
         gap=part_gap(squares, squares, level),
-        sensors=sensor_gaps(e, sensors, level),
+        sensors=by_sensor,
         experiments=experiment_gaps(e, level),
-        bands=band_gaps(e, sensors, case.rig.sampling.dt_s, level),
+        bands=bands,
         regimes=regime_findings(e, sensors, regime_axes(moved), level, rng),
         drift=drift_findings(case, e, level),
         common=common_findings(case, e, level),

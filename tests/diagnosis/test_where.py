@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.fft import dct
@@ -346,6 +348,26 @@ def test_recorded_disturbance_comes_with_the_clock(gap_cases):
     found = _recorded(gap_cases, "periodic_disturbance")
     assert all(c.found for c in found.common)
     assert len(found.common_found) == 2
+
+
+def test_beside_a_model_error_sizes_are_over_what_a_model_may_miss():
+    """Three times as much missed as allowed, wherever a record starts and with the hub angle alone."""
+    error, case = 0.05, made(white(np.random.default_rng(3)))
+    experiments = tuple(
+        replace(e, outputs=("hub_angle_rad",), output=e.output[:, :1] + 2.0) for e in case.experiments
+    )
+    case = replace(case, experiments=experiments, model_error=error)
+    (held,) = case.held_out
+    size = 3 * error * np.std(held.output) / NOISE[0]
+    tone = {
+        e.name: np.sqrt(2) * size * np.sin(2 * np.pi * 5 * DT * np.arange(len(e.output))) for e in experiments
+    }
+    found = where(case, {name: e[:, None] for name, e in tone.items()})
+    assert found.gap.gap_rms == pytest.approx(np.sqrt(3**2 - 1), rel=0.01)
+    assert {c.route for c in found.curves} == {"hub_torque", "hub_angle"}
+    assert "deflection" not in {r.axis for r in found.regimes}
+    assert found.dominant_sensor is None
+    assert not where(case, {name: e[:, None] / 4 for name, e in tone.items()}).is_gap
 
 
 def test_more_noise_than_stated_is_called_that():

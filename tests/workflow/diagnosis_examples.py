@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.answer import Diagnosis, NamedEffect
+from diagnosis.answer import Diagnosis, NamedEffect, Shares
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
@@ -140,8 +140,15 @@ class KnownAnswer(Engine):
             residuals_after=after,
             simulations=model.simulations,
             unlisted=self.unlisted,
-            competing=self._competing(case, effects, sure),
+            competing=() if case.model_error else self._competing(case, effects, sure),
+            shares=self._shares(case, names) if case.model_error else None,
         )
+
+    def _shares(self, case: Case, names: list[str]) -> Shares:
+        outputs = case.outputs
+        closes = ((("backlash",), 0.62), (("coulomb_friction", "backlash"), 0.4), (("gravity",), -0.3))
+        carried = dict.fromkeys(names, (0.9, 0.8, 0.95))
+        return Shares(outputs, (0.3,) * len(outputs), (0.1,) * len(outputs), 0.06, carried, (), closes, ())
 
     def _competing(
         self, case: Case, effects: tuple[Effect, ...], sure: float

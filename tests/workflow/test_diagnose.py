@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import time
 import tomllib
 from functools import partial
@@ -172,6 +173,49 @@ def test_what_was_suspected_is_spoken_of(tmp_path, undrawn):
     assert "Asked about: backlash in the gear has probability under 0.1 %." in html
     assert "dry (Coulomb) friction has probability 96 % and is part of the answer" in html
     assert json.loads(files["arm.json"])["suspected"] == {"backlash": 0.0, "coulomb_friction": 0.96}
+
+
+@pytest.mark.parametrize(
+    ("engine", "words"),
+    [
+        (
+            KnownAnswer((FRICTION,), ambiguous=("backlash",)),
+            ("Put these numbers into your model: arm.rig.toml", "hold the motor shaft", "80 % to 95 %"),
+        ),
+        (
+            KnownAnswer((), "unknown", "unknown"),
+            ("Partial answers, each by itself: backlash in the gear closes 62 % of the held-out gap",),
+        ),
+        (KnownAnswer((), "none", "none"), ("No gap that interests:", "near the 5 %")),
+    ],
+    ids=["effect", "unknown", "none"],
+)
+def test_beside_a_model_error_a_hub_angle_is_enough(folder, tmp_path, engine, words, undrawn):
+    case = tmp_path / "arm"
+    shutil.copytree(folder, case)
+    text = (case / "case.toml").read_text()
+    (case / "case.toml").write_text('outputs = ["hub_angle_rad"]\nmodel_error = 0.05\n' + text)
+    files = made(case, engine, rig="rig_uncertain.toml")
+    html = re.sub("<[^>]*>", "", files["arm.html"].decode())
+    for one in words:
+        assert one in html
+    # One meaning of the gap: per cent of the motion, computed here without the diagnosis.
+    loaded = load_case(case).case
+    (held,) = loaded.held_out
+    missed = held.output[:, 0] - simulate(loaded.rig, held.voltage_V).hub_angle_rad
+    percent = 100 * pooled_rms(missed) / np.std(held.output[:, 0])
+    assert f"the model misses {percent:.3g} % of the motion" in html
+    assert "times the sensor noise" not in html
+    assert "gravity" not in html.split("Partial answers")[-1].split("None of them")[0]
+    document = json.loads(files["arm.json"])
+    assert document["shares"]["closes"][0] == [["backlash"], 0.62]
+    assert [s["sensor"] for s in document["where"]["sensors"]] == ["hub_angle"]
+    assert Rig.from_toml(_written(tmp_path / "rig.toml", files["arm.rig.toml"]))
+
+
+def _written(path, content):
+    path.write_bytes(content)
+    return path
 
 
 # Several cases
