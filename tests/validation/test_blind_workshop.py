@@ -148,7 +148,7 @@ def test_a_schedule_has_the_shares_and_no_effect_its_sensors_cannot_show():
 
 @pytest.mark.slow
 def test_generated_cases_load_and_hold_what_their_answers_say(tmp_path):
-    answers = generate(4, 3, tmp_path, open_cases=True, workshop=True)
+    answers = generate(5, 3, tmp_path, open_cases=True, workshop=True)
     assert {a["verdict"] for a in answers} == {"none", "effect", "unknown"}
     for answer in answers:
         case = load_case(tmp_path / answer["case"]).case
@@ -159,10 +159,11 @@ def test_generated_cases_load_and_hold_what_their_answers_say(tmp_path):
             assert answer["true_rig"][section][name] / case.rig.value(key) - 1 == pytest.approx(
                 relative, abs=1e-4
             )
-        shares = [part["background_share_of_motion"] for part in answer["rms_held_out"].values()]
-        assert 0.005 < np.mean(shares) < 0.09
         gaps = answer["pooled_gap"]
         if answer["verdict"] == "none":
+            # Wanted 2 to 3.5 %; the controller's encoder and noise are in the records, not in the sizing.
+            shares = [part["background_share_of_motion"] for part in answer["rms_held_out"].values()]
+            assert 0.015 < np.sqrt(np.mean(np.square(shares))) < 0.05
             assert gaps["held_out_gap_before"] < 2 * gaps["held_out_gap_after_oracle"]
         else:
             assert answer["major_over_background_realised"] >= 2
