@@ -32,7 +32,8 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
     for column, output in enumerate(case.outputs):
         words, unit, _ = gap_style.OUTPUTS[output]
         (above, below), measured = grid[:, column], worst.output[:, column]
-        above.plot(*outline(time, measured, _TRACE_BINS), **style.MEASURED_LINE, label="measured")
+        # Broad and pale: a model that fits lies on top of it.
+        above.plot(*outline(time, measured, _TRACE_BINS), color=gap_style.PALE, lw=3.0, label="measured")
         for model in dict.fromkeys(("stated", found.models[-1])):
             look, name = gap_style.MODELS[model], gap_style.WORDS[model]
             residual = found.residuals[model][worst.name][:, column] * case.noise[column]

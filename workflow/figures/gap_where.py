@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from diagnosis.where.findings import SENSORS, RegimeBin, Where
+from diagnosis.where.findings import SENSORS, BandGap, RegimeBin, Where
 from workflow.figures import gap_style, style
+from workflow.figures.bands import Real
 from workflow.figures.registry import drawing
 
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
@@ -33,6 +34,15 @@ def _size(model_error: float) -> tuple[float, str]:
     )
 
 
+def _of_band(where: Where, band: BandGap, model_error: float) -> tuple[float, Real]:
+    """Size and interval to draw: over the noise per line, or what the band has of its sensor's per cent."""
+    if not model_error > 0:
+        return band.gap.gap_rms, np.array(band.gap.interval)
+    whole = 100 * model_error * where.gap.gap_rms * np.sqrt(len(where.sensors))
+    share, *ends = np.sqrt(np.maximum([band.gap.share, *band.gap.share_interval], 0.0)) * whole
+    return float(share), np.array(ends)
+
+
 @drawing("gap_bands")
 def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure:
     """Size of the gap, noise (or what a model may miss) taken off: by band and experiment, of every sensor.
@@ -49,15 +59,16 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
         name, colour = _LOOKS[sensor]
         for band in (band for band in where.bands if band.sensor == sensor):
             middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
+            size, interval = _of_band(where, band, model_error)
             left.plot(
                 [band.low_Hz, band.high_Hz],
-                [factor * max(band.gap.gap_rms, _SMALLEST)] * 2,
+                [max(size, factor * _SMALLEST)] * 2,
                 color=colour,
                 alpha=1.0 if band.gap.found else 0.35,
                 lw=4.0,
                 solid_capstyle="butt",
             )
-            left.plot([middle, middle], factor * np.maximum(band.gap.interval, _SMALLEST), **_WHISKER)
+            left.plot([middle, middle], np.maximum(interval, factor * _SMALLEST), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
     left.set_ylim(bottom=factor * _SMALLEST)
