@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,6 +18,10 @@ DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", 
 Model = Literal["stated", "refit", "repaired"]
 
 NOISE_FLOOR = 1.0
+# A nominal parameter that has to be off by more tolerances than this is significant by itself.
+FAR_OFF = 3.0
+# Below this probability of the first answer, or with another one above that, the answer is called ambiguous.
+SURE, POSSIBLE = 0.8, 0.05
 # Of the bootstrap of the share closed: draws, samples of a block.
 _BLOCKS, _BLOCK = 2000, 50
 
@@ -48,7 +53,7 @@ class Shares:
 
     names : of the outputs. before, after : RMS left beyond sensor noise over that of the motion, per output:
         nominal values re-estimated, effects added. interests : share of the motion from which on a gap does.
-    carried : effect -> (share of the gap's energy over noise that it closes, whatever the order in which
+    carried : effect -> (share of the gap's energy beyond noise that it closes, whatever the order in which
         effects are added, with its 95 % interval).
     small : effects in the repaired model that carry less than what interests.
     closes : (effects, share of the gap closed by them alone), most first; also where the answer is unknown.
@@ -180,6 +185,19 @@ class Diagnosis:
         after = {name: pooled_rms(e) for name, e in self.residuals_after.items()}
         name = max(after, key=after.__getitem__)
         return name, after[name]
+
+
+def best_first(
+    entries: Sequence[NamedEffect], answer: str, accepted: Sequence[str]
+) -> tuple[NamedEffect, ...]:
+    """The answer and what is accepted first, then by presence; none and unknown last unless they are it."""
+    order = {answer: -1, **{name: k for k, name in enumerate(accepted)}}
+    last = {"none", "unknown"} - {answer}
+
+    def place(e: NamedEffect) -> tuple[bool, int, float, float]:
+        return e.name in last, order.get(e.name, len(order)), -e.presence, -e.probability
+
+    return tuple(sorted(entries, key=place))
 
 
 def held_out_gap(case: CaseOfMachine, residuals: dict[str, Real]) -> float:

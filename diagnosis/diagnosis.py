@@ -7,11 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from diagnosis.answer import (
+    FAR_OFF,
     NOISE_FLOOR,
+    POSSIBLE,
+    SURE,
     DetailVerdict,
     Diagnosis,
     NamedEffect,
     Verdict,
+    best_first,
     held_out_gap,
     share_closed,
 )
@@ -20,6 +24,7 @@ from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilitie
 from diagnosis.evidence.look_alikes import look_alikes
 from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit
+from diagnosis.fit.intervals import parameter_intervals
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.imperfect.answered import beside_imperfections
 from diagnosis.machine.case import Case
@@ -33,10 +38,6 @@ from diagnosis.next_experiment.discrimination import (
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
-# A nominal parameter that has to be off by more tolerances than this is significant by itself.
-FAR_OFF = 3.0
-# Below this probability of the first answer, or with another one above that, the answer is called ambiguous.
-_SURE, _POSSIBLE = 0.8, 0.05
 # At most so many explanations are told apart by the next experiment.
 _MOST_COMPETING = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
@@ -129,7 +130,7 @@ def _to_part(
         return competing
     likeliest = max(alike, key=lambda h: h.unknown_weight)
     imitated = [LOOK_ALIKES[n].look_alike_of for n in likeliest.names if n in LOOK_ALIKES]
-    if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < _POSSIBLE:
+    if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < POSSIBLE:
         return competing
     double = competing_hypothesis(case, likeliest.fit, weighed.cause["unknown"])
     return tuple(sorted((*competing, double), key=lambda hypothesis: -hypothesis.probability))[
@@ -159,8 +160,8 @@ def _detail(verdict: Verdict, weighed: Probabilities, competing: Sequence[str], 
     if verdict == "none":
         return "parametric" if far else "none"
     shares = {**weighed.presence, **{name: weighed.cause[name] for name in ("none", "unknown")}}
-    likely = any(shares[name] >= _POSSIBLE for name in competing)
-    return "ambiguous" if weighed.cause[weighed.answer] < _SURE or likely else "effect"
+    likely = any(shares[name] >= POSSIBLE for name in competing)
+    return "ambiguous" if weighed.cause[weighed.answer] < SURE or likely else "effect"
 
 
 def _competing(
@@ -178,7 +179,7 @@ def _competing(
     share = {name: p for name, p in weighed.presence.items() if name not in together}
     share |= {name: weighed.cause[name] for name in ("none", "unknown")}
     share.pop(answer, None)
-    likely = [name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _POSSIBLE]
+    likely = [name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= POSSIBLE]
     if accepted.names and answer != "unknown":
         for h in sorted(hypotheses, key=lambda h: h.fit.cost):
             if len(h.names) == len(accepted.names) and h.fit.cost <= accepted.fit.cost + _AS_GOOD:
@@ -223,14 +224,7 @@ def _named(
         NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
         for name in ("none", "unknown")
     ]
-    order = {weighed.answer: -1, **{name: k for k, name in enumerate(together)}}
-    last_ones = {"none", "unknown"} - {weighed.answer}
-    return tuple(
-        sorted(
-            entries,
-            key=lambda e: (e.name in last_ones, order.get(e.name, len(order)), -e.presence, -e.probability),
-        )
-    )
+    return best_first(entries, weighed.answer, together)
 
 
 def _intervals(
@@ -246,21 +240,7 @@ def _intervals(
     covariance = (
         end.covariance()[rows, rows] * max(1.0, end.rms**2) * _solver_variance(end, samples_per_record)
     )
-    x = end.coordinates[k]
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    low, high = candidate.box
-    draws = np.clip(x + rng.standard_normal((_DRAWS, x.size)) @ root.T, low, high)
-    found = {}
-    centre = candidate.parameters(x)
-    sampled = [candidate.parameters(draw) for draw in draws]
-    for key, value in centre.items():
-        spread = np.array([p[key] for p in sampled]) - value
-        if key == "phase_rad":
-            spread = np.mod(spread + np.pi, 2 * np.pi) - np.pi
-        below, above = np.quantile(spread, [0.025, 0.975])
-        found[key] = (float(value + below), float(value + above))
-    return found
+    return parameter_intervals(candidate, end.coordinates[k], covariance, rng, _DRAWS)
 
 
 def _solver_variance(end: Fit, samples_per_record: float) -> float:

@@ -7,16 +7,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diagnosis.answer import DetailVerdict, Diagnosis, NamedEffect, Verdict, held_out_gap, share_closed
+from diagnosis.answer import (
+    FAR_OFF,
+    NOISE_FLOOR,
+    POSSIBLE,
+    SURE,
+    DetailVerdict,
+    Diagnosis,
+    NamedEffect,
+    Verdict,
+    best_first,
+    held_out_gap,
+    share_closed,
+)
+from diagnosis.fit.intervals import parameter_intervals
 from diagnosis.imperfect import verdict as judging
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent, normal_equations
+from diagnosis.imperfect.descent import Descent
 from diagnosis.imperfect.search import Explanation, Progress, Search
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 
-_SURE, _POSSIBLE, _FAR_OFF = 0.8, 0.05, 3.0
 _DRAWS = 1000
-_FLOOR = 1.0
 # Small effects stay in the repaired model from this share of the model error on.
 _LEAST_KEPT = 0.3
 
@@ -39,7 +50,7 @@ def beside_imperfections(
         accepted = search.finished(search.by_these(kept, whole.explanation))
     before = _whitened(case, search.stated())
     moved, after = _whitened(case, refit), _whitened(case, accepted)
-    closed, interval = share_closed(case, moved, after, rng, _FLOOR)
+    closed, interval = share_closed(case, moved, after, rng, NOISE_FLOOR)
     named: dict[str, Verdict] = {"none": "none", "unknown": "unknown"}
     kind = named.get(found.answer, "effect")
     ambiguous = _ambiguous(found)
@@ -56,7 +67,7 @@ def beside_imperfections(
         gap_before=held_out_gap(case, before),
         gap_refit=held_out_gap(case, moved),
         gap_after=held_out_gap(case, after),
-        noise_floor=_FLOOR,
+        noise_floor=NOISE_FLOOR,
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(keys, map(float, accepted.end.deviations), strict=True)),
@@ -82,7 +93,7 @@ def _ambiguous(found: judging.Verdict) -> tuple[str, ...]:
     share = {name: p for name, p in weighed.presence.items() if name not in found.accepted}
     share |= {name: weighed.cause[name] for name in ("none", "unknown")}
     share.pop(found.answer, None)
-    return tuple(name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= _POSSIBLE)
+    return tuple(name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= POSSIBLE)
 
 
 def _detail(
@@ -91,9 +102,9 @@ def _detail(
     if kind == "unknown":
         return "unknown"
     if kind == "none":
-        far = np.max(np.abs(accepted.end.deviations), initial=0.0) > _FAR_OFF
+        far = np.max(np.abs(accepted.end.deviations), initial=0.0) > FAR_OFF
         return "parametric" if far else "none"
-    return "ambiguous" if found.probabilities.cause[found.answer] < _SURE or ambiguous else "effect"
+    return "ambiguous" if found.probabilities.cause[found.answer] < SURE or ambiguous else "effect"
 
 
 def _named(
@@ -121,9 +132,7 @@ def _named(
         )
     for name in ("none", "unknown"):
         entries.append(NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan")))
-    order = {found.answer: -1, **{name: k for k, name in enumerate(found.accepted)}}
-    last = {"none", "unknown"} - {found.answer}
-    return tuple(sorted(entries, key=lambda e: (e.name in last, order.get(e.name, len(order)), -e.presence)))
+    return best_first(entries, found.answer, found.accepted)
 
 
 def _intervals(
@@ -131,22 +140,8 @@ def _intervals(
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of the parameters of the k-th effect, from Gaussian draws of its coordinates."""
     records, candidate = search.records, end.candidates[k]
-    weights = records.levels.weights(end.left)
-    equations = normal_equations(
-        records, weights, end.jacobian, end.columns, end.deviations, end.start, end.left
-    )
     first = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(first, first + len(candidate.axes))
-    covariance = np.linalg.pinv(equations.hessian, hermitian=True)[rows, rows] * judging.TEMPER
-    values, vectors = np.linalg.eigh(covariance)
-    x = end.coordinates_of(k)
-    draws = x + rng.standard_normal((_DRAWS, x.size)) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    sampled = [candidate.parameters(draw) for draw in np.clip(draws, *candidate.box)]
-    found = {}
-    for key, value in candidate.parameters(x).items():
-        spread = np.array([p[key] for p in sampled]) - value
-        if key == "phase_rad":
-            spread = np.mod(spread + np.pi, 2 * np.pi) - np.pi
-        low, high = np.quantile(spread, [0.025, 0.975])
-        found[key] = (float(value + low), float(value + high))
-    return found
+    inverse = np.asarray(np.linalg.pinv(end.equations(records).hessian, hermitian=True), dtype=np.float64)
+    covariance = judging.TEMPER * inverse[rows, rows]
+    return parameter_intervals(candidate, end.coordinates_of(k), covariance, rng, _DRAWS)

@@ -57,6 +57,18 @@ class Descent:
         first = sum(len(c.axes) for c in self.candidates[:k])
         return self.coordinates[first : first + len(self.candidates[k].axes)]
 
+    def equations(self, records: Records, start: Start | None = None, e: Real | None = None) -> Normal:
+        """Normal equations at the end, or of other coefficients e (N,) and start in its linearisation."""
+        return normal_equations(
+            records,
+            records.levels.weights(self.left),
+            self.jacobian,
+            self.columns,
+            self.deviations,
+            self.start if start is None else start,
+            self.left if e is None else e,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Normal:
@@ -173,22 +185,11 @@ def descend(
     return Descent(tuple(candidates), d, x, start, e, jacobian, columns, loss, prior, converged)
 
 
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """A point after deviations, sizes of the effects, zeros and states have followed linearly: loss, d, x."""
-
-    loss: float
-    deviations: Real
-    coordinates: Real
-
-
-def follow(records: Records, around: Descent, e: Real, start: Start) -> Followed:
-    """What the loss of coefficients e (N,) becomes once everything that `around` holds has followed."""
+def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[float, Real]:
+    """What the loss of coefficients e (N,) becomes, and where the deviations go, once everything that
+    `around` holds has followed linearly."""
     P = around.deviations.size
-    weights = records.levels.weights(around.left)
-    equations = normal_equations(
-        records, weights, around.jacobian, around.columns, around.deviations, start, e
-    )
+    equations = around.equations(records, start, e)
     H = equations.hessian + np.diag(1e-9 * np.diag(equations.hessian) + 1e-12)
     step = np.asarray(-np.linalg.solve(H, equations.gradient), dtype=np.float64)
     step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
@@ -199,20 +200,12 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> Followed
     for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
         moved[part] += own @ step[first + r * S : first + (r + 1) * S]
     loss, _ = loss_at(records, moved, d, start2)
-    return Followed(loss, np.clip(d, -FARTHEST, FARTHEST), around.coordinates)
+    return loss, np.clip(d, -FARTHEST, FARTHEST)
 
 
 def occam(records: Records, end: Descent) -> float:
     """log of the prior density of the effects' coordinates times the volume that the records leave them."""
-    equations = normal_equations(
-        records,
-        records.levels.weights(end.left),
-        end.jacobian,
-        end.columns,
-        end.deviations,
-        end.start,
-        end.left,
-    )
+    equations = end.equations(records)
     # What the records say nothing about keeps the width of its range.
     low, high = box(end.candidates)
     width = np.where(np.isfinite(high - low), high - low, 2 * np.pi)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.linalg import cho_factor, cho_solve
 
-from diagnosis.imperfect.descent import Descent, follow, normal_equations
+from diagnosis.imperfect.descent import Descent, follow
 from diagnosis.imperfect.levels import coefficients
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.machine.machine_protocol import Real
@@ -68,8 +68,8 @@ def point_at(records: Records, around: Descent, candidate: Candidate, x: Real, s
     e = records.coefficients(around.deviations, effects, start)
     if not np.all(np.isfinite(e)):
         return None
-    followed = follow(records, around, e, start)
-    return Point(followed.loss, x, followed.deviations, start)
+    loss, deviations = follow(records, around, e, start)
+    return Point(loss, x, deviations, start)
 
 
 def _turned(records: Records, start: Start, candidate: Candidate) -> list[Start]:
@@ -95,9 +95,7 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
     size = next_fast_len(2 * longest, real=True)
     transfer = np.fft.rfft(response, size, axis=0)
     weights = records.levels.weights(around.left)
-    equations = normal_equations(
-        records, weights, around.jacobian, around.columns, around.deviations, around.start, around.left
-    )
+    equations = around.equations(records)
     H, g = equations.hessian, equations.gradient
     factor = cho_factor(H + np.diag(1e-9 * np.diag(H) + 1e-12))
     shared = np.column_stack([around.jacobian, around.columns.zeros])

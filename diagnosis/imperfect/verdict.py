@@ -58,12 +58,6 @@ class Judged:
     score: float
     complete: float
 
-    @property
-    def major(self) -> tuple[str, ...]:
-        """Effects that matter, the one that carries most first."""
-        parts = sorted(self.parts, key=lambda part: -part.share)
-        return tuple(part.name for part in parts if part.matters > 0.5)
-
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
