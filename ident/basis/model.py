@@ -13,6 +13,9 @@ from ident.basis.poles import Poles
 from ident.basis.structure import filter_input
 from ident.data.arrays import ComplexArray, RealArray, lock
 
+# Each is a state; a file that says more is damaged, and would fill the memory.
+_MOST_STAGES = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class GobfModel:
@@ -49,9 +52,9 @@ class GobfModel:
             raise ValueError("the coefficients and the direct term must be finite")
         if not (np.isfinite(self.dt_s) and self.dt_s > 0):
             raise ValueError(f"dt_s must be positive; got {self.dt_s}")
-        if not (self.integrators >= 0 and self.input_delay_samples >= 0):
+        if not all(0 <= n <= _MOST_STAGES for n in (self.integrators, self.input_delay_samples)):
             raise ValueError(
-                "integrators and input_delay_samples must not be negative; "
+                f"integrators and input_delay_samples must not be negative, nor above {_MOST_STAGES}; "
                 f"got {self.integrators} and {self.input_delay_samples}"
             )
 

@@ -88,13 +88,7 @@ class ModelFile:
     @classmethod
     def from_mat(cls, content: bytes, source: str = "model file") -> ModelFile:
         """Inverse of `to_mat`. ValueError: one line that begins with `source`."""
-        raw = mat_variables(content, source)
-        document: dict[str, Any] = {name: _plain(value) for name, value in raw.items()}
-        if "ellipses" in raw:
-            struct = raw["ellipses"]
-            if struct.dtype.names is None or struct.size != 1:
-                raise ValueError(f"{source}: 'ellipses' is not a struct; expected the one that was written")
-            document["ellipses"] = {name: _plain(struct[name].item()) for name in struct.dtype.names}
+        document: dict[str, Any] = _plain(mat_variables(content, source))
         return _read(document, source)
 
 
@@ -106,11 +100,10 @@ def _as_lists(array: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A MATLAB variable as it would stand in JSON: text, a number, or an array."""
-    array = np.asarray(value)
-    if array.dtype.kind == "U":
-        return "".join(array.ravel().tolist())
-    return array.item() if array.shape == (1, 1) and array.dtype.kind in "fiub" else array
+    """A MATLAB variable as it would stand in JSON: text, a number, an array, or fields."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
 
 
 def _read(document: Mapping[str, Any], source: str) -> ModelFile:
@@ -130,10 +123,9 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
             stated = np.asarray(_array(document, name), dtype=np.float64)
             scale = 1.0 + np.abs(computed).max(initial=0.0)
             same_size = stated.size == computed.size  # of an empty matrix neither format keeps the shape
-            if not (
-                same_size
-                and np.all(np.abs(stated.reshape(computed.shape) - computed) <= _STATE_TOLERANCE * scale)
-            ):
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is not the same either
+                off = np.abs(stated.reshape(computed.shape) - computed) if same_size else np.inf
+            if not np.all(off <= _STATE_TOLERANCE * scale):
                 raise ValueError(
                     f"'{name}' is not the state matrix of these poles and coefficients; change the poles and "
                     "coefficients, and write the file anew"
@@ -205,9 +197,6 @@ def _count(document: Mapping[str, Any], name: str) -> int:
 
 def _text(document: Mapping[str, Any], name: str) -> str:
     value = _field(document, name)
-    # MATLAB has no empty string but an empty array.
-    if isinstance(value, np.ndarray) and value.size == 0:
-        return ""
     if not isinstance(value, str):
         raise ValueError(f"the field '{name}' must be text")
     return value

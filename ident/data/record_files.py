@@ -6,7 +6,6 @@ Every complaint is one line that names file, place and expectation.
 from __future__ import annotations
 
 import re
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -17,7 +16,9 @@ import numpy as np
 import pandas as pd
 
 from ident.data.arrays import RealArray
+from ident.data.foreign_files import as_numbers, content_of, shown
 from ident.data.mat_files import mat_variables
+from ident.data.npz_files import npz_arrays
 from ident.data.units import TimeColumn
 
 # Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
@@ -71,9 +72,10 @@ class Table:
         column = self.raw[name]
         if isinstance(column, pd.Series):
             return self._finite(name, pd.to_numeric(column, errors="coerce").to_numpy(np.float64), column)
-        values = np.asarray(column)
-        if values.dtype.kind not in "fiub":
-            raise ValueError(f"{self.path}: column '{name}' holds {values.dtype}; expected real numbers")
+        try:
+            values = as_numbers(column)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: column '{shown(name)}' {error}") from None
         # MATLAB has no 1-d arrays: (T, 1) and (1, T) are its vectors.
         if values.ndim == 2 and 1 in values.shape:
             values = values.ravel()
@@ -228,29 +230,17 @@ def _read_csv(file: Path, separator: str = ",") -> Table:
 @reads(".npz")
 def _read_npz(file: Path) -> Table:
     """A numpy archive of named vectors; object arrays (pickles) are refused."""
-    raw: dict[str, Any] = {}
     try:
-        archive = np.load(file, allow_pickle=False)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
-        archive = None
-    if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise ValueError(f"{file}: not a numpy .npz archive")
-    with archive:
-        for name in archive.files:
-            try:
-                raw[name] = archive[name]
-            except ValueError:
-                what = f"'{name}' holds Python objects; expected arrays of numbers"
-                raise ValueError(f"{file}: {what}") from None
-            except (OSError, EOFError, zipfile.BadZipFile):
-                raise ValueError(f"{file}: '{name}' cannot be read, the archive is damaged") from None
+        raw = npz_arrays(file)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     return Table(file, tuple(raw), raw, first_line=None)
 
 
 @reads(".mat")
 def _read_mat(file: Path) -> Table:
     """A MATLAB file up to version 7.2 (version 7.3 is HDF5: save with '-v7')."""
-    raw = mat_variables(file, file)
+    raw = mat_variables(content_of(file), file)
     return Table(file, tuple(raw), raw, first_line=None)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
+from ident.data.foreign_files import shown
 from workflow.engine.errors import shortened
 
 T = TypeVar("T")
@@ -61,7 +62,11 @@ def from_arrays(kind: type[T], arrays: Mapping[str, AnyArray]) -> T:
     """Inverse of `to_arrays`. Raises CodecError."""
     if DOCUMENT not in arrays:
         raise CodecError(f"holds no {kind.__name__}: {DOCUMENT!r} is missing")
-    return unpack(kind, json.loads(arrays[DOCUMENT].tobytes().decode("utf-8")), arrays)
+    try:
+        document = json.loads(arrays[DOCUMENT].tobytes().decode("utf-8"))
+    except (ValueError, RecursionError):
+        raise CodecError(f"{DOCUMENT!r} is damaged: not JSON") from None
+    return unpack(kind, document, arrays)
 
 
 def plain(value: Any, *, arrays: bool = True) -> Any:
@@ -162,7 +167,7 @@ def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -
         _expect(document in get_args(kind), document, at, f"one of {', '.join(map(repr, get_args(kind)))}")
         return document
     if origin is np.ndarray or kind is np.ndarray:
-        return _unpack_array(document, arrays, at)
+        return _unpack_array(kind, document, arrays, at)
     if isinstance(origin, type) and issubclass(origin, tuple):
         return _unpack_tuple(get_args(kind), document, arrays, at)
     if isinstance(origin, type) and issubclass(origin, Mapping):
@@ -187,13 +192,13 @@ def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], 
     missing = sorted(set(fields) - set(document))
     if strange or missing or document.get(_TYPE, kind.__name__) != kind.__name__:
         what = (
-            f"unknown field {strange[0]!r}"
+            f"unknown field '{shown(strange[0])}'"
             if strange
             else f"missing field {missing[0]!r}"
             if missing
             else "is"
         )
-        raise CodecError(f"{at}: {what} ({document.get(_TYPE)}, expected {kind.__name__})")
+        raise CodecError(f"{at}: {what} ({shown(document.get(_TYPE))}, expected {kind.__name__})")
     values = {name: _unpack(hint, document[name], arrays, f"{at}.{name}") for name, hint in fields.items()}
     try:
         return kind(**values)
@@ -212,10 +217,15 @@ def _unpack_tuple(parts: tuple[Any, ...], document: Any, arrays: Mapping[str, An
     )
 
 
-def _unpack_array(document: Any, arrays: Mapping[str, AnyArray], at: str) -> AnyArray:
+def _unpack_array(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> AnyArray:
     name = document.get(_ARRAY) if isinstance(document, dict) else None
     _expect(isinstance(name, str) and name in arrays, document, at, "an array that is in the archive")
-    return arrays[str(name)]
+    array = arrays[str(name)]
+    # The annotation is ndarray[shape, dtype[number]]; one that says less holds whatever there is.
+    wanted = next(iter(get_args(get_args(kind)[1])), None) if get_args(kind) else None
+    if isinstance(wanted, type) and not np.can_cast(array.dtype, wanted, "same_kind"):
+        raise CodecError(f"{at}: holds {shown(str(array.dtype))}, expected {wanted.__name__}")
+    return array
 
 
 def _unpack_scalar(kind: type, document: Any, at: str) -> Any:
@@ -245,12 +255,15 @@ def _unpack_plain(document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any
         return [_unpack_plain(item, arrays, f"{at}[{i}]") for i, item in enumerate(document)]
     if not isinstance(document, dict):
         return document
-    if document.keys() == {_FLOAT}:
-        return float(document[_FLOAT])
-    if document.keys() == {_COMPLEX}:
-        return complex(*(_unpack_plain(part, arrays, at) for part in document[_COMPLEX]))
+    try:
+        if document.keys() == {_FLOAT}:
+            return float(document[_FLOAT])
+        if document.keys() == {_COMPLEX}:
+            return complex(*(_unpack_plain(part, arrays, at) for part in document[_COMPLEX]))
+    except (TypeError, ValueError):
+        raise CodecError(f"{at}: expected a number, got {shortened(document)}") from None
     if document.keys() == {_ARRAY}:
-        return _unpack_array(document, arrays, at)
+        return _unpack_array(np.ndarray, document, arrays, at)
     return {key: _unpack_plain(item, arrays, f"{at}.{key}") for key, item in document.items()}
 
 
@@ -265,7 +278,7 @@ def _member(union: Any, document: Any, at: str) -> Any:
     elif len(rest) > 1:
         rest = [m for m in rest if isinstance(m, type) and isinstance(document, m)] or rest
     if not rest:
-        raise CodecError(f"{at}: {document.get(_TYPE)} is none of {union}")
+        raise CodecError(f"{at}: {shown(document.get(_TYPE))} is none of {union}")
     return rest[0]
 
 

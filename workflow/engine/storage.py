@@ -13,7 +13,6 @@ import io
 import json
 import os
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ident.data.foreign_files import Unread, shown
+from ident.data.npz_files import npz_arrays
 from workflow.engine import codec
 from workflow.engine.errors import InputError, describe_os_error, naming
 
@@ -168,17 +169,15 @@ def read_npz(path: Path, *, only: str | None = None) -> dict[str, AnyArray]:
     Raises InputError naming the file.
     """
     try:
-        # Opened here: np.load leaves its own handle to the garbage collector when the content is damaged.
-        with open(path, "rb") as stream:
-            archive = np.load(stream, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds a single array")
-            return {name: archive[name] for name in (archive.files if only is None else [only])}
+        arrays = npz_arrays(path, only)
     except OSError as error:
         raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        # numpy's own words would recommend to load the file unsafely.
-        raise InputError(f"{path}: expected an npz file of plain arrays (no pickled objects)") from error
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    for name, array in arrays.items():
+        if isinstance(array, Unread):
+            raise InputError(f"{path}: '{shown(name)}' holds {array.why}")
+    return arrays
 
 
 def sha256_of_bytes(content: bytes) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 from control_design.plants.plant_set import UncertainPlant, count_integrators
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
+from ident.data.foreign_files import content_of
 from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
 from ident.frequency_fit import identify_frf
@@ -134,11 +135,7 @@ def _read_document(path: Path) -> dict[str, Any]:
     if suffix != ".mat":
         raise InputError(f"{path}: not a run directory, and the ending is none of .json, .mat, .npz, .csv")
     with naming(str(path)):
-        raw = mat_variables(path.read_bytes(), path)
-    return {
-        name: "".join(value.ravel().tolist()) if np.asarray(value).dtype.kind == "U" else value
-        for name, value in raw.items()
-    }
+        return mat_variables(content_of(path), path)
 
 
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ident.basis.model_files import ModelFile
+from ident.data.foreign_files import content_of
 from workflow.engine import storage
 from workflow.engine.errors import naming
 
@@ -21,5 +22,5 @@ def read_model(path: Path) -> ModelFile:
     """The model in a file of `write_model`. Raises InputError: one line that names the file."""
     with naming(str(path)):
         if path.suffix.lower() == ".mat":
-            return ModelFile.from_mat(path.read_bytes(), str(path))
+            return ModelFile.from_mat(content_of(path), str(path))
         return ModelFile.from_json(storage.read_text(path), str(path))

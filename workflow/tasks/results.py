@@ -27,6 +27,7 @@ from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
 from ident.checks.residual_tests import ResidualTest
 from ident.checks.validation import FreshFit, ScatterRow
+from ident.data.ellipses import chi2_radius
 from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.friction import EquivalentFriction, FrictionFit
@@ -310,6 +311,13 @@ class IdentifiedPlant:
     model: GobfModel
     posterior: ResponsePosterior
     level: float
+
+    def __post_init__(self) -> None:
+        chi2_radius(self.level)
+        for name in ("dt_s", "integrators", "input_delay_samples"):
+            of_model, of_posterior = getattr(self.model, name), getattr(self.posterior, name)
+            if of_model != of_posterior:
+                raise ValueError(f"{name} of the model is {of_model}, of its posterior {of_posterior}")
 
 
 # Controller

@@ -1,0 +1,76 @@
+"""MATLAB files against scipy's writer, and files that once ended the process."""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import numpy as np
+import pytest
+import scipy.io
+
+from ident.data.mat_files import mat_variables
+
+RNG = np.random.default_rng(14)
+CELLS = np.array([1.0, "a"], dtype=object)
+VALUES = {
+    "real": RNG.normal(size=(7, 3)),
+    "row": RNG.normal(size=(1, 9)),
+    "whole": np.arange(12, dtype=np.int16).reshape(3, 4),
+    "single": RNG.normal(size=(2, 2, 3)).astype(np.float32),
+    "complex": RNG.normal(size=(4, 1)) + 1j * RNG.normal(size=(4, 1)),
+    "logical": np.array([[True, False]]),
+    "none": np.zeros((0, 0)),
+}
+
+
+def written(variables, **options):
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, variables, **options)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_everything_that_scipy_writes_comes_back(packed):
+    nested = {"t": np.arange(3.0), "inner": {"y": np.ones(2)}, "label": "Größe [µm]", "cells": CELLS}
+    found = mat_variables(
+        written(VALUES | {"log": nested, "rows": ["ab", "cde"]}, do_compression=packed), "f"
+    )
+    for name, value in VALUES.items():
+        np.testing.assert_array_equal(found[name], value)
+    log = found["log"]
+    np.testing.assert_array_equal(log["t"].ravel(), nested["t"])
+    np.testing.assert_array_equal(log["inner"]["y"].ravel(), [1, 1])
+    assert log["label"] == nested["label"]
+    assert (log["cells"][0].item(), log["cells"][1]) == (1.0, "a")
+    assert found["rows"] == ["ab", "cde"]
+
+
+def test_what_is_no_array_is_told_when_it_is_asked_for():
+    found = mat_variables(written({"s": scipy.sparse.eye_array(3).tocsc(), "x": 1.0}), "f")
+    assert found["x"].item() == 1.0
+    assert "sparse matrix" in found["s"].why
+
+
+def test_names_that_crash_compiled_readers_are_refused():
+    once = written({"ab": 1.0})
+    twice = once + once[128:]
+    with pytest.raises(ValueError, match=r"^f: damaged: the variable 'ab' is there twice"):
+        mat_variables(twice, "f")
+    # The name of two letters stands beside its tag.
+    tag = struct.pack("<HH", 1, 2) + b"ab"
+    assert tag in once
+    with pytest.raises(ValueError, match="no name of a variable"):
+        mat_variables(once.replace(tag, tag[:4] + b"a\0"), "f")
+
+
+def test_lengths_are_believed_no_further_than_the_bytes_go():
+    content = written({"x": np.arange(4.0)})
+    dimensions = struct.pack("<ii", 1, 4)
+    assert content.count(dimensions) == 1
+    for shape in ((1, 2**31 - 1), (2**31 - 1, 2**31 - 1), (1, -4), (2, 4)):
+        with pytest.raises(ValueError, match="damaged"):
+            mat_variables(content.replace(dimensions, struct.pack("<ii", *shape)), "f")
+    for length in range(130, len(content), 7):
+        with pytest.raises(ValueError, match=r"^f: "):
+            mat_variables(content[:length], "f")
