@@ -4,7 +4,9 @@ from diagnosis.answer import Diagnosis, NamedEffect
 from diagnosis.diagnosis import diagnose
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case, Experiment
-from diagnosis.machine.own_plant import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
+from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
+from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
+from diagnosis.machine.with_effects import with_effects
 
 __all__ = [
     "Case",
@@ -19,4 +21,5 @@ __all__ = [
     "ResidualModel",
     "diagnose",
     "pooled_rms",
+    "with_effects",
 ]

@@ -16,12 +16,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from diagnosis.machine.around import around
 from diagnosis.machine.machine_protocol import (
     KNOWN_START,
     Real,
@@ -32,123 +31,16 @@ from diagnosis.machine.machine_protocol import (
     Weighing,
     check_record,
 )
+from diagnosis.machine.plant_effect import Change, PlantEffect
 from ident.data.arrays import lock
-from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
+from plant.effects.search_space import Candidate
 
 Simulate = Callable[[Mapping[str, float], Mapping[str, Mapping[str, float]], Real], Real]
 
-_STEPS = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
 # In noise deviations: beyond any record, and its square is still a number.
 _RUNAWAY = 1e12
-
-
-@dataclass(frozen=True)
-class EffectParameter:
-    """A parameter of an effect: range, and values a search starts from.
-
-    name : str. With its unit.
-    low, high : float
-        On a "log" scale both above zero; the size of an effect is positive (see `PlantEffect.signed`).
-    starts : tuple of float
-        Without any: eight over the range for an effect's size, three for what follows, inside the range.
-    """
-
-    name: str
-    low: float
-    high: float
-    starts: tuple[float, ...] = ()
-    scale: Literal["log", "linear"] = "log"
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
-            raise ValueError(f"parameter {self.name}: needs low < high; got {self.low} and {self.high}")
-        if self.scale == "log" and not self.low > 0:
-            raise ValueError(f"parameter {self.name}: low must be above zero on a log scale; got {self.low}")
-        outside = [v for v in self.starts if not self.low <= v <= self.high]
-        if outside:
-            raise ValueError(
-                f"parameter {self.name}: start {outside[0]:.6g} is outside {self.low:.6g} to {self.high:.6g}"
-            )
-
-    def axis(self, dependence: Dependence) -> Axis:
-        return Axis(self.name, self.scale, self.low, self.high, _STEPS[dependence])
-
-    def start_coordinates(self, count: int) -> list[float]:
-        axis = self.axis("smooth")
-        if self.starts:
-            return [axis.coordinate(v) for v in self.starts]
-        low, high = axis.box
-        return [low + (high - low) * (k + 1) / (count + 1) for k in range(count)]
-
-
-@dataclass(frozen=True)
-class Change:
-    """An effect with values, as a fit hands it to the simulation."""
-
-    id: str
-    values: Mapping[str, float]
-
-    def parameters(self) -> dict[str, float]:
-        return dict(self.values)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"name": self.id, **self.values}
-
-
-@dataclass(frozen=True)
-class PlantEffect:
-    """Something the plant may have and its simulation lacks unless told.
-
-    name : str
-    parameters : tuple of EffectParameter
-        The first is the size: the larger, the more the outputs change (the smaller, if not `grows`, as with a
-        stiffness or a limit). Below its lower end the effect must be next to nothing.
-    signed : bool. The size may be negative as well: both sides are searched, as one effect.
-    grows : bool
-    dependence : "smooth", "continuous" or "non-smooth". How outputs depend on the parameters: differentiable;
-        continuous (dry friction); neither (backlash, rounding), which takes grids in place of slopes.
-    group : str. Where it acts (actuator, joint, sensor, ...); only shown.
-    """
-
-    name: str
-    parameters: tuple[EffectParameter, ...]
-    signed: bool = False
-    grows: bool = True
-    dependence: Dependence = "smooth"
-    group: str = ""
-    # Which of its own parameters an effect multiplies nobody said.
-    multiplies: ClassVar[str | None] = None
-    harmonic: ClassVar[Harmonic | None] = None
-    adds_to: ClassVar[str | None] = None
-    contains: ClassVar[str | None] = None
-    absolute_angle: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "parameters", tuple(self.parameters))
-        if not self.parameters:
-            raise ValueError(f"effect {self.name}: needs at least one parameter")
-        if self.name in ("none", "unknown"):
-            raise ValueError(f"effect {self.name}: this name is an answer of its own")
-        if self.dependence not in _STEPS:
-            raise ValueError(f"effect {self.name}: dependence must be one of {', '.join(_STEPS)}")
-
-    def candidates(self) -> tuple[Candidate, ...]:
-        axes = tuple(p.axis(self.dependence) for p in self.parameters)
-        counts = [8, *[3] * (len(axes) - 1)]
-        values = [p.start_coordinates(n) for p, n in zip(self.parameters, counts, strict=True)]
-        starts = tuple(product(*values))
-        signs = (1, -1) if self.signed else (1,)
-        return tuple(Candidate(self, axes, starts, sign, self.grows) for sign in signs)
-
-    def from_search(self, values: Mapping[str, float], sign: int) -> Change:
-        """The effect at these values, the size (the first parameter) with its sign."""
-        size = self.parameters[0].name
-        signed = {**values, size: sign * values[size]}
-        return Change(self.name, MappingProxyType(signed))
-
-    @property
-    def id(self) -> str:
-        return self.name
+# What a simulation may raise where a trial runs away; any other error is one of the simulation.
+_NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +49,8 @@ class Plant:
 
     simulation : (parameters, effects, inputs (T, U)) -> outputs (T, Y)
         `parameters` has every stated parameter, `effects` name -> parameter -> value of those to include.
-        It must be a function of its arguments alone.
+        It must be a function of its arguments alone. Further columns may follow the outputs, for effects
+        around it (`with_effects`).
     parameters : name -> stated value
     tolerances : name -> relative standard deviation of the nominal parameter
         Parameters without one are exact. A value fitted to these same records is no knowledge beside them:
@@ -175,7 +68,7 @@ class Plant:
     tolerances: Mapping[str, float]
     output_names: tuple[str, ...]
     noise: Real
-    effects: tuple[PlantEffect, ...]
+    effects: tuple[PlantEffect, ...] = ()
     model_error: float = 0.0
 
     def __post_init__(self) -> None:
@@ -200,8 +93,6 @@ class Plant:
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"plant: effect {name} is listed twice")
-        if not names:
-            raise ValueError("plant: lists no effect that may be missing")
 
     @cached_property
     def weighing(self) -> Weighing:
@@ -227,14 +118,55 @@ class Plant:
 
     def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
-        given = {effect.id: effect.values for effect in effects}
-        far = _RUNAWAY * self.noise
+        far, run = _RUNAWAY * self.noise, self.simulated(effects)
 
         def outputs(inputs: Real, *_start: Real) -> Real:
-            found = np.asarray(self.simulation(self.parameters, given, inputs))
+            try:
+                found = run(inputs)
+            except _NUMERICAL:
+                found = np.full((len(inputs), far.size), np.nan)
             return np.clip(np.where(np.isnan(found), far, found), -far, far)
 
         return outputs
+
+    def simulated(self, effects: Sequence[Change]) -> Callable[[Real], Real]:
+        """Inputs (T, U) -> outputs (T, Y) as the simulation gives them, listed effects around it.
+
+        Raises ValueError, one line: a shape that does not fit, an error of the simulation that is not
+        numerical (those it raises as they are).
+        """
+        listed = {effect.name: effect.acts for effect in self.effects if effect.acts is not None}
+        told = {effect.id: effect.values for effect in effects if effect.id not in listed}
+        acting = [
+            (acts, effect.values)
+            for name, acts in listed.items()
+            for effect in effects
+            if effect.id == name and acts is not None
+        ]
+        known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in told.items()))
+
+        def told_simulation(inputs: Real) -> Real:
+            try:
+                found = np.asarray(self.simulation(self.parameters, told, inputs), dtype=np.float64)
+            except _NUMERICAL:
+                raise
+            except Exception as error:
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                raise ValueError(f"{self._at(told)} the simulation ended with {reason}") from error
+            if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
+                raise ValueError(
+                    f"{self._at(told)} the simulation must give outputs ({len(inputs)}, {self.noise.size}); "
+                    f"got {found.shape}"
+                )
+            return found
+
+        run = around(told_simulation, acting, known)
+        return lambda inputs: run(inputs)[:, : self.noise.size]
+
+    def _at(self, told: Mapping[str, Mapping[str, float]]) -> str:
+        values = ", ".join(f"{key} {value:.6g}" for key, value in self.parameters.items())
+        added = " and ".join(f"{name} {dict(given)}" for name, given in told.items())
+        return f"plant: with {values}" + (f" and {added}" if added else "")
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
         return tuple(candidate for effect in self.effects for candidate in effect.candidates())
@@ -259,7 +191,7 @@ class PlantCase(RecordedCase[PlantExperiment]):
     """A plant as its makers know it, and what it did.
 
     Raises ValueError if a role has no experiment, a name comes twice, an output is constant (a dead sensor),
-    or the simulation does not give finite outputs of the measured shape for the first experiment.
+    the plant lists no effect, or the simulation does not give the same finite outputs twice.
     """
 
     name: str
@@ -270,13 +202,24 @@ class PlantCase(RecordedCase[PlantExperiment]):
         super().__post_init__()
         for e in self.experiments:
             check_record(e, self.plant.output_names)
-        first = self.experiments[0]
-        found = np.asarray(self.plant.simulation(self.plant.parameters, {}, first.input))
-        if found.shape != first.output.shape or not np.all(np.isfinite(found)):
-            raise ValueError(
-                f"case {self.name}: the simulation must give finite outputs {first.output.shape} for "
-                f"experiment {first.name}; got {found.shape}"
-            )
+        if not self.plant.effects:
+            raise ValueError("plant: lists no effect that may be missing")
+        run = self.plant.simulated(())
+        for e in self.experiments:
+            where = f"case {self.name}, experiment {e.name}"
+            try:
+                found, again = run(e.input), run(e.input)
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from error
+            except _NUMERICAL as error:
+                raise ValueError(f"{where}: the simulation as stated ended with {error!r}") from error
+            if not np.all(np.isfinite(found)):
+                raise ValueError(f"{where}: the simulation as stated does not give finite outputs")
+            if not np.array_equal(found, again):
+                differ = float(np.max(np.abs(found - again)))
+                raise ValueError(
+                    f"{where}: two simulations as stated differ by up to {differ:.3g}; is something random?"
+                )
 
     @property
     def machine(self) -> Plant:

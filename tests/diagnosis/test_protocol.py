@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
+from diagnosis import (
+    EffectParameter,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    diagnose,
+    with_effects,
+)
 from diagnosis.machine.machine_protocol import Weighing
 from examples import own_plant
 from plant import simulate
@@ -139,6 +147,38 @@ PLANT = Plant(
 )
 
 
+BOTH = (GOOD, replace(GOOD, name="b", role="held_out"))
+
+
+def _random(parameters, effects, inputs, rng=np.random.default_rng(0)):  # noqa: B008
+    return inputs + rng.standard_normal(inputs.shape)
+
+
+def _listed(name, level=1.0, late=1, **how):
+    """An integrator, `late` samples behind."""
+
+    def simulation(parameters, effects, inputs):
+        return np.concatenate([np.zeros((late, 1)), np.cumsum(inputs, axis=0)[:-late]])
+
+    record = replace(GOOD, input=level * GOOD.input)
+    return with_effects(replace(PLANT, simulation=simulation), [name], [record], dt_s=0.1, **how)
+
+
+def test_only_numerical_failures_of_a_trial_are_taken_for_running_away():
+    def failing(error):
+        def simulation(parameters, effects, inputs):
+            if effects:
+                raise error
+            return inputs
+
+        return replace(PLANT, simulation=simulation).simulator([PLANT.effects[0].from_search({"y": 0.5}, 1)])
+
+    for error in (ZeroDivisionError(), OverflowError(), FloatingPointError(), np.linalg.LinAlgError()):
+        assert np.all(failing(error)(GOOD.input) > 1e9)
+    with pytest.raises(ValueError, match=r"with k 2 and offset \{'y': 0.5\} the simulation ended with Key"):
+        failing(KeyError("mine"))(GOOD.input)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -150,7 +190,7 @@ PLANT = Plant(
         (lambda: replace(PLANT, noise=np.array([0.0])), "one noise level above zero per output"),
         (lambda: replace(PLANT, tolerances={"m": 0.1}), "tolerance of m, which is no parameter"),
         (lambda: replace(PLANT, tolerances={"k": 0.0}), "must be between 0 and 10"),
-        (lambda: replace(PLANT, effects=()), "lists no effect"),
+        (lambda: PlantCase("c", replace(PLANT, effects=()), BOTH), "lists no effect"),
         (lambda: replace(PLANT, effects=PLANT.effects * 2), "listed twice"),
         (lambda: replace(PLANT, model_error=-1.0), "model_error"),
         (lambda: EffectParameter("y", 2.0, 1.0), "low < high"),
@@ -168,12 +208,35 @@ PLANT = Plant(
             "is the sensor dead",
         ),
         (
-            lambda: PlantCase(
-                "c",
-                replace(PLANT, simulation=lambda p, e, u: u[:-1]),
-                (GOOD, replace(GOOD, name="b", role="held_out")),
-            ),
-            r"must give finite outputs \(30, 1\)",
+            lambda: PlantCase("c", replace(PLANT, simulation=lambda p, e, u: u[:-1]), BOTH),
+            r"experiment a: plant: with k 2 the simulation must give outputs \(30, 1\); got \(29, 1\)",
+        ),
+        (
+            lambda: PlantCase("c", replace(PLANT, simulation=lambda p, e, u: u * np.nan), BOTH),
+            "c, experiment a: the simulation as stated does not give finite outputs",
+        ),
+        (
+            lambda: PlantCase("c", replace(PLANT, simulation=_random), BOTH),
+            "experiment a: two simulations as stated differ by up to .*; is something random",
+        ),
+        (
+            lambda: PlantCase("c", replace(PLANT, simulation=lambda p, e, u: p["m"] * u), BOTH),
+            "experiment a: plant: with k 2 the simulation ended with KeyError: 'm'",
+        ),
+        (
+            lambda: PlantCase("c", replace(PLANT, simulation=lambda p, e, u: u * (1 / (p["k"] - 2))), BOTH),
+            "experiment a: the simulation as stated ended with ZeroDivisionError",
+        ),
+        (lambda: _listed("none_such"), "no listed effect is called 'none_such'; there are input_delay"),
+        (lambda: _listed("coulomb_friction"), "coulomb_friction needs motion="),
+        (lambda: _listed("spring", motion="x"), "no output is called 'x'; there are y"),
+        (lambda: _listed("input_delay", input=1), "there is no input 1; the records have 1"),
+        (lambda: _listed("spring", motion="y", force=0, level=0.0), "needs largest_force="),
+        (lambda: _listed("input_offset", level=0.0), "zero in every record"),
+        (lambda: _listed("spring", motion=3), r"column 3 of a simulation that returns \(30, 1\)"),
+        (
+            lambda: _listed("spring", motion="y", late=9),
+            "the simulated motion follows the stated input later",
         ),
     ],
 )

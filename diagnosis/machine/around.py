@@ -1,0 +1,147 @@
+"""Effects around a simulation that does not know them: on an input, on an output, on the body between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.motion_effects import BodyForces, PulseResponse, with_forces
+
+Run = Callable[[Real], Real]
+Values = Mapping[str, float]
+
+# A force that the simulation does not follow to this share of what it changes was not found.
+_MISSED = 0.05
+# Simulations without the forces that are kept: those of one set of parameters.
+_KEPT = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A body in the simulation: column of its force, column of its motion, force of a pulse to try it with.
+
+    of_speed : bool. The motion is a speed; else it is a position.
+    """
+
+    force: int
+    motion: int
+    of_speed: bool
+    dt_s: float
+    pulse: float
+    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
+
+    def under(self, run: Run, key: Hashable, forces: BodyForces) -> Run:
+        """The simulation with forces on the body; not a number where none were found that it follows.
+
+        key : what the simulation depends on besides its inputs.
+        """
+
+        def simulated(inputs: Real) -> Real:
+            response, sign = self._remembered((key, inputs.shape), lambda: self._response(run, inputs))
+
+            def under(force: Real) -> tuple[Real, Real]:
+                moved = inputs.copy()
+                moved[:, self.force] = force
+                found = run(moved)
+                return found, sign * found[:, self.motion]
+
+            command = inputs[:, self.force]
+            free = self._remembered((key, inputs.tobytes()), lambda: under(command))
+            outputs, missed = with_forces(under, free, command, response, forces)
+            return outputs if missed < _MISSED else np.full_like(outputs, np.nan)
+
+        return simulated
+
+    def _response(self, run: Run, inputs: Real) -> tuple[PulseResponse, float]:
+        """From rest, other inputs as at the start; -1 where force and motion count opposite ways, else 1."""
+        still = np.repeat(inputs[:1], len(inputs), axis=0)
+        still[:, self.force] = 0.0
+        pushed = still.copy()
+        pushed[1, self.force] = self.pulse
+        moved = (run(pushed) - run(still))[:, self.motion] / self.pulse
+        sign = float(np.sign(moved[np.argmax(np.abs(moved[:5]))]))
+        return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.of_speed), sign
+
+    def _remembered(self, key: Hashable, compute: Callable[[], Any]) -> Any:
+        if key not in self._kept:
+            if len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = compute()
+        return self._kept[key]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredBody:
+    """A body whose motion is given, whose force is asked: inputs of position and speed, output of force."""
+
+    position: int
+    speed: int
+    force: int
+
+    def under(self, run: Run, key: Hashable, forces: BodyForces) -> Run:
+        def simulated(inputs: Real) -> Real:
+            found = np.array(run(inputs))
+            found[:, self.force] += forces.overcome(inputs[:, self.position], inputs[:, self.speed])
+            return found
+
+        return simulated
+
+
+AnyBody = Body | MeasuredBody
+
+
+@dataclass(frozen=True, eq=False)
+class Acts:
+    """What an effect does to a simulation.
+
+    on : column of the inputs or outputs, or a body. where : "input", "output" or "body".
+    change : of a column, (T,), values, dt_s, what it was before its first row -> (T,); of a body, values ->
+        fields of `BodyForces`.
+    at_rest_before : an input was zero before its first row; else, and every output, as in that row.
+    """
+
+    where: Literal["input", "output", "body"]
+    on: int | AnyBody
+    change: Callable[..., Any]
+    dt_s: float
+    at_rest_before: bool = True
+
+
+def around(run: Run, acting: Sequence[tuple[Acts, Values]], key: Hashable) -> Run:
+    """A simulation with effects around it, on each column in the order given.
+
+    key : what the simulation depends on besides its inputs.
+    """
+    bodies: dict[int, tuple[AnyBody, dict[str, float]]] = {}
+    for acts, values in acting:
+        if not isinstance(acts.on, int):
+            _, sizes = bodies.setdefault(id(acts.on), (acts.on, {}))
+            for name, value in acts.change(values).items():
+                # Laws of dry friction that are tried together add up, but for the speed over which one falls.
+                sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
+    inner, known = run, key
+    for body, sizes in bodies.values():
+        inner = body.under(inner, known, replace(BodyForces(), **sizes))
+        known = (known, tuple(sizes.items()))
+
+    def simulated(inputs: Real) -> Real:
+        return _changed(inner(_changed(inputs, acting, "input")), acting, "output")
+
+    return simulated
+
+
+def _changed(signals: Real, acting: Sequence[tuple[Acts, Values]], where: str) -> Real:
+    here = [(acts, values) for acts, values in acting if acts.where == where]
+    if not here:
+        return signals
+    found = np.array(signals, dtype=np.float64)
+    for acts, values in here:
+        assert isinstance(acts.on, int)
+        signal = found[:, acts.on]
+        before = 0.0 if where == "input" and acts.at_rest_before else float(signal[0])
+        found[:, acts.on] = acts.change(signal, values, acts.dt_s, before)
+    return found

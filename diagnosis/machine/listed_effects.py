@@ -1,0 +1,236 @@
+"""Effects that any machine may have, by name: what they do to an input, an output or the force on a body.
+
+Sizes are in the units of the input (force, offset, ...) and of the output; ranges are multiples of the
+records' magnitudes, as in `plant.effects`, where effects of the same name are those of a flexible link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numba import njit
+from scipy.signal import lfilter
+
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.plant_effect import EffectParameter
+from plant.effects.search_space import Dependence, geometric
+
+Values = Mapping[str, float]
+Where = Literal["input", "output", "body"]
+
+_SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Magnitudes of the records: largest input, force, position, speed, output; sampling; longest record."""
+
+    input: float = 1.0
+    force: float = 1.0
+    position: float = 1.0
+    speed: float = 1.0
+    output: float = 1.0
+    dt_s: float = 1.0
+    duration_s: float = 1.0
+
+
+def _log(name: str, unit: float, low: float, high: float, first: float, last: float, count: int) -> Any:
+    """A range and starts, in multiples of a magnitude."""
+    starts = tuple(geometric(first * unit, min(last * unit, high * unit), count))
+    return EffectParameter(name, low * unit, high * unit, starts)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """An effect of the list: where it acts, what it does, its parameters with their ranges."""
+
+    where: Where
+    change: Callable[..., Any]
+    parameters: Callable[[Sizes], tuple[EffectParameter, ...]]
+    signed: bool = False
+    grows: bool = True
+    dependence: Dependence = "smooth"
+    contains: str | None = None
+
+
+def _delayed(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    late = values["delay_s"] / dt_s
+    whole = int(late)
+    part = late - whole
+    padded = np.concatenate([np.full(whole + 1, before), signal])[: signal.size + 1]
+    return np.asarray((1 - part) * padded[1:] + part * padded[:-1])
+
+
+def _lagged(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A held signal behind 1/(T s + 1), as its mean over each sample."""
+    T = values["time_constant_s"]
+    decay = np.exp(-dt_s / T)
+    state, _ = lfilter([1 - decay], [1.0, -decay], signal, zi=[decay * before])
+    start = np.concatenate([[before], state[:-1]])
+    return np.asarray(signal + (start - signal) * T / dt_s * (1 - decay))
+
+
+def _lagged_sensor(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A signal that is straight between samples behind 1/(T s + 1)."""
+    T = values["time_constant_s"]
+    decay = np.exp(-dt_s / T)
+    new = 1 - T / dt_s * (1 - decay)
+    taps = [new, (1 - decay) - new]
+    return np.asarray(lfilter(taps, [1.0, -decay], signal, zi=[before * (1 - new)])[0])
+
+
+def _drifting(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.asarray(signal + values["rate_per_s"] * dt_s * np.arange(signal.size))
+
+
+def _dead(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.asarray(np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0))
+
+
+def _clipped(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.clip(signal, -values["limit"], values["limit"])
+
+
+def _scaled(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.asarray((1 + values["relative_error"]) * signal)
+
+
+def _shifted(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.asarray(signal + values["offset"])
+
+
+def _with_play(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.asarray(_play(np.ascontiguousarray(signal), 0.5 * values["gap"], before))
+
+
+@njit(cache=True)
+def _play(signal: Real, half: float, at: float) -> Real:
+    """Follows at a distance of `half`, from the middle."""
+    followed = np.empty_like(signal)
+    for k in range(signal.size):
+        at = min(max(at, signal[k] - half), signal[k] + half)
+        followed[k] = at
+    return followed
+
+
+def _stribeck(values: Values) -> dict[str, float]:
+    share, static = values["coulomb_share"], values["static_force"]
+    return {
+        "coulomb": share * static,
+        "excess": (1 - share) * static,
+        "stribeck_velocity": values["velocity"],
+    }
+
+
+def _delays(s: Sizes) -> tuple[EffectParameter, ...]:
+    return (_log("delay_s", s.dt_s, 2e-4, min(100.0, 0.2 * s.duration_s / s.dt_s), 0.04, 30.0, 14),)
+
+
+def _lags(s: Sizes) -> tuple[EffectParameter, ...]:
+    return (_log("time_constant_s", s.dt_s, 2e-3, 200.0, 0.02, 40.0, 10),)
+
+
+def _gains(s: Sizes) -> tuple[EffectParameter, ...]:
+    return (EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7)),)
+
+
+# Effects of the actuator act in this order, then those of the body, then those of the sensor.
+KINDS: dict[str, Kind] = {
+    "input_delay": Kind("input", _delayed, _delays),
+    "actuator_gain": Kind("input", _scaled, _gains, signed=True),
+    "input_offset": Kind(
+        "input",
+        _shifted,
+        lambda s: (_log("offset", s.input, 1e-5, 1.0, 1e-3, 0.3, 8),),
+        signed=True,
+    ),
+    "input_drift": Kind(
+        "input",
+        _drifting,
+        lambda s: (_log("rate_per_s", s.input / s.duration_s, 1e-5, 3.0, 1e-3, 1.0, 8),),
+        signed=True,
+    ),
+    "input_backlash": Kind(
+        "input",
+        _with_play,
+        lambda s: (_log("gap", s.input, 1e-4, 1.5, 1e-3, 1.0, 20),),
+        dependence="non-smooth",
+    ),
+    "actuator_dead_zone": Kind(
+        "input",
+        _dead,
+        lambda s: (_log("width", s.input, 1e-5, 1.0, 1e-3, 0.5, 12),),
+        dependence="continuous",
+    ),
+    "actuator_saturation": Kind(
+        "input",
+        _clipped,
+        lambda s: (_log("limit", s.input, 0.05, 1.0, 0.1, 0.99, 24),),
+        grows=False,
+        dependence="continuous",
+    ),
+    "actuator_lag": Kind("input", _lagged, _lags),
+    "coulomb_friction": Kind(
+        "body",
+        lambda v: {"coulomb": v["force"]},
+        lambda s: (_log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 14),),
+        dependence="continuous",
+    ),
+    "stribeck_friction": Kind(
+        "body",
+        _stribeck,
+        lambda s: (
+            _log("static_force", s.force, 1e-5, 2.0, 3e-4, 0.6, 8),
+            _SHARE,
+            _log("velocity", s.speed, 0.01, 2.0, 0.012, 0.3, 3),
+        ),
+        dependence="continuous",
+        contains="coulomb_friction",
+    ),
+    "one_sided_friction": Kind(
+        "body",
+        lambda v: {"up" if v["force"] > 0 else "down": abs(v["force"])},
+        lambda s: (_log("force", s.force, 1e-5, 1.0, 1e-3, 0.6, 8),),
+        signed=True,
+        dependence="continuous",
+    ),
+    "viscous_friction": Kind(
+        "body",
+        lambda v: {"viscous": v["coefficient"]},
+        lambda s: (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+    ),
+    "spring": Kind(
+        "body",
+        lambda v: {"linear": v["stiffness"]},
+        lambda s: (_log("stiffness", s.force / s.position, 1e-5, 30.0, 1e-4, 3.0, 8),),
+    ),
+    "hardening_spring": Kind(
+        "body",
+        lambda v: {"cubic": v["cubic"]},
+        lambda s: (_log("cubic", s.force / s.position**3, 1e-7, 1e3, 1e-5, 10.0, 12),),
+    ),
+    "backlash": Kind(
+        "output",
+        _with_play,
+        lambda s: (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
+        dependence="non-smooth",
+    ),
+    "sensor_lag": Kind("output", _lagged_sensor, _lags),
+    "sensor_delay": Kind("output", _delayed, _delays),
+    "sensor_gain": Kind("output", _scaled, _gains, signed=True),
+    "sensor_offset": Kind(
+        "output",
+        _shifted,
+        lambda s: (_log("offset", s.output, 1e-6, 3.0, 1e-4, 0.5, 8),),
+        signed=True,
+    ),
+    "sensor_drift": Kind(
+        "output",
+        _drifting,
+        lambda s: (_log("rate_per_s", s.output / s.duration_s, 1e-6, 3.0, 1e-4, 1.0, 8),),
+        signed=True,
+    ),
+}

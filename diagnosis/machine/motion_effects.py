@@ -1,0 +1,219 @@
+"""Friction and springs on a body inside a simulation that knows neither: force in, motion out.
+
+Wanted is u = command - F(x(u), v(u)) over a record, where a simulation gives x(u) and nothing else. With its
+response to a short pulse of force the equation is solved sample by sample, dry friction exactly (a body
+sticks, slips, turns round inside a sample), then simulated with that force; where the simulation is not
+linear, what it says is the start of the next round (Newton's method over a waveform, with one linear
+response for all times).
+
+Neglected: friction acts as its mean over each sample, and the speed between samples is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numba import njit
+
+from diagnosis.machine.machine_protocol import Real
+
+_ROUNDS = 12
+# Of the change that the effects make: what rounds may still move.
+_CONVERGED = 1e-4
+# Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
+_AT_ONCE = 0.02
+_FORGOTTEN = 1e-7
+
+
+@dataclass(frozen=True)
+class BodyForces:
+    """Forces on a body against its motion, SI or whatever units force and motion have.
+
+    Dry friction of size coulomb + excess exp(-|v| / stribeck_velocity), with `up` more while v > 0 and `down`
+    more while v < 0, at rest up to coulomb + excess; viscous v; linear x + cubic x^3, x from zero.
+    """
+
+    coulomb: float = 0.0
+    excess: float = 0.0
+    stribeck_velocity: float = 1.0
+    up: float = 0.0
+    down: float = 0.0
+    viscous: float = 0.0
+    linear: float = 0.0
+    cubic: float = 0.0
+
+    def overcome(self, x: Real, v: Real) -> Real:
+        """Force (T,) that a known motion takes against them."""
+        level = self.coulomb + self.excess * np.exp(-np.abs(v) / self.stribeck_velocity)
+        dry = np.where(v > 0, level + self.up, np.where(v < 0, -level - self.down, 0.0))
+        return np.asarray(dry + self.viscous * v + self.linear * x + self.cubic * x**3)
+
+
+@dataclass(frozen=True, eq=False)
+class PulseResponse:
+    """Position and speed (L,) after a unit force over one sample; `ahead` samples before speed shows it.
+
+    corrections : (2,) what a force in this sample and the one before adds to central differences of position.
+    """
+
+    position: Real
+    speed: Real
+    corrections: Real
+    ahead: int
+    dt_s: float
+    of_speed: bool
+
+    @classmethod
+    def of(cls, motion: Real, dt_s: float, *, of_speed: bool) -> PulseResponse:
+        """motion (T,): change of the motion per force, the pulse in its second sample.
+
+        Raises ValueError if the force does not move the body at once.
+        """
+        h = motion[1:]
+        at_once = abs(h[0]) > _AT_ONCE * abs(h[1])
+        corrections = np.zeros(2)
+        if of_speed:
+            speed, position = h, np.cumsum(h) * dt_s
+            position = position - 0.5 * dt_s * h
+        else:
+            speed, position = np.gradient(h, dt_s), h
+            speed[0] = 0.5 * h[1] / dt_s
+            if not at_once:
+                speed[0], speed[1] = 0.0, (-3 * h[1] + 4 * h[2] - h[3]) / (2 * dt_s)
+                corrections = np.array([0.5 * h[1] / dt_s, 0.5 * h[2] / dt_s - speed[1]])
+        ahead = 0 if at_once else 1
+        largest = np.max(np.abs(speed[:20]))
+        if not abs(speed[ahead]) > 0.1 * largest:
+            raise ValueError(
+                "friction and springs need a force that moves the body at once; the simulated motion follows "
+                "the stated input later"
+            )
+        kept = np.abs(speed) > _FORGOTTEN * largest
+        kept |= np.abs(position) > _FORGOTTEN * np.max(np.abs(position))
+        last = int(np.flatnonzero(kept)[-1]) + 1
+        return cls(position[:last], speed[:last], corrections, ahead, dt_s, of_speed)
+
+    def motion(self, simulated: Real, force: Real) -> tuple[Real, Real]:
+        """Position and speed (T,) of what was simulated (T,) under a force (T,)."""
+        if self.of_speed:
+            steps = 0.5 * self.dt_s * (simulated[1:] + simulated[:-1])
+            return np.concatenate([[0.0], np.cumsum(steps)]), simulated
+        speed = np.gradient(simulated, self.dt_s)
+        now, before = self.corrections
+        speed[1:-1] -= now * force[1:-1] + before * force[:-2]
+        speed[0] -= 2 * now * force[0]
+        speed[-1] = speed[-2]
+        return simulated, speed
+
+
+def with_forces(
+    simulate: Callable[[Real], tuple[Real, Real]],
+    free: tuple[Real, Real],
+    command: Real,
+    response: PulseResponse,
+    forces: BodyForces,
+) -> tuple[Real, float]:
+    """Outputs (T, Y) with the forces acting, and what the last round still moved, over what they change.
+
+    simulate : force (T,) -> outputs (T, Y), motion (T,). command : force (T,) without the forces; free : what
+    it gives.
+    """
+    held = np.zeros(command.size)
+    outputs, now = free
+    error = np.inf
+    for _ in range(_ROUNDS):
+        if not np.all(np.isfinite(now)):
+            return outputs, np.inf
+        held, position, speed = _solve(
+            *response.motion(now, command + held),
+            held,
+            response.position,
+            response.speed,
+            response.ahead,
+            *astuple(forces),
+        )
+        outputs, now = simulate(command + held)
+        seen = response.motion(now, command + held)
+        k = int(response.of_speed)
+        missed = np.sqrt(np.mean((seen[k] - (position, speed)[k]) ** 2))
+        error = float(missed / max(np.sqrt(np.mean((now - free[1]) ** 2)), 1e-300))
+        if error < _CONVERGED:
+            break
+    return outputs, error
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _solve(
+    position: Real,
+    speed: Real,
+    held: Real,
+    hx: Real,
+    hv: Real,
+    ahead: int,
+    coulomb: float,
+    excess: float,
+    falls: float,
+    up: float,
+    down: float,
+    viscous: float,
+    linear: float,
+    cubic: float,
+) -> tuple[Real, Real, Real]:
+    """Forces (T,), positions and speeds (T,) with them, from those under the forces `held`."""
+    T = position.size
+    f, x, v = held.copy(), position.copy(), speed.copy()
+    change = np.zeros(T)
+    gx, gv = hx[ahead], hv[ahead]
+    for k in range(T - ahead):
+        n = k + ahead
+        ax, av = position[n] - gx * held[k], speed[n] - gv * held[k]
+        for j in range(max(0, n - hv.size + 1), k):
+            ax += hx[n - j] * change[j]
+            av += hv[n - j] * change[j]
+        x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
+        # Smooth forces by the trapezoidal rule, the cubic one by its tangent.
+        stiffness = linear + 3 * cubic * x0 * x0
+        divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
+        smooth = 2 * cubic * x0**3 - 0.5 * viscous * (v0 + av) - 0.5 * stiffness * (x0 + ax)
+        a, g = av + gv * smooth / divisor, gv / divisor
+        end, dry = v0, 0.0
+        for _ in range(3 if excess > 0 else 1):
+            level = coulomb + excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
+            end, dry = _dry(v0, a, g, level + up, level + down, excess + coulomb - level)
+        f[k] = (smooth + dry) / divisor
+        x[n], v[n] = ax + gx * f[k], end
+        change[k] = f[k] - held[k]
+    return f, x, v
+
+
+@njit(cache=True)
+def _dry(v0: float, a: float, g: float, up: float, down: float, at_rest: float) -> tuple[float, float]:
+    """Speed at the end of a sample and mean dry friction in it.
+
+    v0: speed at its start. a: at its end without friction; g: per force. up, down: levels against motion up
+    and down; at_rest: how much more is held at rest.
+    """
+    if v0 < 0:
+        end, f = _slowed(-v0, -a, g, down, up, at_rest)
+        return -end, -f
+    if v0 > 0:
+        return _slowed(v0, a, g, up, down, at_rest)
+    if a > g * (up + at_rest):
+        return a - g * up, -up
+    if a < -g * (down + at_rest):
+        return a + g * down, down
+    return 0.0, -a / g
+
+
+@njit(cache=True)
+def _slowed(v0: float, a: float, g: float, up: float, down: float, at_rest: float) -> tuple[float, float]:
+    end = a - g * up
+    if end >= 0:
+        return end, -up
+    pulled = a - v0
+    if pulled >= -g * (down + at_rest):
+        return 0.0, -a / g
+    share = v0 / (g * up - pulled)
+    return (1 - share) * (pulled + g * down), (1 - share) * down - share * up

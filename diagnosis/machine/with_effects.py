@@ -1,0 +1,183 @@
+"""Listed effects around a simulation that knows none of them.
+
+plant = with_effects(plant, "all", experiments, dt_s=0.01, motion="position_m")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from diagnosis.machine.around import Acts, AnyBody, Body, MeasuredBody
+from diagnosis.machine.listed_effects import KINDS, Sizes, Where
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.own_plant import Plant, PlantExperiment
+from diagnosis.machine.plant_effect import PlantEffect
+
+_MISSING = {
+    "input": "changes a command, and the stated input is none or zero in every record",
+    "body": "needs motion=, the output that is the body's position or speed",
+}
+_GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
+# What no record of one output can tell from its twin at the input where the machine is linear.
+_TWINS = ("sensor_lag", "sensor_delay", "sensor_gain")
+# A play of a force is rare; friction one way looks like an offset beside friction both ways.
+_BY_NAME_ONLY = ("input_backlash", "one_sided_friction")
+_SMOOTHED = 11  # samples, of a measured position whose speed is asked
+
+
+def with_effects(
+    plant: Plant,
+    names: Sequence[str] | Literal["all"],
+    experiments: Sequence[PlantExperiment],
+    *,
+    dt_s: float,
+    input: int = 0,  # noqa: A002
+    force: int | None = None,
+    motion: str | int | None = None,
+    motion_is: Literal["position", "speed"] = "position",
+    measured_motion: tuple[int, int] | None = None,
+    output: str | None = None,
+    largest_force: float | None = None,
+    at_rest_before: bool = True,
+    prefix: str = "",
+) -> Plant:
+    """The plant with effects of `KINDS` around its simulation, beside those it has.
+
+    names : of `KINDS`, or "all" that apply: those of the body where its motion is stated; lag, delay and gain
+        of a sensor where there are several outputs (with one, they look like those of the actuator).
+    dt_s : sampling period.
+    input : column of the command that effects of an actuator change.
+    force : column of the force on the body, held over each sample; default `input`.
+    motion : output, or column of what the simulation returns (beyond the outputs: a motion nobody measured),
+        of the body that friction and springs act on.
+    measured_motion : in place of it columns of position and speed among the inputs, of a simulation that
+        gives the force which that motion takes as its `output`.
+    output : that effects of a sensor change; default the motion, else the first.
+    largest_force : for ranges, where the column of the force is zero in the records.
+    at_rest_before : before its first row a command is zero; else as in that row.
+    prefix : before the names, where this is asked of several inputs, bodies or sensors.
+
+    Raises ValueError, one line: an unknown name, column or output, a command of zeros, a simulation that
+    friction and springs cannot be put around.
+    """
+    for name in () if names == "all" else names:
+        if name not in KINDS:
+            raise ValueError(f"plant: no listed effect is called {name!r}; there are {', '.join(KINDS)}")
+    force = input if force is None else force
+    for column in (input, force, *(measured_motion or ())):
+        if not 0 <= column < experiments[0].input.shape[1]:
+            count = experiments[0].input.shape[1]
+            raise ValueError(f"plant: there is no input {column}; the records have {count}, from 0 on")
+    seen = 0 if output is None else _column(plant, output)
+    body: AnyBody | None = None
+    if motion is not None:
+        moving = motion if isinstance(motion, int) else _column(plant, motion)
+        seen = moving if output is None and moving < len(plant.output_names) else seen
+        sizes = _of_body(plant, experiments, dt_s, force, moving, motion_is, largest_force)
+        body = Body(force, moving, motion_is == "speed", dt_s, sizes.force)
+    elif measured_motion is not None:
+        sizes = Sizes(
+            force=_largest(e.output[:, seen] for e in experiments),
+            position=_largest(e.input[:, measured_motion[0]] for e in experiments),
+            speed=_largest(e.input[:, measured_motion[1]] for e in experiments),
+        )
+        body = MeasuredBody(*measured_motion, seen)
+    else:
+        sizes = Sizes()
+    sizes = replace(
+        sizes,
+        input=sizes.force if body and input == force else _largest(e.input[:, input] for e in experiments),
+        output=_largest(e.output[:, seen] - np.mean(e.output[:, seen]) for e in experiments),
+        dt_s=dt_s,
+        duration_s=dt_s * max(len(e.input) for e in experiments),
+    )
+    places: dict[Where, int | AnyBody | None] = {"input": input, "output": seen, "body": body}
+    if measured_motion is not None:
+        places["input"] = None
+    found = list(plant.effects)
+    for name in _applying(plant, places) if names == "all" else names:
+        kind, place = KINDS[name], places[KINDS[name].where]
+        if place is None or (kind.where == "input" and not sizes.input > 0):
+            raise ValueError(f"plant: {name} {_MISSING[kind.where]}")
+        simpler = None if kind.contains is None else prefix + kind.contains
+        found.append(
+            PlantEffect(
+                prefix + name,
+                kind.parameters(sizes),
+                signed=kind.signed,
+                grows=kind.grows,
+                dependence=kind.dependence,
+                group=_GROUPS[kind.where],
+                contains=simpler,
+                acts=Acts(kind.where, place, kind.change, dt_s, at_rest_before),
+            )
+        )
+    equipped = replace(plant, effects=tuple(found))
+    _try(equipped, experiments[0], body)
+    return equipped
+
+
+def _applying(plant: Plant, places: Mapping[Where, object]) -> list[str]:
+    left_out = _BY_NAME_ONLY if len(plant.output_names) > 1 else (*_BY_NAME_ONLY, *_TWINS)
+    return [n for n, kind in KINDS.items() if n not in left_out and places[kind.where] is not None]
+
+
+def _column(plant: Plant, output: str) -> int:
+    if output not in plant.output_names:
+        raise ValueError(f"plant: no output is called {output!r}; there are {', '.join(plant.output_names)}")
+    return plant.output_names.index(output)
+
+
+def _largest(signals: Iterable[Real]) -> float:
+    return max(float(np.max(np.abs(signal))) for signal in signals)
+
+
+def _of_body(
+    plant: Plant,
+    experiments: Sequence[PlantExperiment],
+    dt_s: float,
+    force: int,
+    motion: int,
+    motion_is: str,
+    largest_force: float | None,
+) -> Sizes:
+    pushed = largest_force or _largest(e.input[:, force] for e in experiments)
+    if not pushed > 0:
+        raise ValueError(
+            f"plant: input {force} is zero in every record: friction needs largest_force= for its sizes"
+        )
+    moved = [_motion(plant, e, motion) for e in experiments]
+    if motion_is == "speed":
+        position, speed = _largest(np.cumsum(v) * dt_s for v in moved), _largest(moved)
+    else:
+        smooth = (savgol_filter(x, _SMOOTHED, 2, deriv=1, delta=dt_s) for x in moved)
+        position, speed = _largest(moved), _largest(smooth)
+    return Sizes(force=pushed, position=position, speed=speed)
+
+
+def _motion(plant: Plant, experiment: PlantExperiment, column: int) -> Real:
+    if column < len(plant.output_names):
+        return experiment.output[:, column]
+    simulated = np.asarray(plant.simulation(plant.parameters, {}, experiment.input))
+    if simulated.ndim != 2 or simulated.shape[1] <= column:
+        raise ValueError(f"plant: motion= is column {column} of a simulation that returns {simulated.shape}")
+    return np.asarray(simulated[:, column])
+
+
+def _try(plant: Plant, experiment: PlantExperiment, body: AnyBody | None) -> None:
+    """Raises ValueError where the simulation does not follow a moderate force on the body."""
+    for effect in plant.effects:
+        if effect.acts is None or effect.acts.on is not body:
+            continue
+        candidate = effect.candidates()[0]
+        change = candidate.effect_at(np.array(candidate.starts[len(candidate.starts) // 2]))
+        if not np.all(np.isfinite(plant.simulated([change])(experiment.input))):
+            raise ValueError(
+                f"plant: {effect.name} cannot be put around this simulation (experiment {experiment.name}: "
+                "its force and the motion do not settle); write its equation into it"
+            )

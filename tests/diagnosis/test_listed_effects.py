@@ -1,0 +1,199 @@
+"""Listed effects around simulations that know none of them, against scipy's integrator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.signal import lsim
+
+from diagnosis import Plant, PlantExperiment, with_effects
+from diagnosis.machine.listed_effects import KINDS
+from diagnosis.machine.plant_effect import Change
+from tests.diagnosis.machines import rubbing
+
+DT_S = 0.01
+
+
+@njit
+def _moved(force, mass, damper, spring, pendulum, dt_s):
+    """Position and speed (T, 2): spring (or gravity on a pendulum) and damper; Runge-Kutta steps."""
+    state, found = np.zeros(2), np.zeros((force.size, 2))
+    h = dt_s / 4
+    for k in range(force.size):
+        found[k] = state
+        for _ in range(4):
+            total, slope = np.zeros(2), np.zeros(2)
+            for part, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+                x, v = state + part * h * slope
+                pull = spring * (np.sin(x) if pendulum else x)
+                slope = np.array([v, (force[k] - damper * v - pull) / mass])
+                total += weight * slope
+            state = state + h / 6 * total
+    return found
+
+
+# Mass, damper, spring, whether the spring is gravity on a pendulum.
+BODIES = {
+    "mass": (2.0, 0.0, 0.0, False),
+    "on a spring": (2.0, 3.0, 80.0, False),
+    "pendulum": (1.0, 0.1, 20.0, True),
+}
+
+
+def _acceleration(name, more=lambda x, v: 0.0):
+    m, c, k, pendulum = BODIES[name]
+    return lambda x, v, u: (u - c * v - k * (np.sin(x) if pendulum else x) - more(x, v)) / m
+
+
+def _force(dt_s, seconds=5.0, amplitude=6.0):
+    levels = amplitude * np.random.default_rng(3).uniform(-1, 1, int(seconds / 0.2))
+    return levels.repeat(round(0.2 / dt_s))
+
+
+class _Counted:
+    def __init__(self, name, dt_s, sign=1.0):
+        self.body, self.dt_s, self.sign, self.calls = BODIES[name], dt_s, sign, 0
+
+    def __call__(self, parameters, effects, inputs):
+        self.calls += 1
+        return self.sign * _moved(inputs[:, 0].copy(), *self.body, self.dt_s)
+
+
+def _wrapped(simulation, force, names, dt_s, motion="x"):
+    record = PlantExperiment("a", "estimation", force[:, None], simulation({}, {}, force[:, None]))
+    plant = Plant(simulation, {}, {}, ("x", "v"), np.full(2, 1e-4))
+    how = {"motion": motion, "motion_is": "speed" if motion == "v" else "position"}
+    return with_effects(plant, names, [record], dt_s=dt_s, **how)
+
+
+def _missed(found, truth, free):
+    """Error over what the effects change."""
+    return np.linalg.norm(found - truth, axis=0) / np.linalg.norm(free - truth, axis=0)
+
+
+@pytest.mark.parametrize("motion", ["x", "v"])
+@pytest.mark.parametrize("name", BODIES)
+def test_dry_friction_around_a_simulation_is_the_one_inside_it(name, motion):
+    errors = []
+    for dt_s in (DT_S, DT_S / 2):
+        force, simulation = _force(dt_s), _Counted(name, dt_s)
+        truth = rubbing(_acceleration(name), force, dt_s, lambda v: 0.8 / BODIES[name][0])
+        plant = _wrapped(simulation, force, ["coulomb_friction"], dt_s, motion)
+        simulation.calls = 0
+        found = plant.simulated([Change("coulomb_friction", {"force": 0.8})])(force[:, None])
+        # Once where the machine is linear; without friction it has run before.
+        assert simulation.calls <= (3 if name == "pendulum" else 2)
+        errors.append(_missed(found, truth, simulation({}, {}, force[:, None])))
+    # Measured: 4.5e-4 on the spring, 1.1e-4 of the pendulum, 4e-6 of the mass, whose speed is exact.
+    assert np.all(errors[0] < 6e-4)
+    if name == "on a spring":
+        # Friction is its mean over a sample: second order (4 times less at half the sample).
+        np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.15)
+
+
+def test_springs_viscous_and_stribeck_friction_together():
+    def level(v):
+        return (0.5 + 0.4 * np.exp(-abs(v) / 0.3)) / 2
+
+    force, simulation = _force(DT_S), _Counted("mass", DT_S)
+    truth = rubbing(_acceleration("mass", lambda x, v: 1.5 * v + 8 * x + 10 * x**3), force, DT_S, level)
+    names = ["stribeck_friction", "viscous_friction", "spring", "hardening_spring"]
+    values = [
+        {"static_force": 0.9, "coulomb_share": 5 / 9, "velocity": 0.3},
+        {"coefficient": 1.5},
+        {"stiffness": 8.0},
+        {"cubic": 10.0},
+    ]
+    plant = _wrapped(simulation, force, names, DT_S)
+    found = plant.simulated([Change(n, v) for n, v in zip(names, values, strict=True)])(force[:, None])
+    # Measured 4e-4: the trapezoidal rule on a period of 300 samples.
+    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 1e-3)
+
+
+def test_friction_one_way_in_the_direction_of_the_force():
+    force, acceleration = _force(DT_S), _acceleration("on a spring")
+    truth = rubbing(acceleration, force, DT_S, lambda v: 0.4 if v > 0 else 1e-12)
+    for sign in (1.0, -1.0):
+        simulation = _Counted("on a spring", DT_S, sign)
+        plant = _wrapped(simulation, force, ["one_sided_friction"], DT_S)
+        found = plant.simulated([Change("one_sided_friction", {"force": 0.8})])(force[:, None])
+        assert np.all(_missed(sign * found, truth, sign * simulation({}, {}, force[:, None])) < 1e-3)
+
+
+def _after(name, values, signal, **more):
+    """What an effect makes of a signal (T,) that a simulation passes on."""
+    record = PlantExperiment("a", "estimation", signal[:, None], signal[:, None])
+    plant = Plant(lambda p, e, u: u, {}, {}, ("y",), np.ones(1))
+    plant = with_effects(plant, [name], [record], dt_s=DT_S, **more)
+    return plant.simulated([Change(name, values)])(signal[:, None])[:, 0]
+
+
+def test_effects_of_actuator_and_sensor_are_their_equations():
+    rng = np.random.default_rng(5)
+    u, t = rng.uniform(-2, 2, 40).repeat(5), DT_S * np.arange(200)
+    fine = u.repeat(1000)
+
+    def averaged(x):
+        return x.reshape(-1, 1000).mean(axis=1)
+
+    late = averaged(np.concatenate([np.zeros(2300), fine])[: fine.size])
+    np.testing.assert_allclose(_after("input_delay", {"delay_s": 0.023}, u), late, atol=1e-12)
+    held = averaged(np.concatenate([np.full(2300, u[0]), fine])[: fine.size])
+    running = _after("input_delay", {"delay_s": 0.023}, u, at_rest_before=False)
+    np.testing.assert_allclose(running, held, atol=1e-12)
+    np.testing.assert_allclose(_after("sensor_delay", {"delay_s": 0.02}, u)[2:], u[:-2], atol=1e-12)
+    grid = DT_S / 1000 * np.arange(fine.size)
+    lag = averaged(lsim(([1.0], [0.03, 1.0]), fine, grid, interp=False)[1])
+    # The mean of a thousand values from a sample's start is half a thousandth of its change off.
+    np.testing.assert_allclose(_after("actuator_lag", {"time_constant_s": 0.03}, u), lag, atol=1e-3)
+    ramp = 3.0 * t
+    behind = ramp - 3.0 * 0.05 * (1 - np.exp(-t / 0.05))
+    np.testing.assert_allclose(_after("sensor_lag", {"time_constant_s": 0.05}, ramp), behind, atol=1e-12)
+    assert np.ptp(_after("actuator_saturation", {"limit": 0.5}, u)) == 1.0
+    dead = _after("actuator_dead_zone", {"width": 0.5}, u)
+    np.testing.assert_allclose(dead[np.abs(u) > 0.5], (u - 0.5 * np.sign(u))[np.abs(u) > 0.5])
+    assert not np.any(dead[np.abs(u) <= 0.5])
+    for name in ("actuator_gain", "sensor_gain"):
+        np.testing.assert_allclose(_after(name, {"relative_error": -0.1}, u), 0.9 * u)
+    for name in ("input_offset", "sensor_offset"):
+        np.testing.assert_allclose(_after(name, {"offset": -0.1}, u), u - 0.1)
+    for name in ("input_drift", "sensor_drift"):
+        np.testing.assert_allclose(_after(name, {"rate_per_s": 0.2}, u), u + 0.2 * t)
+    triangle = np.concatenate([np.arange(100.0), np.arange(100.0, 0, -1)])
+    # Behind by half the gap either way, still for a whole one where it turns round.
+    expected = np.concatenate([np.maximum(triangle[:100] - 2, 0), np.minimum(triangle[100:] + 2, 98)])
+    np.testing.assert_allclose(_after("backlash", {"gap": 4.0}, triangle), expected)
+    np.testing.assert_allclose(_after("input_backlash", {"gap": 4.0}, triangle), expected)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_listed_effect_is_next_to_nothing_at_its_end_and_plain_at_its_starts(name):
+    force, simulation = _force(DT_S), _Counted("on a spring", DT_S)
+    plant = _wrapped(simulation, force, [name], DT_S)
+    free = simulation({}, {}, force[:, None])[:, 0]
+    for candidate in plant.effects[0].candidates():
+        low, high = candidate.box
+
+        def change(x, candidate=candidate):
+            found = plant.simulator([candidate.effect_at(np.array(x))])(force[:, None])[:, 0]
+            return np.linalg.norm(found - free) / np.linalg.norm(free)
+
+        least = [low[0] if candidate.grows else high[0], *candidate.starts[0][1:]]
+        assert change(least) < 1e-3
+        assert max(change(x) for x in candidate.starts) > 0.02
+
+
+def test_two_friction_laws_add_up_and_an_unmeasured_motion_will_do():
+    force, simulation = _force(DT_S), _Counted("on a spring", DT_S)
+    record = PlantExperiment("a", "estimation", force[:, None], simulation({}, {}, force[:, None])[:, :1])
+    plant = Plant(simulation, {}, {}, ("x",), np.full(1, 1e-4))
+    names = ["coulomb_friction", "stribeck_friction"]
+    plant = with_effects(plant, names, [record], dt_s=DT_S, motion=1, motion_is="speed")
+    assert plant.effects[1].contains == "coulomb_friction"
+    half = Change("coulomb_friction", {"force": 0.4})
+    flat = Change("stribeck_friction", {"static_force": 0.4, "coulomb_share": 1.0, "velocity": 0.1})
+    together = plant.simulated([half, flat])(force[:, None])
+    alone = plant.simulated([Change("coulomb_friction", {"force": 0.8})])(force[:, None])
+    assert together.shape == (force.size, 1)
+    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-12)
