@@ -21,7 +21,7 @@ from diagnosis.machine.machine_protocol import Real
 
 _ROUNDS = 12
 # Of the change that the effects make: what rounds may still move.
-_CONVERGED = 1e-4
+_CONVERGED = 1e-5
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
 _FORGOTTEN = 1e-7

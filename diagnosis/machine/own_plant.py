@@ -31,7 +31,7 @@ from diagnosis.machine.machine_protocol import (
     Weighing,
     check_record,
 )
-from diagnosis.machine.plant_effect import Change, PlantEffect
+from diagnosis.machine.plant_effect import Change, PlantEffect, WrongValue
 from ident.data.arrays import lock
 from plant.effects.search_space import Candidate
 
@@ -53,8 +53,9 @@ class Plant:
         around it (`with_effects`).
     parameters : name -> stated value
     tolerances : name -> relative standard deviation of the nominal parameter
-        Parameters without one are exact. A value fitted to these same records is no knowledge beside them:
-        give it a tolerance of 1 or more.
+        Parameters without one are exact; those with one are listed as "wrong_NAME", a ratio, from three
+        tolerances on. A value fitted to these same records is no knowledge beside them: give it a tolerance
+        of 1 or more, and it moves freely.
     output_names : (Y,)
     noise : (Y,). Noise standard deviations, from repeats of an experiment where there are any.
     effects : tuple of PlantEffect
@@ -94,14 +95,22 @@ class Plant:
             if names.count(name) > 1:
                 raise ValueError(f"plant: effect {name} is listed twice")
 
+    @property
+    def missing(self) -> tuple[PlantEffect | WrongValue, ...]:
+        """Everything that may be named."""
+        return (*self.effects, *WrongValue.all_of(self.tolerances))
+
     @cached_property
     def weighing(self) -> Weighing:
-        names = tuple(effect.name for effect in self.effects)
-        return Weighing(names, float(self.model_error))
+        return Weighing(tuple(kind.id for kind in self.missing), float(self.model_error))
 
     @property
     def description(self) -> Plant:
         return self
+
+    def value(self, key: str) -> float:
+        """Stated value of a parameter."""
+        return self.parameters[key]
 
     def scaled(self, factors: Mapping[str, float]) -> Plant:
         """The same plant with these parameters multiplied."""
@@ -135,6 +144,10 @@ class Plant:
         Raises ValueError, one line: a shape that does not fit, an error of the simulation that is not
         numerical (those it raises as they are).
         """
+        wrong = {kind.id: kind.multiplies for kind in WrongValue.all_of(self.tolerances)}
+        ratios = {wrong[e.id]: e.values["ratio"] for e in effects if e.id in wrong}
+        if ratios:
+            return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong])
         listed = {effect.name: effect.acts for effect in self.effects if effect.acts is not None}
         told = {effect.id: effect.values for effect in effects if effect.id not in listed}
         acting = [
@@ -169,7 +182,7 @@ class Plant:
         return f"plant: with {values}" + (f" and {added}" if added else "")
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
-        return tuple(candidate for effect in self.effects for candidate in effect.candidates())
+        return tuple(candidate for kind in self.missing for candidate in kind.candidates())
 
 
 @dataclass(frozen=True, eq=False)

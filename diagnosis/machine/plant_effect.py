@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from diagnosis.machine.around import Acts
+from plant.effects.base import ratio_candidates
 from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
 
 _STEPS = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
@@ -127,3 +128,36 @@ class PlantEffect:
     @property
     def id(self) -> str:
         return self.name
+
+
+# A stated value may be wrong by this factor.
+_LARGEST_RATIO = 10.0
+# From this tolerance on (1: nothing is known) no value is wrong.
+_KNOWS_NOTHING = 1.0
+
+
+@dataclass(frozen=True)
+class WrongValue:
+    """A stated parameter that is wrong by several of its tolerances: a finding, no matter of tolerances."""
+
+    multiplies: str
+    tolerance: float
+    dependence: ClassVar[Dependence] = "smooth"
+    harmonic: ClassVar[Harmonic | None] = None
+    adds_to: ClassVar[str | None] = None
+    contains: ClassVar[str | None] = None
+    absolute_angle: ClassVar[bool] = False
+
+    @classmethod
+    def all_of(cls, tolerances: Mapping[str, float]) -> tuple[WrongValue, ...]:
+        return tuple(cls(key, value) for key, value in tolerances.items() if value < _KNOWS_NOTHING)
+
+    @property
+    def id(self) -> str:
+        return f"wrong_{self.multiplies}"
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        return ratio_candidates(self, self.tolerance, _LARGEST_RATIO)
+
+    def from_search(self, values: Mapping[str, float], sign: int) -> Change:
+        return Change(self.id, MappingProxyType(dict(values)))

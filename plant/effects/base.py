@@ -11,7 +11,15 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic, Scales, log_axis
+from plant.effects.search_space import (
+    Axis,
+    Candidate,
+    Dependence,
+    EffectKind,
+    Harmonic,
+    Scales,
+    log_axis,
+)
 from plant.machine import Machine, SmoothTorque
 from plant.rig import Rig
 
@@ -152,20 +160,23 @@ class RatioEffect(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        """Both sides of one, from where the tolerance of the stated value no longer explains the ratio."""
-        tolerance = scales.tolerance(cls.multiplies)
-        least, largest = max(1e-6, _LEAST_TOLERANCES * tolerance), cls.largest_ratio
-        points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
-        points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
-        usual = 1 + USUAL_TOLERANCES * tolerance
-        above = log_axis("ratio", 1 + least, largest, usual=(1 + least, usual) if tolerance > 0 else None)
-        sides = [Candidate(cls, (above,), tuple((float(p),) for p in points))]
-        below = max(1 - least, 0.2) if least < 1 else 0.0
-        if below > 0:
-            axis = log_axis("ratio", 1 / largest, below, usual=(1 / usual, below) if tolerance > 0 else None)
-            starts = tuple((float(v),) for v in np.minimum(-points, np.log(below)))
-            sides.append(Candidate(cls, (axis,), starts, sign=-1, grows=False))
-        return tuple(sides)
+        return ratio_candidates(cls, scales.tolerance(cls.multiplies), cls.largest_ratio)
+
+
+def ratio_candidates(kind: EffectKind, tolerance: float, largest: float) -> tuple[Candidate, ...]:
+    """Both sides of one, from where the tolerance of the stated value no longer explains the ratio."""
+    least = max(1e-6, _LEAST_TOLERANCES * tolerance)
+    points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
+    points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
+    usual = 1 + USUAL_TOLERANCES * tolerance
+    above = log_axis("ratio", 1 + least, largest, usual=(1 + least, usual) if tolerance > 0 else None)
+    sides = [Candidate(kind, (above,), tuple((float(p),) for p in points))]
+    below = max(1 - least, 0.2) if least < 1 else 0.0
+    if below > 0:
+        axis = log_axis("ratio", 1 / largest, below, usual=(1 / usual, below) if tolerance > 0 else None)
+        starts = tuple((float(v),) for v in np.minimum(-points, np.log(below)))
+        sides.append(Candidate(kind, (axis,), starts, sign=-1, grows=False))
+    return tuple(sides)
 
 
 def with_voltage(machine: Machine, **changes: Any) -> Machine:
