@@ -170,11 +170,14 @@ def identify(
     log: Annotated[
         list[Path],
         typer.Argument(
-            help="CSV (one header line) or named arrays (npz, mat, ...); several files are fitted together."
+            help="CSV or other tables, npz, MAT, ... (docs/logs.md); several files are fitted together."
         ),
     ],
-    input_name: Annotated[str, typer.Option("--input", help="Name of the input column.")],
-    output_name: Annotated[str, typer.Option("--output", help="Name of the output column.")],
+    input_name: Annotated[
+        str | None,
+        typer.Option("--input", help="Name of the input column [default: as names and units say]"),
+    ] = None,
+    output_name: Annotated[str | None, typer.Option("--output", help="Name of the output column.")] = None,
     time: Annotated[str | None, typer.Option(help="Name of the time column; this or --dt-s.")] = None,
     time_unit: Annotated[
         str | None,
@@ -184,6 +187,18 @@ def identify(
         ),
     ] = None,
     dt_s: Annotated[float | None, typer.Option(help="Sampling period [s], if there is no --time.")] = None,
+    scale: Annotated[
+        list[str] | None,
+        typer.Option(help="COLUMN=FACTOR: quantity = factor * column + offset (repeatable).", metavar="TEXT"),
+    ] = None,
+    offset: Annotated[list[str] | None, typer.Option(help="COLUMN=VALUE, added after scaling.")] = None,
+    unit: Annotated[list[str] | None, typer.Option(help="COLUMN=UNIT of that quantity.")] = None,
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair", help="Put time stamps that jitter, and single missing rows, on a uniform grid."
+        ),
+    ] = False,
     report_page: Annotated[
         Path | None,
         typer.Option(
@@ -290,6 +305,10 @@ def identify(
             time=time,
             dt_s=dt_s,
             time_unit=time_unit,
+            scale={name: _number("--scale", text) for name, text in _named("--scale", scale).items()},
+            offset={name: _number("--offset", text) for name, text in _named("--offset", offset).items()},
+            units=_named("--unit", unit),
+            repair=repair,
             reference=reference,
             input_limit=input_limit,
             validation=validation or [],
@@ -450,6 +469,27 @@ def diagnose(
         _complain(line, found.exit_code)
     if found.exit_code != EXIT_OK:
         raise typer.Exit(found.exit_code)
+
+
+def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:
+    """NAME=VALUE, as often as the option is there; a name may have = in it."""
+    pairs = [text.rpartition("=") for text in stated or ()]
+    for name, _, value in pairs:
+        if not name or not value:
+            raise InputError(f"{option} {name}{value}: expected COLUMN=VALUE")
+    return {name: value for name, _, value in pairs}
+
+
+def _number(option: str, text: str) -> float:
+    from math import isfinite
+
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not isfinite(number) or (number == 0 and option == "--scale"):
+        raise InputError(f"{option} {text}: expected a finite number{', not 0' * (option == '--scale')}")
+    return number
 
 
 def _degree(text: str | None) -> int | str | None:

@@ -31,6 +31,7 @@ class FindingKind(Enum):
     OUTSIDE_BAND = auto()
     # Records.
     TIME_UNIT = auto()
+    REPAIRED = auto()
     FEW_SAMPLES = auto()
     UNKNOWN_TIME_CONSTANT = auto()
     UNKNOWN_DAMPING = auto()

@@ -8,11 +8,11 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relative_deficit, standard_axes
-from ident.data.record_files import Table, read_table
+from ident.data.record_files import read_table
+from ident.data.table import Table
 
 # A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
 # more.
@@ -144,8 +144,10 @@ class FrequencyUncertainty:
         """Write the columns `from_csv` reads; numbers keep all their digits."""
         parts = (self.centre.real, self.centre.imag, self.covariance[:, 0, 0], self.covariance[:, 1, 1])
         columns = {"omega_rad_s": self.omega_rad_s, **dict(zip(_COLUMNS, parts, strict=True))}
-        table = pd.DataFrame({**columns, _CROSS: self.covariance[:, 0, 1]})
-        table.to_csv(path, index=False, lineterminator="\n")
+        columns[_CROSS] = self.covariance[:, 0, 1]
+        rows = zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True)
+        text = "\n".join(",".join(row) for row in (tuple(columns), *rows)) + "\n"
+        Path(path).write_text(text, encoding="utf-8", newline="\n")
 
     def _matching(self, response: npt.ArrayLike) -> ComplexArray:
         response = np.asarray(response, dtype=np.complex128)

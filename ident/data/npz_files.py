@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import io
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ident.data.foreign_files import LARGEST_BYTES, Unread, content_of, shown
+from ident.data.foreign_files import LARGEST_BYTES, Unread, shown
 
 _ENCRYPTED = 0x1
 
 
-def npz_arrays(file: Path, only: str | None = None) -> dict[str, Any]:
+def npz_arrays(content: bytes, only: str | None = None) -> dict[str, Any]:
     """The arrays of an npz file by name (or just the one called `only`); `Unread` in place of Python objects.
 
     Raises ValueError with the reason, without the name of the file: no archive, encrypted, damaged, a name
     twice, more than `LARGEST_BYTES`. Nothing is ever unpickled.
     """
     try:
-        archive = zipfile.ZipFile(io.BytesIO(content_of(file)))
+        archive = zipfile.ZipFile(io.BytesIO(content))
         entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
     except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError):
         raise ValueError("not a numpy .npz archive") from None

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
 from ident.data.arrays import RealArray, readonly_real
-from ident.data.units import TimeColumn, written_unit
+from ident.data.finding import Finding
+from ident.data.record_files import read_table
+from ident.data.time_grid import Repair, TimeGrid
+from ident.data.units import TimeColumn
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 _LARGEST = 1e100
@@ -31,6 +34,7 @@ class Record:
     source : str. Where the data came from (the file), named in later error messages.
     time_column : TimeColumn or None
         What the file's time stamps were taken for; None where dt_s was given without any.
+    repair : Repair or None. What was done to rows that jittered or were missing.
     cut : int. Samples of the commanded input beyond what the amplifier gives (`limited`).
 
     Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
@@ -49,6 +53,7 @@ class Record:
     output_units: tuple[str, ...] = ()
     source: str = ""
     time_column: TimeColumn | None = None
+    repair: Repair | None = None
     cut: int = 0
 
     def __post_init__(self) -> None:
@@ -95,6 +100,13 @@ class Record:
     def label(self) -> str:
         """How error messages call this record: the file if there is one, else the name."""
         return self.source or f"record '{self.name}'"
+
+    @property
+    def doubts(self) -> tuple[Finding, ...]:
+        """What to know of the time base before trusting a frequency."""
+        column, repair = self.time_column, self.repair
+        found = [column.doubt(self.dt_s)] if column is not None and column.doubtful else []
+        return (*found, *([repair.finding(self.label, self.dt_s)] if repair is not None else []))
 
     @property
     def n_samples(self) -> int:
@@ -172,19 +184,21 @@ class Record:
         time_unit: str | None = None,
         references: Sequence[str] = (),
         name: str | None = None,
-        **reading: Any,
+        scale: Mapping[str, float] | None = None,
+        offset: Mapping[str, float] | None = None,
+        units: Mapping[str, str] | None = None,
+        repair: bool = False,
     ) -> Self:
         """Read columns of a CSV, npz or MATLAB file; readers and checks: `ident.data.record_files`.
 
         The sampling time comes from the column `time`, from dt_s, or from both if they agree. The unit of
         the time stamps is time_unit, else the one in the column's name ('t_ms', 'Zeit [ms]'), else seconds;
         signals keep the unit in their names. What was taken stands in `time_column`, `input_units` and
-        `output_units`. `reading` are options of the reader (CSV: separator). Raises ValueError in one line
-        naming file and place.
+        `output_units`. scale, offset, units: by column, quantity = scale * column + offset in that unit.
+        repair: stamps that jitter, and single missing rows, are put on a uniform grid (`TimeGrid`), not
+        refused. Raises ValueError in one line naming file and place.
         """
-        from ident.data.record_files import read_table
-
-        table = read_table(path, **reading)
+        table = read_table(path)
         for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
             if isinstance(names, str):
                 raise ValueError(
@@ -204,28 +218,42 @@ class Record:
             )
         columns = table.columns(wanted if time is None else [time, *wanted])
         stamps, base = (None, None) if time is None else table.seconds(time, columns[time], time_unit)
+        scale, offset, units = scale or {}, offset or {}, units or {}
+        for item in (*scale, *offset, *units):
+            if item not in wanted:
+                raise ValueError(
+                    f"{table.path}: scale, offset or unit of column {item!r}, which is not used as a signal"
+                )
+        grid = None
+        if repair and time is not None and stamps is not None:
+            grid = TimeGrid.of(table, time, stamps)
+            stamps = np.asarray(grid.dt_s * np.arange(int(grid.rows[-1]) + 1), dtype=np.float64)
         step = table.sampling_time(stamps, time, dt_s)
 
-        def stack(names: Sequence[str]) -> RealArray:
-            return np.column_stack([columns[item] for item in names]) if names else np.zeros((0, 0))
+        def stack(names: Sequence[str], held: bool = False) -> RealArray:
+            if not names:
+                return np.zeros((0, 0))
+            found = [columns[item] * scale.get(item, 1.0) + offset.get(item, 0.0) for item in names]
+            if grid is None:
+                return np.column_stack(found)
+            return np.column_stack([grid.held(item) if held else grid.sampled(item) for item in found])
+
+        def stated(names: Sequence[str]) -> tuple[str, ...]:
+            found = tuple(units.get(item, "" if item in scale else table.unit(item)) for item in names)
+            return found if any(found) else ()
 
         return cls(
             name=table.path.stem if name is None else name,
-            input=stack(inputs),
+            input=stack(inputs, held=True),
             output=stack(outputs),
             dt_s=step,
             input_names=tuple(inputs),
             output_names=tuple(outputs),
-            reference=stack(references) if references else None,
+            reference=stack(references, held=True) if references else None,
             reference_names=tuple(references),
-            input_units=_units(inputs),
-            output_units=_units(outputs),
+            input_units=stated(inputs),
+            output_units=stated(outputs),
             source=str(table.path),
             time_column=base,
+            repair=None if grid is None else grid.repair,
         )
-
-
-def _units(names: Sequence[str]) -> tuple[str, ...]:
-    """The units that stand in the names; empty if there is none at all."""
-    found = tuple(written_unit(name) for name in names)
-    return found if any(found) else ()

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ident.data.arrays import RealArray
-from ident.data.record_files import Table
+from ident.data.finding import Finding, FindingKind, finding
+from ident.data.table import Table
 
 # Stamps this far off a multiple (in samples) are no jitter that an interpolation makes good.
 _LARGEST_JITTER = 0.2
@@ -20,6 +20,35 @@ _LARGEST_JITTER = 0.2
 _ON_GRID = 1e-3
 _MOST_LOST_ROWS = 5
 _MOST_LOST_SHARE = 0.05
+
+
+# Angular frequency times spacing at which a cubic spline is wrong by 1 % of a sine: 5/384 (omega h)^4.
+_FAITHFUL = (0.01 * 384 / 5) ** 0.25
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What was done to the rows of a log to have them on a uniform grid.
+
+    missing of samples rows were filled in; jitter: largest distance of a stamp from its instant, in samples.
+    """
+
+    samples: int
+    missing: int
+    jitter: float
+
+    def finding(self, record: str, dt_s: float) -> Finding:
+        """too_narrow: share by which ellipses shrink if every filled row counts as one more measurement;
+        above faithful_rad_s the spline is wrong by more than 1 % of the motion."""
+        return finding(
+            FindingKind.REPAIRED,
+            record=record,
+            samples=self.samples,
+            missing=self.missing,
+            jitter=self.jitter,
+            too_narrow=(self.samples / (self.samples - self.missing)) ** 0.5 - 1,
+            faithful_rad_s=_FAITHFUL / ((1 + 2 * self.jitter) * dt_s),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +106,12 @@ class TimeGrid:
         return cls(float(f"{slope:.12g}"), rows, np.zeros(len(rows)) if on_grid else late)
 
     @property
+    def repair(self) -> Repair | None:
+        """What `sampled` changes; None where the log is on the grid as it is."""
+        jitter = float(np.max(np.abs(self.late)))
+        return Repair(int(self.rows[-1]) + 1, len(self.missing), jitter) if self.missing or jitter else None
+
+    @property
     def missing(self) -> tuple[int, ...]:
         """Samples that the log lacks."""
         return tuple(int(k) for k in np.setdiff1d(np.arange(self.rows[-1] + 1), self.rows))
@@ -88,6 +123,8 @@ class TimeGrid:
         noise of the readings next to a missing row goes into it. Readings that are on the grid stay as they
         are.
         """
+        from scipy.interpolate import CubicSpline  # here: a log that is refused never waits for it
+
         grid = np.arange(self.rows[-1] + 1)
         if len(grid) == len(values) and not self.late.any():
             return values

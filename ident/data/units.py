@@ -63,8 +63,9 @@ class TimeColumn:
         return finding(FindingKind.TIME_UNIT, name=self.name, in_header=self.in_header, dt_s=dt_s)
 
     @classmethod
-    def of(cls, name: str, stated: str | None = None) -> TimeColumn:
-        """Raises ValueError (one line) for a unit that nobody knows."""
+    def of(cls, name: str, stated: str | None = None, beside: str = "") -> TimeColumn:
+        """stated: by the user; beside: by the file, outside of the name. Raises ValueError (one line) for a
+        unit that nobody knows."""
         if stated is not None:
             if stated.lower() not in TIME_UNITS:
                 raise ValueError(f"unknown unit of time '{stated}'; expected {', '.join(KNOWN_TIME_UNITS)}")
@@ -72,9 +73,9 @@ class TimeColumn:
             return cls(name, unit, TIME_UNITS.get(written_unit(name).lower(), ""), stated=True)
         # 'time ms', or just 'ms': no unit in the name of any other signal, but of time it is.
         last = re.split(r"[\s_./]", name.strip())[-1]
-        written = written_unit(name) or (last if last.lower() in TIME_UNITS else "")
+        written = beside or written_unit(name) or (last if last.lower() in TIME_UNITS else "")
         known = TIME_UNITS.get(written.lower(), "")
-        if written and not known and _BRACKETED.search(name):
+        if written and not known and (beside or _BRACKETED.search(name)):
             raise ValueError(
                 f"time column '{name}': unknown unit '{written}'; expected {', '.join(KNOWN_TIME_UNITS)}, "
                 "or state it with --time-unit (time_unit)"
@@ -108,13 +109,14 @@ def written_unit(name: str) -> str:
         text = (found[1] if found[1] is not None else found[2]).strip()
         return "" if re.fullmatch(r"[\d.,:\s-]*", text) else text
     suffixes = (name[found.end() :] for found in re.finditer("_", name))
-    unit = next((text for text in suffixes if _is_unit(text)), "")
+    unit = next((text for text in suffixes if is_unit(text)), "")
     if unit:
         return unit.replace("_", "/")
     found = _AFTER.search(name)
     unit = (found[1] or found[2]) if found else ""
-    return unit if _is_unit(unit) else ""
+    return unit if is_unit(unit) else ""
 
 
-def _is_unit(text: str) -> bool:
+def is_unit(text: str) -> bool:
+    """Whether the word is a unit that headers use: of time, or of a signal."""
     return text.lower() in TIME_UNITS or _SIGNAL.fullmatch(text) is not None

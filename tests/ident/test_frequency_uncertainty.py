@@ -157,7 +157,7 @@ HEADER = "omega_rad_s,real,imag,variance_real,variance_imag,covariance_real_imag
         (HEADER + "1,1,0,-1,1,0\n", "line 2: a variance is negative"),
         (HEADER + "1,1,0,1,1,2\n", "not positive semidefinite"),
         (HEADER + "2,1,0,1,1,0\n1,1,0,1,1,0\n", "strictly increasing"),
-        (HEADER + "1,1,0\n", "line 2: column 'variance_real' is empty"),
+        (HEADER + "1,1,0\n", "line 2: 3 cells where line 1 has 6"),
         (HEADER, "no rows"),
         ("omega_rad_s,real\n1,2\n", "no column 'imag'; the file has omega_rad_s, real"),
         ("real,imag\n1,2\n", "exactly one of the columns"),

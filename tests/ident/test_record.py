@@ -8,6 +8,7 @@ import scipy.io
 
 from ident.data import record_files
 from ident.data.record import Record
+from ident.data.table import Table
 
 T, U, Y = "t_s", "u_V", "y_rad"
 
@@ -55,12 +56,6 @@ def test_csv_with_spaces_bom_and_trailing_blank_lines(tmp_path):
     assert read(path).n_samples == 6
 
 
-def test_other_separator(tmp_path):
-    path = write(tmp_path / "log.csv", [f"{T};{U};{Y}", *(row.replace(",", ";") for row in rows())])
-    assert read(path, separator=";").n_samples == 6
-    assert "no column 't_s'; the file has t_s;u_V;y_rad" in complaint(path)
-
-
 def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
     rng = np.random.default_rng(0)
     stamps = 5.0 + 1e-3 * np.arange(50) + rng.uniform(-5e-8, 5e-8, 50)
@@ -99,9 +94,10 @@ FAULTS = {
     "blank line": ([HEAD, *rows(3), "", *rows(3, start=3)], ["log.csv, line 5: column 't_s' is empty"]),
     "short row": ([HEAD, *rows(3), "0.03,1", *rows(2, start=4)], ["line 5: column 'y_rad' is empty"]),
     "long row": ([HEAD, *rows(3), "0.03,1,2,3", *rows(2, start=4)], ["line 5: 4 cells where line 1 has 3"]),
-    "semicolons": (["t_s;u_V;y_rad", "0;1;2"], ["no column", "semicolons"]),
-    "tabs": (["t_s\tu_V\ty_rad", "0\t1\t2"], ["no column", "tabs"]),
-    "no header": (["0,1,2", "1,2,3"], ["no column", "column names in line 1"]),
+    "no header": (
+        ["0,1,2", "1,2,3"],
+        ["no column 't_s'; the file has column 1, column 2", "column names in line 1"],
+    ),
     "decimal commas": ([HEAD, "0,00,1,00,2,00"], ["line 2: 6 cells where line 1 has 3", "decimal point"]),
     "time stands still": (
         [HEAD, *rows(4), "0.030000,1,2", *rows(1, start=5)],
@@ -198,7 +194,7 @@ def test_npz_with_objects_is_refused_without_running_them(tmp_path):
         ({U: np.array([1, -1, np.nan, 1, 2, 3])}, "index 2: column 'u_V' is nan; expected a finite number"),
         ({U: np.arange(6) + 1j}, "'u_V' holds complex128; expected real numbers"),
         ({U: np.array(list("abcdef"))}, "expected real numbers"),
-        ({U: np.ones((6, 2))}, r"shape \(6, 2\); expected a vector"),
+        ({U: np.ones((6, 2))}, r"no column 'u_V'; the file has u_V\[0\], u_V\[1\]"),
         ({U: np.arange(5.0)}, "equally long"),
     ],
 )
@@ -227,10 +223,9 @@ def test_a_format_of_ones_own_is_one_registered_reader(tmp_path, good, monkeypat
     monkeypatch.setattr(record_files, "READERS", dict(record_files.READERS))
 
     @record_files.reads(".rows")
-    def _read_rows(file):
-        return record_files.Table(
-            file, (T, U, Y), dict(zip((T, U, Y), np.loadtxt(file).T, strict=True)), None
-        )
+    def _read_rows(file, content):
+        values = np.loadtxt(content.decode().splitlines())
+        return Table(file, dict(zip((T, U, Y), values.T, strict=True)))
 
     path = write(tmp_path / "log.rows", [row.replace(",", " ") for row in rows()])
     np.testing.assert_array_equal(read(path).output, read(good).output)

@@ -77,6 +77,11 @@ VALUES = {
     "rms": 4.0012,
     "unit": "V",
     "percent": 2.345,
+    "samples": 4000,
+    "missing": 12,
+    "jitter": 0.0421,
+    "too_narrow": 0.0015,
+    "faithful_rad_s": 93.62,
     "from_Hz": 0.2,
     "to_Hz": 31.62,
     "parity": "odd",
@@ -98,6 +103,7 @@ VALUES = {
 # Other values that lead to other words.
 OTHERWISE = {
     "TIME_UNIT": [{"in_header": ""}],
+    "REPAIRED": [{"missing": 0}],
     "NUISANCE": [{"needed": False}],
     "INTEGRATORS": [{"accepted": 0}, {"refused": False}],
     "DELAY": [{"other_delay": 1}],

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
+from ident.data.record_files import read_table
+from ident.data.roles import roles_of
 from workflow.config.settings import check
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine import storage
@@ -20,12 +23,16 @@ if TYPE_CHECKING:
 
 def identify_logs(
     logs: Sequence[Path],
-    input_name: str,
-    output_name: str,
+    input_name: str | None = None,
+    output_name: str | None = None,
     *,
     time: str | None = None,
     dt_s: float | None = None,
     time_unit: str | None = None,
+    scale: Mapping[str, float] | None = None,
+    offset: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    repair: bool = False,
     reference: str | None = None,
     input_limit: float | None = None,
     validation: Sequence[Path] = (),
@@ -44,7 +51,9 @@ def identify_logs(
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
     or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
     logs made in closed loop, for the two-stage method. input_limit: what the amplifier gives at most; larger
-    commands in the logs are taken as that. time_unit: of the time column, where its name does not say it.
+    commands in the logs are taken as that. Input, output and time that are not named are found where names
+    and units leave no doubt. scale, offset, units, repair: as in `Record.from_file`.
+    time_unit: of the time column, where its name does not say it.
     band_rad_s: fit inside this band only, friction and drift below it and noise above it left out. promise:
     what the ellipses are about, as `uncertainty.promise` of a configuration; output_name is then the position
     of the shaft that the friction acts on. noise_order: largest order of the noise model behind the ellipses;
@@ -56,6 +65,12 @@ def identify_logs(
     written = [("--out", out), ("--report", report), ("--export", export)]
     storage.refuse_in_the_way([*logs, *validation], [(name, path) for name, path in written if path])
     references = [] if reference is None else [reference]
+    if input_name is None or output_name is None or (time is None and dt_s is None):
+        with naming(str(logs[0])):
+            table, log = read_table(logs[0]), shlex.quote(str(logs[0]))
+            roles = roles_of(table, log, input=input_name, output=output_name, time=time)
+        input_name, output_name = roles.input, roles.output
+        time = roles.time if time is None and dt_s is None else time
 
     def read(path: Path) -> Record:
         with naming(str(path)):
@@ -66,6 +81,10 @@ def identify_logs(
                 time=time,
                 dt_s=dt_s,
                 time_unit=time_unit,
+                scale=scale,
+                offset=offset,
+                units=units,
+                repair=repair,
                 references=references,
             )
             return record if input_limit is None else record.limited(input_limit)

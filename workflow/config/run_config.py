@@ -92,6 +92,13 @@ def _planned(plan: ExperimentPlan) -> tuple[SimulatedRecord, ...]:
     )
 
 
+def _not_zero(scale: float) -> float:
+    if scale == 0:
+        raise ValueError("a scale must not be 0")
+    return scale
+
+
+Scale = Annotated[float, AfterValidator(_not_zero)]
 TimeUnit = Literal["s", "ms", "us", "ns", "min", "h"]
 
 
@@ -131,6 +138,13 @@ class FileSource(Section):
         None,
         gt=0,
         description="what the amplifier gives at most: larger commands in the logs are taken as that",
+    )
+    scale: Mapping[str, Scale] = Field(
+        default_factory=dict, description="of a column: quantity = scale * column + offset"
+    )
+    offset: Mapping[str, float] = Field(default_factory=dict, description="of a column, added after scaling")
+    repair: bool = Field(
+        False, description="put time stamps that jitter, and single missing rows, on a uniform grid"
     )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ident.data.foreign_files import Unread, shown
+from ident.data.foreign_files import Unread, content_of, shown
 from ident.data.npz_files import npz_arrays
 from workflow.engine import codec
 from workflow.engine.errors import InputError, describe_os_error, naming
@@ -169,7 +169,7 @@ def read_npz(path: Path, *, only: str | None = None) -> dict[str, AnyArray]:
     Raises InputError naming the file.
     """
     try:
-        arrays = npz_arrays(path, only)
+        arrays = npz_arrays(content_of(path), only)
     except OSError as error:
         raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
     except ValueError as error:

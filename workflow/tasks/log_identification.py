@@ -12,7 +12,7 @@ from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import residual_advice, whiteness_test
 from ident.closed_loop import two_stage
-from ident.data.finding import Finding
+from ident.data.finding import Finding, distinct
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, settling_time_s
 from ident.friction import (
@@ -218,9 +218,8 @@ def _posterior(
 
 
 def _doubts(records: Sequence[Record]) -> list[Finding]:
-    """Time columns that look like another unit, each said once."""
-    doubted = {record.time_column: record.dt_s for record in records if record.time_column is not None}
-    return [column.doubt(dt_s) for column, dt_s in doubted.items() if column.doubtful]
+    """Time columns that look like another unit, and repaired ones, each said once."""
+    return list(distinct([doubt for record in records for doubt in record.doubts]))
 
 
 def _beyond(

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from ident.data.record import Record
-from ident.data.units import written_unit
 from workflow.config.run_config import (
     Channel,
     FileRecord,
@@ -62,6 +61,8 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
     # A record's own time base replaces the common one altogether: dt_s here must not meet a time column
     # there.
     own = entry.time is not None or entry.dt_s is not None
+
+    units = {name: unit for name, unit in source.units.items() if name in (*inputs, *outputs)}
     with naming(str(entry.path)):
         record = Record.from_file(
             entry.path,
@@ -72,19 +73,14 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
             time_unit=entry.time_unit or (None if own else source.time_unit),
             references=list(references),
             name=record_name(entry),
+            scale=source.scale,
+            offset=source.offset,
+            units=units,
+            repair=source.repair,
         )
         if entry.start_sample or entry.stop_sample is not None:
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
-    sign = -1.0 if entry.mirrored else 1.0
-
-    def units(names: Sequence[str]) -> tuple[str, ...]:
-        return tuple(source.units.get(name) or written_unit(name) for name in names)
-
-    return replace(
-        record.each(lambda signal: sign * signal),
-        input_units=units(record.input_names),
-        output_units=units(record.output_names),
-    )
+    return record.each(lambda signal: -signal) if entry.mirrored else record
 
 
 def refuse_constant_input(record: Record) -> None:

@@ -1,0 +1,76 @@
+"""Which column of a log is time, input and output, where names and units leave no doubt."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.data.foreign_files import shown
+from ident.data.table import Table
+from ident.data.units import TIME_UNITS
+
+_TIME = re.compile(r"(t|time|zeit|timestamp|zeitstempel|elapsed)(?![a-z])", re.IGNORECASE)
+_INPUT = re.compile(
+    r"(u|v|input|command|cmd|drive|voltage|spannung|current|strom|torque|moment|force)(?![a-z])", re.I
+)
+_OUTPUT = re.compile(
+    r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|encoder|hub)(?![a-z])", re.I
+)
+_DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
+_MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|[cm]m|rpm|counts?|ticks?", re.I)
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Names of the columns; time is None where no column looks like it."""
+
+    time: str | None
+    input: str
+    output: str
+
+
+def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
+    """The columns of one channel. stated: input, output and time as far as the user named them.
+
+    Raises ValueError where a role has no column or several: it lists all columns, and says what to type.
+    """
+    moving = [name for name in table.names if _is_signal(table, name)]
+    time = stated.get("time") or _only([name for name in table.names if _is_time(table, name)])
+    rest = [name for name in moving if name not in (time, stated.get("input"), stated.get("output"))]
+    inputs = [name for name in rest if _says(table, name, _DRIVEN, _INPUT)]
+    outputs = [name for name in rest if _says(table, name, _MOVED, _OUTPUT)]
+    input_, output = stated.get("input") or _only(inputs), stated.get("output") or _only(outputs)
+    if input_ is not None and output is not None and input_ != output:
+        return Roles(time, input_, output)
+    options = [
+        ("--input", input_ or next(iter(inputs), "NAME")),
+        ("--output", output or next(iter(outputs), "NAME")),
+    ]
+    options += [("--time", time)] if time else [("--dt-s", "SECONDS")]
+    command = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
+    listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
+    raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink identify {log} {command}")
+
+
+def _only(names: list[str]) -> str | None:
+    return names[0] if len(names) == 1 else None
+
+
+def _is_time(table: Table, name: str) -> bool:
+    return table.is_clock(name) or _TIME.match(name) is not None or table.unit(name).lower() in TIME_UNITS
+
+
+def _is_signal(table: Table, name: str) -> bool:
+    try:
+        return not _is_time(table, name) and bool(np.ptp(table.columns([name])[name]) > 0)
+    except ValueError:
+        return False
+
+
+def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str]) -> bool:
+    """What the unit says, where there is one; else what the name does."""
+    stated = table.unit(name)
+    return (unit.fullmatch(stated) if stated else word.match(name)) is not None

@@ -1,0 +1,238 @@
+"""Named columns of one log file, checked where they are asked for.
+
+Every complaint is one line that names file, place and expectation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident.data.arrays import RealArray
+from ident.data.foreign_files import as_numbers, shown
+from ident.data.text_tables import Layout, is_number
+from ident.data.time_stamps import StampError, is_stamp, seconds_since_first
+from ident.data.units import TimeColumn, written_unit
+
+# Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
+# of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
+TIME_TOLERANCE = 0.01
+# Of a matrix so many columns at most are offered by number.
+_MOST_NUMBERED = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Named columns of one file.
+
+    raw: by name, an array, or text cells (a tuple of str) as `layout` says they are written. A matrix (T, C)
+    is offered as C columns name[0], name[1], ... `first_line` is the file line of row 0, or None where rows
+    have no lines (npz, mat). units: by name, where the file states them apart from the names.
+    """
+
+    path: Path
+    raw: Mapping[str, Any]
+    first_line: int | None = None
+    layout: Layout | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        columns: dict[str, Any] = {}
+        for name, values in self.raw.items():
+            columns |= _split(name, values)
+        object.__setattr__(self, "raw", columns)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.raw)
+
+    def place(self, row: int) -> str:
+        return f"index {row}" if self.first_line is None else f"line {row + self.first_line}"
+
+    def unit(self, name: str) -> str:
+        """The unit of a column as the file has it, beside the name or in it; empty if there is none."""
+        return self.units.get(name, "") or written_unit(name)
+
+    def columns(self, wanted: Sequence[str]) -> dict[str, RealArray]:
+        """The wanted columns as equally long finite vectors; dates and clock times in seconds.
+
+        Raises ValueError if one is missing (lists those there are), not numeric, not finite or of another
+        length.
+        """
+        for name in wanted:
+            if name not in self.raw:
+                raise ValueError(f"{self.path}: no column '{shown(name)}'; the file has {self._listed(name)}")
+        found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
+        sizes = {name: column.size for name, column in found.items()}
+        if len(set(sizes.values())) > 1:
+            raise ValueError(f"{self.path}: columns must be equally long; got {shown(str(sizes), 160)}")
+        return found
+
+    def _listed(self, wanted: str = "") -> str:
+        # Of a matrix that was asked for by its own name, its columns.
+        parts = [name for name in self.names if wanted and name.startswith(f"{wanted}[")]
+        hint = (
+            " (numbers?); expected column names in line 1" if self.layout and not self.layout.header else ""
+        )
+        return _listed(parts or self.names) + hint
+
+    def is_clock(self, name: str) -> bool:
+        """Whether a column holds dates or clock times, which need no unit."""
+        values = self.raw[name]
+        if isinstance(values, tuple):
+            return is_stamp(next((cell for cell in values if cell), ""))
+        return getattr(values, "dtype", np.dtype(float)).kind in "Mm"
+
+    def _numbers(self, name: str) -> RealArray:
+        column = self.raw[name]
+        if isinstance(column, tuple):
+            return self._finite(name, self._parsed(name, column), column)
+        try:
+            values = as_numbers(column)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: column '{shown(name)}' {error}") from None
+        if values.ndim != 1:
+            raise ValueError(
+                f"{self.path}: column '{shown(name)}' has shape {values.shape}; expected a vector"
+            )
+        if values.dtype.kind in "Mm":
+            if np.isnat(values).any():
+                row = int(np.argmax(np.isnat(values)))
+                raise ValueError(f"{self.path}, {self.place(row)}: column '{shown(name)}' is empty")
+            values = (values - values[:1]) / np.timedelta64(1, "ns") / 1e9
+        return self._finite(name, values.astype(np.float64), values)
+
+    def _parsed(self, name: str, cells: tuple[str, ...]) -> RealArray:
+        """Text as numbers; NaN for what is none."""
+        decimal = self.layout.decimal if self.layout else "."
+        try:
+            if self.is_clock(name):
+                return seconds_since_first(cells)
+        except StampError as error:
+            what = f"{self.path}, {self.place(error.row)}: column '{shown(name)}' {error}"
+            raise ValueError(what) from None
+        plain = [cell.replace(",", ".") for cell in cells] if decimal == "," else cells
+        try:
+            if not any("_" in cell for cell in cells):  # which Python takes for a separator of digits
+                return np.array(list(map(float, plain)))
+        except ValueError:
+            pass
+        pairs = zip(cells, plain, strict=True)
+        return np.array([float(p) if is_number(c, decimal) else np.nan for c, p in pairs])
+
+    def _finite(self, name: str, numbers: RealArray, cells: Any) -> RealArray:
+        """The numbers if all are finite; else a complaint that quotes the first that is not."""
+        bad = np.flatnonzero(~np.isfinite(numbers))
+        if not bad.size:
+            return numbers
+        row = int(bad[0])
+        found = str(cells[row])
+        if isinstance(cells, tuple):
+            found = f"'{shown(found, 40)}'" if found else "empty"
+        sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
+        raise ValueError(
+            f"{self.path}, {self.place(row)}: column '{shown(name)}' is {found}; "
+            f"expected a finite number{sign}"
+        )
+
+    def seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
+        """Time stamps in seconds, from the unit stated or written in the header, and what was taken for
+        which. Raises ValueError for an unknown unit."""
+        if self.is_clock(name):
+            if unit is not None:
+                raise ValueError(f"{self.path}: '{shown(name)}' holds clock times; they have no unit")
+            return stamps, TimeColumn(name, "s", "s")
+        try:
+            column = TimeColumn.of(name, unit, self.units.get(name, ""))
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from None
+        return column.seconds(stamps), replace(column, doubtful=column.doubtful_for(stamps))
+
+    def increasing(self, stamps: RealArray, name: str | None) -> None:
+        """Raises ValueError unless there are two time stamps at least, each later than the one before."""
+        if stamps.size < 2:
+            raise ValueError(
+                f"{self.path}: a single row of numbers; expected at least 2 to find the sampling time"
+            )
+        backwards = np.flatnonzero(~(np.diff(stamps) > 0))
+        if backwards.size:
+            row = int(backwards[0]) + 1
+            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else "split the file there"
+            raise ValueError(
+                f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
+                f"{stamps[row]:.9g} s; expected increasing time ({what})"
+            )
+
+    def sampling_time(self, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
+        """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both
+        are there.
+
+        Raises ValueError if neither is given, dt_s is not positive, or the stamps are not increasing and
+        uniform to `TIME_TOLERANCE`, rounding to their last digit aside.
+        """
+        if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
+            raise ValueError(f"{self.path}: dt_s must be a positive number of seconds; got {dt_s}")
+        if stamps is None:
+            if dt_s is None:
+                raise ValueError(
+                    f"{self.path}: give the time column or dt_s; the file has {_listed(self.names)}"
+                )
+            return float(dt_s)
+        self.increasing(stamps, name)
+        interval = np.diff(stamps)
+        # The median says what the step is even where samples are lost; the mean over all is the better
+        # estimate after.
+        median = float(np.median(interval))
+        uneven = np.flatnonzero(~(np.abs(interval - median) <= TIME_TOLERANCE * median))
+        if uneven.size and not only_rounded(stamps):
+            row = int(uneven[0]) + 1
+            # A few wide steps are lost samples; many uneven ones are a clock that was read late now and then.
+            few = uneven.size <= 0.05 * interval.size
+            what = "samples are missing: split the file there" if few else "resample it to a uniform step"
+            raise ValueError(
+                f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s "
+                f"where most steps are {median:.6g} s; expected uniform sampling (each step within "
+                f"{TIME_TOLERANCE:.0%}; {uneven.size} of {interval.size} are not: {what}, or --repair)"
+            )
+        mean = float((stamps[-1] - stamps[0]) / interval.size)
+        if dt_s is None:
+            # Rounding noise of decimal stamps: 0.0020000000000000005 is 0.002.
+            return float(f"{mean:.12g}")
+        if not abs(dt_s - mean) <= TIME_TOLERANCE * mean:
+            raise ValueError(
+                f"{self.path}: dt_s = {dt_s:.6g} s, but the time column '{name}' steps by {mean:.6g} s"
+            )
+        return float(dt_s)
+
+
+def only_rounded(stamps: RealArray) -> bool:
+    """Whether increasing stamps (T,) [s] are a uniform clock's, rounded to their last decimal digit: 0.008,
+    0.016, 0.023 for steps of 1/128 s."""
+    since = stamps - stamps[0]
+    digit = next((10.0**-k for k in range(10) if np.allclose(since, np.round(since, k), 0, 1e-10)), 0.0)
+    uniform = np.polyval(np.polyfit(np.arange(since.size), since, 1), np.arange(since.size))
+    # A line through rounded stamps is itself off by part of the digit.
+    return bool(
+        0 < digit <= 0.5 * np.median(np.diff(stamps)) and np.max(np.abs(since - uniform)) <= 0.75 * digit
+    )
+
+
+def _split(name: str, values: Any) -> dict[str, Any]:
+    """A matrix (T, C) as its columns; MATLAB's vectors, (T, 1) and (1, T), as vectors."""
+    if not isinstance(values, np.ndarray) or values.ndim != 2:
+        return {name: values}
+    if 1 in values.shape or values.size == 0:
+        return {name: values.ravel()}
+    if values.shape[1] > _MOST_NUMBERED:
+        return {name: values}
+    return {f"{name}[{k}]": values[:, k] for k in range(values.shape[1])}
+
+
+def _listed(names: Iterable[str], limit: int = 20) -> str:
+    items = list(names)
+    text = ", ".join(shown(name) for name in items[:limit]) or "no columns"
+    return shown(text if len(items) <= limit else f"{text}, ... ({len(items)} in all)", 160)

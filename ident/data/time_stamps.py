@@ -1,0 +1,107 @@
+"""Dates and clock times as logs write them, in seconds since the first of them.
+
+ISO 8601 ('2024-03-01T12:00:00.25Z', with a blank for the T and slashes for the dashes as well), '01.03.2024
+12:00:00,250', '3/1/2024 1:02:03.5 PM', and '12:00:00.250' without a day, which may pass midnight.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import date
+from itertools import pairwise
+
+import numpy as np
+
+from ident.data.arrays import RealArray
+from ident.data.foreign_files import shown
+
+_DAY = r"(?:(\d{4})([-/])(\d\d?)\2(\d\d?)|(\d\d?)([./])(\d\d?)\6(\d{4}))"
+_CLOCK = r"(\d\d?):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?\s*([AaPp][Mm])?"
+_ZONE = r"(?:Z|([+-])(\d\d):?(\d\d))"
+_STAMP = re.compile(rf"(?:{_DAY}(?:T|\s+|$))?(?:{_CLOCK})?\s*{_ZONE}?")
+_DAY_NS = 86_400 * 10**9
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether the text has the form of a date, a clock time, or both."""
+    return (":" in cell or "-" in cell[1:] or "." in cell or "/" in cell) and _matched(cell) is not None
+
+
+def seconds_since_first(cells: Sequence[str]) -> RealArray:
+    """(T,) seconds. Raises ValueError naming the row (from 0) as `IndexError.args` would: (message, row)."""
+    matches = []
+    for row, cell in enumerate(cells):
+        found = _matched(cell)
+        if found is None:
+            raise StampError(f"is '{shown(cell)}'; expected a date or time like '{shown(cells[0])}'", row)
+        matches.append(found)
+    month_first = _month_first(matches)
+    days: dict[str, int] = {}
+    nanoseconds = []
+    for row, found in enumerate(matches):
+        try:
+            nanoseconds.append(_nanoseconds(found, month_first, days))
+        except ValueError as error:
+            raise StampError(f"is '{shown(cells[row])}', no possible date or time ({error})", row) from None
+    if not any(found[1] or found[5] for found in matches):
+        passed, since = 0, [nanoseconds[0]]
+        for before, now in pairwise(nanoseconds):
+            passed += _DAY_NS if before - now > _DAY_NS // 2 else 0
+            since.append(now + passed)
+        nanoseconds = since
+    # The difference in whole nanoseconds first: doubles hold dates to a fraction of a microsecond only.
+    return np.array([now - nanoseconds[0] for now in nanoseconds], dtype=np.float64) / 1e9
+
+
+class StampError(ValueError):
+    """A cell that is no time stamp; `row` counts from 0."""
+
+    def __init__(self, message: str, row: int) -> None:
+        super().__init__(message)
+        self.row = row
+
+
+def _matched(cell: str) -> re.Match[str] | None:
+    text = cell.strip()
+    found = _STAMP.fullmatch(text) if 4 < len(text) < 60 else None
+    return found if found is not None and (found[1] or found[5] or found[9]) else None
+
+
+def _month_first(matches: Sequence[re.Match[str]]) -> bool:
+    """Whether 3/1/2024 is a day in March. Raises ValueError where a log does not tell and it matters."""
+    dates = {(int(found[5]), int(found[7])) for found in matches if found[6] == "/"}
+    if any(first > 12 for first, _ in dates):
+        return False
+    if len(dates) > 1 and not any(second > 12 for _, second in dates):
+        raise StampError("may be day/month or month/day; expected dates as 2024-03-01", 0)
+    return True
+
+
+def _nanoseconds(found: re.Match[str], month_first: bool, days: dict[str, int]) -> int:
+    hour, minute, second = (int(found[k] or 0) for k in (9, 10, 11))
+    if found[13]:
+        if not 1 <= hour <= 12:
+            raise ValueError("12-hour clock")
+        hour = hour % 12 + (12 if found[13].lower() == "pm" else 0)
+    if hour > 23 or minute > 59 or second > 60:
+        raise ValueError("hours to 23, minutes and seconds to 59")
+    zone = 0
+    if found[14]:
+        zone = (60 * int(found[15]) + int(found[16])) * (1 if found[14] == "+" else -1)
+    whole = 3600 * hour + 60 * (minute - zone) + second
+    day = found[0][: found.start(9)] if found[9] else found[0]
+    if day not in days:
+        days[day] = _ordinal(found, month_first)
+    return days[day] * _DAY_NS + whole * 10**9 + int((found[12] or "").ljust(9, "0"))
+
+
+def _ordinal(found: re.Match[str], month_first: bool) -> int:
+    if found[1]:
+        return date(int(found[1]), int(found[3]), int(found[4])).toordinal()
+    if not found[5]:
+        return 0
+    day, month = int(found[5]), int(found[7])
+    if found[6] == "/" and month_first:
+        day, month = month, day
+    return date(int(found[8]), month, day).toordinal()

@@ -1,0 +1,239 @@
+"""Forty logs as laboratories send them: each is read rightly, or refused with the hint that helps.
+
+All hold the same experiment: 60 samples, u = +-1.5 V, y = 0.125 k rad, every 0.01 s unless said otherwise.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+
+from ident.data.record import Record
+
+N, DT_S = 60, 0.01
+K = np.arange(N)
+T_S, U, Y = DT_S * K, 1.5 * (-1.0) ** (K // 3), 0.125 * K
+START = datetime(2024, 2, 29, 23, 59, 59, 800_000)  # passes midnight, in a leap year
+
+
+@dataclass(frozen=True)
+class Log:
+    """name of the file, its bytes, how it is read, and what comes out: a sampling time, or words."""
+
+    file: str
+    content: bytes | Callable[[], bytes]
+    columns: tuple[str, str, str] = ("t_s", "u_V", "y_rad")
+    options: dict[str, Any] = field(default_factory=dict)
+    dt_s: float = DT_S
+    dt_error_s: float = 1e-12
+    refused: tuple[str, ...] = ()
+    units: tuple[str, str] = ("V", "rad")
+
+
+def text(
+    separator=",",
+    decimal=".",
+    header=("t_s", "u_V", "y_rad"),
+    time=lambda t: f"{t:.3f}",
+    *,
+    y=Y,
+    above=(),
+    below=(),
+    end="\n",
+    last="",
+    keep=K,
+    cells=lambda row: row,
+    encoding="utf-8",
+) -> bytes:
+    """A table of the experiment; cells changes the words of a row."""
+    rows = [[time(T_S[k]), f"{U[k]:.1f}", f"{y[k]:.9g}"] for k in keep]
+    numbers = [[cell if "24 " in cell else cell.replace(".", decimal) for cell in row] for row in rows]
+    lines = [*above, separator.join(header) + last] if header else list(above)
+    lines += [*below, *(separator.join(cells(row)) + last for row in numbers)]
+    return (end.join(lines) + end).encode(encoding)
+
+
+def clock(form: str) -> Callable[[float], str]:
+    return lambda t: (START + timedelta(seconds=round(t, 6))).strftime(form)[:-3]
+
+
+def npz(**arrays) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def mat(**variables) -> bytes:
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, variables, do_compression=True)
+    return buffer.getvalue()
+
+
+PREAMBLE = ("Logger 3000;v1.2", "Operator;M. Huber", "Sample rate;100", "")
+LOST = np.delete(K, [20])
+JITTER = 1e-3 * np.random.default_rng(4).uniform(-0.5, 0.5, N)
+LOGS = {
+    # Separators and numbers.
+    "commas": Log("a.csv", text()),
+    "semicolons, decimal commas": Log("a.csv", text(";", ",")),
+    "semicolons, decimal points": Log("a.csv", text(";")),
+    "tabs": Log("a.txt", text("\t")),
+    "tabs, decimal commas": Log("a.tsv", text("\t", ",")),
+    "blanks": Log("a.dat", text("   ")),
+    "bars": Log("a.txt", text("|")),
+    "exponents": Log("a.csv", text(time=lambda t: f"{t:.4E}")),
+    "separators at the ends of lines": Log("a.csv", text(";", ",", last=";")),
+    "blanks around commas": Log("a.csv", text(" , ")),
+    # Characters.
+    "UTF-8 with its mark": Log("a.csv", b"\xef\xbb\xbf" + text()),
+    "UTF-16": Log("a.csv", text("\t", encoding="utf-16")),
+    "code page of Windows": Log(
+        "a.csv",
+        text(
+            ";", header=("Zeit [µs]", "u_V", "Winkel [°]"), time=lambda t: f"{1e6 * t:.0f}", encoding="cp1252"
+        ),
+        ("Zeit [µs]", "u_V", "Winkel [°]"),
+        units=("V", "°"),
+    ),
+    "lines of Windows, blank ones at the end": Log("a.csv", text(end="\r\n") + b"\r\n\r\n"),
+    # What stands above the numbers.
+    "preamble": Log("a.csv", text(";", ",", above=PREAMBLE)),
+    "sep=; of a spreadsheet": Log("a.csv", text(";", ",", above=("sep=;",))),
+    "line of units": Log(
+        "a.csv",
+        text(header=("Time", "Drive", "Hub"), below=("ms,V,rad",), time=lambda t: f"{1e3 * t:.0f}"),
+        ("Time", "Drive", "Hub"),
+    ),
+    "preamble, line of units in brackets, blank line": Log(
+        "a.txt",
+        text("\t", header=("Time", "Drive", "Hub"), above=("Channels: 3", ""), below=("[s]\t[V]\t[rad]", "")),
+        ("Time", "Drive", "Hub"),
+    ),
+    "names and numbers in quotation marks": Log(
+        "a.csv",
+        text(",", ",", ('"t, s"', '"u_V"', '"y_rad"'), cells=lambda row: [f'"{cell}"' for cell in row]),
+        ("t, s", "u_V", "y_rad"),
+        {"time_unit": "s"},
+    ),
+    "names behind a comment sign": Log(
+        "a.txt", text(" ", above=("# made by a script",), header=("# t_s", "u_V", "y_rad"))
+    ),
+    "names of several words over blanks": Log(
+        "a.dat",
+        text("   ", header=("Elapsed time [s]", "Motor voltage [V]", "Hub angle [rad]")),
+        ("Elapsed time [s]", "Motor voltage [V]", "Hub angle [rad]"),
+    ),
+    "words in another column": Log(
+        "a.csv", text(header=("t_s", "u_V", "y_rad", "note"), cells=lambda row: [*row, "ok"])
+    ),
+    # Time.
+    "ISO 8601 with a zone": Log("a.csv", text(time=clock("%Y-%m-%dT%H:%M:%S.%f0Z+"))),
+    "day.month.year": Log("a.csv", text(";", ",", time=clock("%d.%m.%Y %H:%M:%S.%f"))),
+    "month/day/year with PM": Log(
+        "a.csv", text(time=lambda t: f"{clock('%m/%d/%Y %I:%M:%S.%f')(t)} {clock('%p+++')(t)}")
+    ),
+    "clock times through midnight": Log("a.csv", text(time=clock("%H:%M:%S.%f"))),
+    "128 Hz rounded to milliseconds": Log(
+        "a.csv", text(time=lambda t: f"{t / DT_S / 128:.3f}"), dt_s=1 / 128, dt_error_s=1e-3 / (N - 1)
+    ),
+    "a lost row": Log(
+        "a.csv", text(keep=LOST), refused=("line 22", "steps by 0.02 s", "split the file there, or --repair")
+    ),
+    "a lost row, repaired": Log("a.csv", text(keep=LOST), options={"repair": True}),
+    "jitter, repaired": Log(
+        "a.csv",
+        text(time=lambda t: f"{t + JITTER[round(t / DT_S)]:.6f}", y=12.5 * (T_S + JITTER)),
+        dt_error_s=1e-3 / (N - 1),
+        options={"repair": True},
+    ),
+    # What cannot be told, and is said so.
+    "no names": Log(
+        "a.csv", text(header=()), refused=("column 1, column 2, column 3", "expected column names in line 1")
+    ),
+    "decimal commas between commas": Log(
+        "a.csv",
+        text(",", ","),
+        refused=("line 2: 5 cells where line 1 has 3", "separate the columns by semicolons"),
+    ),
+    "a word among the numbers": Log(
+        "a.csv",
+        text(
+            cells=lambda row: [*row[:2], row[2].replace("0.25", "overflow") if row[2] == "0.25" else row[2]]
+        ),
+        refused=("line 4: column 'y_rad' is 'overflow'; expected a finite number",),
+    ),
+    "day or month": Log(
+        "a.csv",
+        text(time=lambda t: f"{'02/03/2024' if t < 0.2 else '03/03/2024'} 12:00:00"),
+        refused=("day/month or month/day",),
+    ),
+    # Packed and binary files.
+    "packed by gzip": Log("a.csv.gz", gzip.compress(text(";", ","))),
+    "npz, a matrix": Log(
+        "a.npz", npz(t_s=T_S, log=np.column_stack([U, Y])), ("t_s", "log[0]", "log[1]"), units=("", "")
+    ),
+    "npz with Python objects": Log(
+        "a.npz",
+        npz(t_s=T_S, u_V=U, y_rad=np.array([{}] * N)),
+        refused=("'y_rad' holds Python objects; expected arrays of numbers",),
+    ),
+    "MATLAB 5": Log("a.mat", mat(t_s=T_S, u_V=U, y_rad=Y)),
+    "MATLAB 5, structs, offset and scale": Log(
+        "a.mat",
+        mat(log={"time": T_S, "signals": {"u_V": U, "deg": np.rad2deg(Y) - 3.0}}),
+        ("log.time", "log.signals.u_V", "log.signals.deg"),
+        {
+            "scale": {"log.signals.deg": np.pi / 180},
+            "offset": {"log.signals.deg": np.pi / 60},
+            "units": {"log.signals.deg": "rad"},
+        },
+    ),
+    "a spreadsheet of 1997": Log(
+        "a.xls", b"\xd0\xcf\x11\xe0" + bytes(600), refused=("unknown kind of file '.xls'", ".csv")
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_forty_logs(name, tmp_path: Path):
+    log, path = LOGS[name], tmp_path / LOGS[name].file
+    path.write_bytes(log.content if isinstance(log.content, bytes) else log.content())
+    time, input_, output = log.columns
+
+    def read():
+        return Record.from_file(path, [input_], [output], time=time, **log.options)
+
+    if log.refused:
+        with pytest.raises(ValueError) as caught:
+            read()
+        line = str(caught.value)
+        assert line.startswith(str(path))
+        assert "\n" not in line
+        assert len(line) - len(str(path.parent)) <= 300
+        for words in log.refused:
+            assert words in line
+        return
+    record = read()
+    assert record.dt_s == pytest.approx(log.dt_s, rel=0, abs=log.dt_error_s)
+    if record.repair:
+        # A spline leaves a line as it is. The phase of the grid is that of the mean stamp, at the ends known
+        # to twice its deviation: 1 ms / sqrt(12 N), times three; 12.5 rad/s.
+        np.testing.assert_allclose(record.output[:, 0], Y, rtol=0, atol=12.5 * 6e-3 / np.sqrt(12 * N))
+    else:
+        np.testing.assert_allclose(record.input[:, 0], U, rtol=1e-12)
+        np.testing.assert_allclose(record.output[:, 0], Y, rtol=1e-12, atol=1e-12)
+    found = (*record.input_units, *record.output_units) or ("", "")
+    assert found == log.units
+
+
+def test_there_are_forty():
+    assert len(LOGS) >= 40
