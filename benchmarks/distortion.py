@@ -27,7 +27,7 @@ from ident.data.arrays import RealArray
 from ident.data.distortion import BandLevel, Distortion, LineLevels, distortion_of
 from ident.data.record import Record
 from plant import ExperimentPlan, parse_effect
-from plant.simulate import Simulator
+from plant.simulation import Simulator
 from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, quantised, rig_of
 

@@ -1,12 +1,16 @@
 """Why simulation and machine differ: which unmodelled effect, how sure, how far the gap shrinks with it."""
 
-from diagnosis.answer import Diagnosis, NamedEffect
-from diagnosis.diagnosis import diagnose
-from diagnosis.fit.residual import ResidualModel, pooled_rms
-from diagnosis.machine.case import Case, Experiment
-from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
-from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
-from diagnosis.machine.with_effects import with_effects
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from diagnosis.answer import Diagnosis, NamedEffect
+    from diagnosis.diagnosis import diagnose
+    from diagnosis.fit.residual import ResidualModel, pooled_rms
+    from diagnosis.machine.case import Case, Experiment
+    from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
+    from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
+    from diagnosis.machine.with_effects import with_effects
 
 __all__ = [
     "Case",
@@ -23,3 +27,23 @@ __all__ = [
     "pooled_rms",
     "with_effects",
 ]
+
+_MODULES = {
+    "answer": ("Diagnosis", "NamedEffect"),
+    "diagnosis": ("diagnose",),
+    "fit.residual": ("ResidualModel", "pooled_rms"),
+    "machine.case": ("Case", "Experiment"),
+    "machine.own_plant": ("Plant", "PlantCase", "PlantExperiment"),
+    "machine.plant_effect": ("EffectParameter", "PlantEffect"),
+    "machine.with_effects": ("with_effects",),
+}
+_WHERE = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """PEP 562: a case file is read before what diagnoses it is loaded."""
+    if name not in _WHERE:
+        raise AttributeError(f"module 'diagnosis' has no attribute {name!r}")
+    value = getattr(import_module(f"diagnosis.{_WHERE[name]}"), name)
+    globals()[name] = value
+    return value

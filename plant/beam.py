@@ -17,7 +17,6 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
 
 Real = npt.NDArray[np.float64]
 
@@ -141,6 +140,8 @@ def _root(k: int, mu: float) -> float:
     def characteristic(x: float) -> float:
         sech = 2 * np.exp(-x) / (1 + np.exp(-2 * x))
         return float(sech + np.cos(x) + mu * x * (np.cos(x) * np.tanh(x) - np.sin(x)))
+
+    from scipy.optimize import brentq  # here: every command would wait for it
 
     root = brentq(characteristic, max(k * np.pi, 1e-6), (k + 1) * np.pi, xtol=1e-14, rtol=1e-14)
     return float(root)

@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import max_len_seq
 
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]
@@ -54,6 +53,8 @@ def prbs(
         raise ValueError(
             f"the register needs {register_length} bits that are not all zero; got {register.tolist()}"
         )
+    from scipy.signal import max_len_seq  # here: every command would wait for it
+
     bits, _ = max_len_seq(register_length, state=register, length=-(-n_samples // hold_samples))
     return amplitude_V * np.where(np.repeat(bits, hold_samples)[:n_samples] == 1, 1.0, -1.0)
 

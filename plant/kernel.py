@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from plant.machine import CUBIC, SINE, STRIBECK
+
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]
 _F = TypeVar("_F", bound=Callable[..., object])
 
-# Elements that switch, and smooth force channels.
-FRICTION, CONTACT = 0, 1
-SINE, CUBIC, STRIBECK, GRAVITY = 0, 1, 2, 3
+FRICTION, CONTACT = 0, 1  # elements that switch
 _NOTHING = 1e-100
 _SLACK_RAD = 1e-13
 

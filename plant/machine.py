@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 from plant.rig import Rig
 
+SINE, CUBIC, STRIBECK, GRAVITY = 0, 1, 2, 3  # smooth forces of `plant.kernel`
+
 Signal = TypeVar("Signal", float, npt.NDArray[np.float64])
 
 

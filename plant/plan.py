@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
-from plant.kernel import CONTACT, FRICTION, GRAVITY, SINE, STRIBECK, run
-from plant.machine import Machine
+from plant.kernel import CONTACT, FRICTION, run
+from plant.machine import GRAVITY, SINE, STRIBECK, Machine
 from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion, static_moment_kg_m
 
 Real = npt.NDArray[np.float64]

@@ -17,8 +17,12 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+# Nothing in an arm is larger in SI units; beyond, powers of it overflow.
+_LARGEST = 1e15
+Positive = Annotated[float, Field(gt=0, le=_LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+
+Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2"]  # what is measured
 
 
 class _Checked(BaseModel):
@@ -91,7 +95,7 @@ class Sensors(_Checked):
 class Sampling(_Checked):
     """Sampling of inputs (held) and outputs."""
 
-    dt_s: Positive = Field(description="sampling period; the voltage is held over it")
+    dt_s: Positive = Field(le=10, description="sampling period; the voltage is held over it")
     transport_delay_s: NotNegative = Field(0.0, description="from the logged voltage to the motor's")
 
 
@@ -126,17 +130,22 @@ class Rig(_Checked):
         was expected.
         Raises FileNotFoundError if there is no such file.
         """
-        text = Path(path).read_bytes()
         try:
-            content = tomllib.loads(text.decode("utf-8-sig"))  # some editors put a mark in front
+            text = Path(path).read_bytes().decode("utf-8-sig")  # some editors put a mark in front
+            content = tomllib.loads(text)
         except UnicodeDecodeError as error:
             raise ValueError(f"{path}: not UTF-8 text (byte {error.start})") from error
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:  # syntax; integers or nesting without end
             raise ValueError(f"{path}: not valid TOML: {error}") from error
+        return cls.from_document(content, str(path))
+
+    @classmethod
+    def from_document(cls, content: Mapping[str, Any], source: str) -> Self:
+        """The content of a rig file. Raises ValueError as `from_toml`, naming `source`."""
         try:
             return cls.model_validate(content)
         except ValidationError as error:
-            raise ValueError(f"{path}: {one_line(error)}") from error
+            raise ValueError(f"{source}: {one_line(error)}") from error
 
     def to_toml(self) -> str:
         """The rig as the text of a rig file; reading it back gives an equal Rig."""
@@ -215,5 +224,5 @@ def one_line(error: ValidationError) -> str:
         text = f"{key}: {message}" if key else message
     else:
         expected = message.removeprefix("Input should be ")
-        text = f"{key}: expected {expected}, got {first['input']!r}"
+        text = f"{key}: expected {expected}, got {first['input']!r:.80}"
     return text

@@ -27,9 +27,11 @@ from workflow.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_NOT_CERTIFIED,
     EXIT_OK,
+    LONGEST_LINE,
     CommandInterruptedError,
     InputError,
     StageError,
+    cut,
     describe_os_error,
     need,
     one_line,
@@ -446,6 +448,10 @@ def diagnose(
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
     if not any(place.exists() for place in case):
         need(*case)
+    from workflow.diagnose.case_settings import read_case_file
+
+    if len(case) == 1:
+        read_case_file(case[0])  # before what diagnoses is loaded, which takes seconds
     from workflow.console import TerminalProgress
     from workflow.diagnose.command import diagnose_cases
 
@@ -559,7 +565,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        return _complain(*_explain(error))
+        message, code = _explain(error)
+        return _complain(cut(one_line(message), LONGEST_LINE), code)
 
 
 def _commands() -> dict[str, Callable[..., Any]]:
@@ -607,8 +614,9 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error), error.exit_code
     if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
         return f"{error.format_message() or 'no command given'} (flexlink --help)", EXIT_BAD_INPUT
-    if isinstance(error, OSError):  # ours name their file; this is a pipe or a terminal
-        return f"cannot write the output: {describe_os_error(error)}", EXIT_BAD_INPUT
+    if isinstance(error, OSError):  # a file that none of ours asks about, a pipe or a terminal
+        what = "cannot use " if error.filename else "cannot write the output: "
+        return what + describe_os_error(error), EXIT_BAD_INPUT
     if isinstance(error, MemoryError):
         return f"out of memory ({error}); shorter records, delays and searches need less", EXIT_INTERNAL
     return f"internal error: {type(error).__name__}: {error} (--debug shows where)", EXIT_INTERNAL

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
-import scipy.linalg
 
 from control_design.controllers.feedforward import FrictionFeedforward
 from control_design.controllers.law import Law
@@ -94,7 +93,7 @@ class Controller(Law):
             made = None if given is None else FrictionFeedforward(**given)
         except TypeError as error:
             raise ValueError(
-                f"feedforward needs level, width, lag_s, excess and fall; got {given}"
+                f"feedforward needs level, width, lag_s, excess and fall; got {given!r:.80}"
             ) from error
         return super().from_dict({**data, "feedforward": made})
 
@@ -180,6 +179,8 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
     M C at the zeros of the controller; a designed controller may have zeros outside the circle, where that
     winds up for ever. The Riccati gain is stable for every observable (A, C) and comes close to it otherwise.
     """
+    from scipy.linalg import solve_discrete_are
+
     n = A.shape[0]
     if n == 0:
         return np.zeros((0, 1))
@@ -188,7 +189,7 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
     scale = float((C @ state_noise @ C.T).item()) or 1.0
     output_noise = np.array([[float(D[0, 0]) ** 2 + 1e-4 * scale]])
     try:
-        p = scipy.linalg.solve_discrete_are(A.T, C.T, state_noise, output_noise)
+        p = solve_discrete_are(A.T, C.T, state_noise, output_noise)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError(
             "no anti-windup gain found: the controller has a marginal mode that its output does not show"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, get_type_hints
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import frequency_response
@@ -15,6 +16,8 @@ from ident.data.arrays import lock
 
 if TYPE_CHECKING:
     import control
+
+_ARRAYS = ("A", "B", "C", "D", "anti_windup_gain")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,18 +83,32 @@ class Law:
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Inverse of `to_dict`; ValueError if it is not of this format, naming a key it lacks."""
         if data.get("format") != cls.format_name():
-            found = f"format is {data.get('format')!r}, expected {cls.format_name()!r}"
+            found = f"format is {data.get('format')!r:.80}, expected {cls.format_name()!r}"
             raise ValueError(f"not a {cls.kind} file: {found}")
         missing = [field.name for field in fields(cls) if field.name not in data]
         if missing:
             raise ValueError(f"{cls.kind} file lacks the key {missing[0]!r}")
-        n = np.size(data["C"])
+        hints = get_type_hints(cls)
+        values = {field.name: cls._read(field.name, hints[field.name], data) for field in fields(cls)}
+        n = values["C"].size
         shapes = {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1), "anti_windup_gain": (n, 1)}
-        values: dict[str, Any] = {field.name: data[field.name] for field in fields(cls)}
         for name in shapes.keys() & values.keys():
-            values[name] = np.array(values[name], dtype=float).reshape(shapes[name])
-        values["dt_s"] = float(values["dt_s"])
+            if values[name].size != np.prod(shapes[name]):
+                raise ValueError(f"{cls.kind} file: {name} has {values[name].size} numbers, C has {n}")
+            values[name] = values[name].reshape(shapes[name])
         return cls(**values)
+
+    @classmethod
+    def _read(cls, name: str, hint: Any, data: Mapping[str, Any]) -> Any:
+        """A field of a file: an array of numbers, or what its annotation says."""
+        value = data[name]
+        try:
+            if name in _ARRAYS:
+                return np.array(value, dtype=np.float64)
+            return TypeAdapter(hint).validate_python(value.item() if isinstance(value, np.generic) else value)
+        except (TypeError, ValueError, OverflowError):
+            expected = "an array of numbers" if name in _ARRAYS else str(getattr(hint, "__name__", hint))
+            raise ValueError(f"{cls.kind} file: {name}: expected {expected}, got {value!r:.80}") from None
 
     def to_json(self) -> str:
         """Readable JSON text."""
@@ -102,9 +119,8 @@ class Law:
         """Inverse of `to_json`; ValueError with one line on bad input."""
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
-            place = f"line {error.lineno}, column {error.colno}"
-            raise ValueError(f"{cls.kind} JSON: {error.msg} at {place}") from error
+        except (ValueError, RecursionError) as error:  # syntax; integers or nesting without end
+            raise ValueError(f"{cls.kind} JSON: {error}") from error
         if not isinstance(data, dict):
             raise ValueError(f"{cls.kind} JSON must be an object; got {type(data).__name__}")
         return cls.from_dict(data)

@@ -16,7 +16,7 @@ from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 from plant.rig import Rig
-from plant.simulate import simulate
+from plant.simulation import simulate
 
 # Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
 # of the inverse of the largest angle for the other.

@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from diagnosis.machine.flexible_arm import NOISE, FlexibleArm, Output
+from diagnosis.machine.flexible_arm import NOISE, FlexibleArm
 from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
-from plant.rig import Rig
+from plant.rig import Output, Rig
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -12,10 +11,9 @@ from diagnosis.machine.machine_protocol import KNOWN_START, Real, RecordOfMachin
 from plant.effects import EFFECTS, Effect, make_machine
 from plant.effects.search_space import Candidate, Scales
 from plant.plan import SUBSTEP_S
-from plant.rig import Rig
-from plant.simulate import Simulator, Start
+from plant.rig import Output, Rig
+from plant.simulation import Simulator, Start
 
-Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2"]
 """What a flexible link can be measured by, in the order of a record's columns."""
 
 NOISE: dict[Output, str] = {

@@ -26,7 +26,7 @@ from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from plant.effects import Effect
 from plant.rig import Rig
-from plant.simulate import simulate
+from plant.simulation import simulate
 
 # In tolerances: small against one, large against the wobble of friction.
 _DEVIATION_STEP = 0.02

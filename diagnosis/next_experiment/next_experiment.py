@@ -19,7 +19,7 @@ from diagnosis.next_experiment.experiment_choices import (
     tailored_excitations,
     within,
 )
-from plant.simulate import simulate
+from plant.simulation import simulate
 
 # A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
 _SETTLED = 20.0

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from diagnosis.machine.case import Case
-from diagnosis.machine.flexible_arm import Output
+from plant.rig import Output
 
 Interval = tuple[float, float]
 # What is measured -> its sensor, as findings name it, and the unit of its slope.

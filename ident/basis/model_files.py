@@ -69,10 +69,8 @@ class ModelFile:
         """Inverse of `to_json`. ValueError: one line that begins with `source`."""
         try:
             document = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(
-                f"{source}, line {error.lineno}, column {error.colno}: not JSON ({error.msg})"
-            ) from None
+        except (ValueError, RecursionError) as error:  # syntax; integers or nesting without end
+            raise ValueError(f"{source}: not JSON ({error})") from None
         if not isinstance(document, dict):
             raise ValueError(f"{source}: expected a JSON object, found {type(document).__name__}")
         return _read(document, source)

@@ -22,8 +22,7 @@ from plant.effects.base import (
     with_torque,
 )
 from plant.effects.search_space import PHASE, Axis, Candidate, Scales, geometric, log_axis
-from plant.kernel import CUBIC, SINE
-from plant.machine import Disturbance, DryFriction, Machine, SmoothTorque, TorsionSpring
+from plant.machine import CUBIC, SINE, Disturbance, DryFriction, Machine, SmoothTorque, TorsionSpring
 from plant.modal import static_moment_kg_m
 from plant.rig import Rig
 

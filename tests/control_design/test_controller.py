@@ -103,7 +103,7 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
     ("text", "message"),
     [
         ('{"format": "flexlink-controller-1", "feedforward": {"level": 1}}', "needs level, width, lag_s"),
-        ("{", "line 1, column 2"),
+        ("{", "line 1 column 2"),
         ("[]", "must be an object"),
         ("{}", "expected 'flexlink-controller-1'"),
         ('{"format": "flexlink-controller-1", "A": []}', "lacks the key 'B'"),

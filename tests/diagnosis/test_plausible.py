@@ -11,7 +11,7 @@ from diagnosis import Case, Experiment
 from diagnosis.machine.plausible import refuse_implausible
 from plant import parse_effects, simulate
 from plant.presets import paper_link
-from plant.simulate import Simulator
+from plant.simulation import Simulator
 from workflow.diagnose.case_files import load_case
 
 RIG = paper_link().perturbed(

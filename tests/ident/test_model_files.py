@@ -111,7 +111,7 @@ def without(name):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "line 1, column 1: not JSON"),
+        ("", "not JSON .Expecting value: line 1 column 1"),
         (ModelFile(example()).to_json()[:300], "not JSON"),
         ("[1, 2]", "expected a JSON object, found list"),
         ("{}", "'format' is missing"),

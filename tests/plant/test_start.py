@@ -8,7 +8,7 @@ from plant.effects import parse_effect
 from plant.machine import Machine
 from plant.modal import default_n_modes, equations_of_motion
 from plant.presets import paper_link
-from plant.simulate import Simulator, Start, simulate
+from plant.simulation import Simulator, Start, simulate
 
 N_MODES = 3
 

@@ -14,7 +14,7 @@ import pytest
 
 from plant.effects import parse_effects
 from plant.rig import Rig
-from plant.simulate import simulate
+from plant.simulation import simulate
 from validation.blind.cases import NOT_TOGETHER, SHARES, schedule
 from validation.blind.generate import answer_toml, folder_hash, generate
 from validation.blind.protocol import run_blind

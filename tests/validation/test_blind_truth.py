@@ -10,7 +10,7 @@ import pytest
 from plant.effects import EFFECTS, parse_effects
 from plant.effects.joint import GroundSpring
 from plant.rig import Rig
-from plant.simulate import simulate
+from plant.simulation import simulate
 from validation.blind.beam import link_basis
 from validation.blind.truth import LISTED, UNLISTED, Feedback, Truth
 

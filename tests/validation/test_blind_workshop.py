@@ -11,7 +11,7 @@ import pytest
 
 from plant.effects import parse_effects
 from plant.rig import Rig
-from plant.simulate import Simulator, Start
+from plant.simulation import Simulator, Start
 from validation.blind.generate import generate
 from validation.blind.truth import LISTED, WORKSHOP_UNLISTED, Background, Before, Feedback, Truth
 from validation.blind.workshop.generate import SHARES, workshop_schedule

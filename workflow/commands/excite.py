@@ -9,7 +9,6 @@ import numpy as np
 from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.experiment import Limits, PlannedExperiment, plan_experiment
-from workflow.tasks.simulated_rig import INPUT_NAME
 
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
@@ -21,7 +20,9 @@ def write_experiment(limits: Limits, out: Path, *, seed: int, **settings: object
     """
     RunDirectory(out).refuse_unless_free()
     found = plan_experiment(limits, seed=seed, **settings)
-    from workflow.report.rendering import render_page  # loads matplotlib: a second
+    # Here: these take seconds to load, and limits that are refused do not need them.
+    from workflow.report.rendering import render_page
+    from workflow.tasks.simulated_rig import INPUT_NAME
 
     time = np.arange(found.plan.n_samples) * limits.dt_s
     signals = found.voltages_V.reshape(-1, time.size)

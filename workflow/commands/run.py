@@ -37,6 +37,8 @@ def run_from_files(
         from workflow.tasks.pipeline import config_of
 
         config, text = config_of(RunDirectory.open(out)), ""
+    elif resume and not replace:
+        raise InputError(f"{out}: no run is there to resume; start one without --resume")
     else:
         config, text = built_in_config()
     # Here: what computes takes seconds to load, and a configuration that is refused does not need it.

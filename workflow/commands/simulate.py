@@ -9,8 +9,6 @@ from workflow.config.run_config import SimulatedSource, built_in_config, load_si
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks import truth
-from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
 
 
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
@@ -24,9 +22,13 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
     out = Path(out)
     RunDirectory(out).refuse_unless_free()
+    # Here: what simulates takes seconds to load, and a configuration that is refused does not need it.
+    from workflow.tasks import truth
+    from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
+
     texts = {}
     for index, entry in enumerate(config.source.records):
-        with naming(f"source.records[{index}] ({entry.name})"):
+        with naming(f"{config.file}: source.records[{index}] ({entry.name})"):
             record = simulate_record(config.source, entry, config.run.seed)
         signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), [*record.input.T, *record.output.T], strict=True))
         safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import tomlkit
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -24,6 +24,7 @@ from workflow.config.rig_settings import EffectTable, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated
 from workflow.config.uncertainty_options import UncertaintyOptions
 
+ConfigT = TypeVar("ConfigT", bound="_FromFile")
 Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
 
@@ -311,14 +312,23 @@ class Notes(Section):
     unknown: tuple[str, ...] = ()
 
 
-class SimulationConfig(Section):
+class _FromFile(Section):
+    _file: str = PrivateAttr("the configuration")
+
+    @property
+    def file(self) -> str:
+        """Where it was read from, for complaints."""
+        return self._file
+
+
+class SimulationConfig(_FromFile):
     """The experiments of a simulated machine alone. Load with `load_simulation`."""
 
     run: RunSection = Field(default_factory=RunSection)
     source: SimulatedSource
 
 
-class RunConfig(Section):
+class RunConfig(_FromFile):
     """A whole run. Load with `load_config`."""
 
     run: RunSection = Field(default_factory=RunSection)
@@ -476,15 +486,21 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
     """Configuration and its text. Raises InputError: one line naming file, dotted key and what was
     expected."""
     text, document = read_toml(path)
-    return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
+    return _checked(RunConfig, document, path), text
 
 
 def load_simulation(path: Path) -> RunConfig | SimulationConfig:
     """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_config`."""
     _, document = read_toml(path)
     if document.keys() <= SimulationConfig.model_fields.keys():
-        return check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
-    return load_config(path)[0]
+        return _checked(SimulationConfig, document, path)
+    return _checked(RunConfig, document, path)
+
+
+def _checked(kind: type[ConfigT], document: dict[str, Any], path: Path) -> ConfigT:
+    found = check(kind, document, source=str(path), context={"base": path.absolute().parent})
+    found._file = str(path)
+    return found
 
 
 def built_in_config() -> tuple[RunConfig, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
@@ -14,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, Val
 from pydantic_core import ErrorDetails, to_json
 
 from workflow.config.renamed_keys import with_current_keys
-from workflow.engine import storage
+from workflow.engine import documents
 from workflow.engine.errors import InputError, shortened
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -35,12 +34,8 @@ def repeated(values: Sequence[T]) -> T | None:
 
 
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
-    """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
-    text = storage.read_text(path)
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
+    """Text and content of a TOML file, by the names its keys have now. Raises InputError."""
+    text, document = documents.read_toml(path)
     return text, with_current_keys(document, str(path))
 
 
@@ -157,8 +152,9 @@ def resolve(path: Path, info: ValidationInfo, *, kind: str = "file") -> Path:
     context = info.context or {}
     base, path = context.get("base"), Path(expand(str(path)))
     resolved = Path(os.path.normpath(Path(base) / path)) if base else path
-    if not context.get("may_be_gone") and not resolved.is_file():
-        if resolved.is_dir():
+    # os.path answers for names that no file can have, too.
+    if not context.get("may_be_gone") and not os.path.isfile(resolved):
+        if os.path.isdir(resolved):
             raise ValueError(f"expected a {kind}, found a directory: {resolved}")
         raise ValueError(f"no such {kind}: {resolved}")
     return resolved

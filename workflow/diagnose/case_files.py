@@ -13,13 +13,12 @@ from diagnosis.machine.plausible import refuse_implausible
 from ident.data.record_files import read_table
 from ident.data.time_grid import TimeGrid
 from plant.rig import Rig
-from workflow.config.settings import check, expand, read_toml, repeated
-from workflow.diagnose.case_settings import RIG_FILE, CaseSettings, ExperimentEntry
+from workflow.config.rig_settings import read_rig
+from workflow.config.settings import expand, repeated
+from workflow.diagnose.case_settings import CASE_FILE, RIG_FILE, CaseSettings, ExperimentEntry, read_case_file
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
-
-CASE_FILE = "case.toml"
 
 # Names of pages and files in the output directory that no case may take.
 _TAKEN_NAMES = ("index", "diagnose")
@@ -52,14 +51,8 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     cannot be read, an unknown key, role or effect, a column that is missing or not finite, a sensor that is
     dead, records whose sampling the rig file contradicts, no experiment held out.
     """
-    file = place if place.is_file() else place / CASE_FILE
-    if not file.is_file():
-        raise InputError(
-            f"{place}: no case is there; expected a folder with {CASE_FILE}, or a TOML file like it"
-        )
+    file, settings = read_case_file(place)
     folder = file.parent
-    _, content = read_toml(file)
-    settings = check(CaseSettings, content, source=str(file))
     name = settings.case or (folder.resolve().name if file.name == CASE_FILE else file.stem)
     if name in _TAKEN_NAMES:
         raise InputError(f"{file}: case: {name!r} is the name of a file of the overview; choose another")
@@ -88,8 +81,7 @@ def _rig(path: Path) -> Rig:
         beside = sorted(p.name for p in path.parent.glob("*.toml") if p.name != CASE_FILE)
         found = f"; beside it: {', '.join(beside)}" if beside else ""
         raise InputError(f"{path}: no such rig file{found}")
-    with naming(str(path)):
-        return Rig.from_toml(path)
+    return read_rig(path)
 
 
 def _experiment(

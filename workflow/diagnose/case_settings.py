@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from diagnosis.machine.flexible_arm import Output
 from ident.data.arrays import RealArray
 from plant.effects import EFFECTS
-from workflow.config.settings import Section, repeated
+from plant.rig import Output
+from workflow.config.settings import Section, check, read_toml, repeated
+from workflow.engine.errors import InputError
 
-RIG_FILE = "rig.toml"
+CASE_FILE, RIG_FILE = "case.toml", "rig.toml"
 
 
 class Column(Section):
@@ -99,3 +101,13 @@ class CaseSettings(Section):
     suspected: tuple[Annotated[str, AfterValidator(_known_effect)], ...] = ()
     columns: Columns = Field(default_factory=Columns)
     experiments: tuple[ExperimentEntry, ...] = Field(min_length=1)
+
+
+def read_case_file(place: Path) -> tuple[Path, CaseSettings]:
+    """The case file of a folder, or the one named itself, and what it says. Raises InputError."""
+    file = place if place.is_file() else place / CASE_FILE
+    if not file.is_file():
+        raise InputError(
+            f"{place}: no case is there; expected a folder with {CASE_FILE}, or a TOML file like it"
+        )
+    return file, check(CaseSettings, read_toml(file)[1], source=str(file))

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from workflow.config.settings import repeated
-from workflow.diagnose.case_files import CASE_FILE, LoadedCase, load_case
+from workflow.diagnose.case_files import LoadedCase, load_case
+from workflow.diagnose.case_settings import CASE_FILE
 from workflow.diagnose.directory import DiagnosisDirectory
 from workflow.diagnose.outputs import Engine, Work
 from workflow.diagnose.words import FILTERS, closure_words, short_answer

@@ -13,7 +13,7 @@ from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
 from plant.effects import LOOK_ALIKES, in_words
-from plant.simulate import simulate
+from plant.simulation import simulate
 from workflow.engine import storage
 from workflow.text.formats import listing
 

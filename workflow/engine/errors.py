@@ -12,6 +12,8 @@ EXIT_BAD_INPUT = 2
 EXIT_NOT_CERTIFIED = 3
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
+LONGEST_LINE = 300
+
 
 def one_line(text: object) -> str:
     """The text without line breaks or runs of blanks, for a message that must stay on one line."""
@@ -23,10 +25,14 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
-def shortened(value: object) -> str:
+def shortened(value: object, most: int = 80) -> str:
     """How a value is written, cut where it is long."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return cut(repr(value), most)
+
+
+def cut(text: str, most: int) -> str:
+    """The text, its end left out where it is longer."""
+    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 class InputError(ValueError):
@@ -35,7 +41,7 @@ class InputError(ValueError):
     exit_code = EXIT_BAD_INPUT
 
     def __init__(self, message: object) -> None:
-        super().__init__(one_line(message))
+        super().__init__(cut(one_line(message), LONGEST_LINE))
 
 
 class StageError(RuntimeError):
@@ -44,7 +50,7 @@ class StageError(RuntimeError):
     exit_code = EXIT_INTERNAL
 
     def __init__(self, message: object) -> None:
-        super().__init__(one_line(message))
+        super().__init__(cut(one_line(message), LONGEST_LINE))
 
 
 class CommandInterruptedError(RuntimeError):

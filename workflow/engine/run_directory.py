@@ -10,11 +10,13 @@
 
 A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the
 stage would be given now (its share of the configuration, its input files, the content of the stages before
-it). File and hash appear in one rename, so there is no instant at which one is there without the other.
+it). File and hash appear in one rename, so there is no instant at which one is there without the other. The
+file holds a digest of its content as well: one that was changed by anybody else is no result.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,14 +27,15 @@ from platform import python_version
 from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
-from workflow.engine import codec, storage
+from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming, shortened
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 3  # 3: results by codec
+LAYOUT_VERSION = 4  # 4: digests of the content in stage files
 T = TypeVar("T")
-_INPUT_HASH = "_input_hash"
+_INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
 _RESULT = "result"
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")
 
@@ -40,6 +43,23 @@ _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba"
 CONTROLLER_FILES = tuple(
     f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in (".json", ".c", ".h")
 )
+
+
+class _StageEntry(BaseModel):
+    seconds: float
+    input_sha256: str
+    finished: str
+
+
+class _Manifest(BaseModel):
+    """manifest.json; what else is in it nobody reads."""
+
+    layout: int
+    status: str
+    versions: dict[str, str]
+    config_sha256: str
+    inputs: dict[str, str]
+    stages: dict[str, _StageEntry]
 
 
 @dataclass(frozen=True)
@@ -110,7 +130,7 @@ class RunDirectory(Store):
 
     def _check_same(self, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
         RunDirectory.open(self.path)
-        changed = first_difference(storage.read_json(self.path / "config.json"), config)
+        changed = first_difference(self.config_document(), config)
         if changed:
             raise InputError(
                 f"{self.path}: cannot resume, the configuration changed at {changed}; choose another --out"
@@ -162,7 +182,10 @@ class RunDirectory(Store):
     def is_done(self, name: str, input_hash: str) -> bool:
         """True when the stage's file is there and was made from exactly this input."""
         path = self.stage_file(name)
-        return path is not None and _recorded_hash(path) == input_hash
+        try:
+            return path is not None and _stage_content(path)[0] == input_hash
+        except InputError:
+            return False  # damaged from outside
 
     def save_stage(self, name: str, result: Any, input_hash: str) -> Path:
         """Write a stage's result atomically, replacing what was there under either suffix."""
@@ -179,20 +202,31 @@ class RunDirectory(Store):
     def load_stage(self, name: str, kind: type[T]) -> T:
         """The result of a finished stage. Raises InputError when it is not there or not readable."""
         path = self._finished(name)
+        _, content = _stage_content(path)
         with naming(str(path)):
             if path.suffix == ".npz":
-                return codec.from_arrays(kind, storage.read_npz(path))
-            document = json.loads(storage.read_text(path))
-            return codec.unpack(kind, document.get(_RESULT), {})
+                return codec.from_arrays(kind, content)
+            return codec.unpack(kind, content[_RESULT], {})
 
     # -- manifest --------------------------------------------------------------------------------------------
 
     def manifest(self) -> dict[str, Any]:
-        return storage.read_json(self.manifest_path)
+        """Raises InputError where it is not as we write it."""
+        document = storage.read_json(self.manifest_path)
+        try:
+            _Manifest.model_validate(document)
+        except ValidationError as error:
+            key = ".".join(map(str, error.errors()[0]["loc"]))
+            raise InputError(f"{self.manifest_path}: damaged at {key[:80]}; start a new run") from error
+        return document
 
     def config_document(self) -> dict[str, Any]:
-        """The resolved configuration the run was begun with."""
-        return storage.read_json(self.path / "config.json")
+        """The resolved configuration the run was begun with. Raises InputError where it was changed since."""
+        path = self.path / "config.json"
+        document = storage.read_json(path)
+        if hash_of(document) != self.manifest()["config_sha256"]:
+            raise InputError(f"{path}: damaged, or changed since the run began; start a new run")
+        return document
 
     def record_stage(self, name: str, seconds: float, input_hash: str) -> None:
         """Note a finished stage's time in the manifest."""
@@ -216,10 +250,33 @@ def stage_bytes(result: Any, input_hash: str) -> tuple[bytes, str]:
     """Content and suffix of a stage's file: npz, or JSON for a result without arrays."""
     document, arrays = codec.pack(result)
     if arrays:
-        own = {_INPUT_HASH: np.array(input_hash), **codec.to_arrays(result)}
-        return storage.npz_bytes(own), ".npz"
-    text = json.dumps({_INPUT_HASH: input_hash, _RESULT: document}, indent=1, ensure_ascii=False)
+        content = {_INPUT_HASH: np.array(input_hash), **codec.to_arrays(result)}
+        return storage.npz_bytes({**content, _DIGEST: np.array(_digest(content))}), ".npz"
+    plain = {_INPUT_HASH: input_hash, _RESULT: document}
+    text = json.dumps({**plain, _DIGEST: _digest(plain)}, indent=1, ensure_ascii=False)
     return (text + "\n").encode("utf-8"), ".json"
+
+
+def _stage_content(path: Path) -> tuple[str, dict[str, Any]]:
+    """Input hash and content of a stage's file. Raises InputError where it is not as it was written."""
+    content = storage.read_npz(path) if path.suffix == ".npz" else documents.read_json(path)
+    recorded = str(content.pop(_DIGEST, None))
+    if _INPUT_HASH not in content or recorded != _digest(content):
+        raise InputError(f"{path}: changed since it was written; flexlink run --resume makes it anew")
+    return str(content[_INPUT_HASH]), content
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """SHA-256 of what a stage's file holds: arrays, or values of JSON."""
+    digest = hashlib.sha256()
+    for name in sorted(content):
+        value = content[name]
+        if isinstance(value, np.ndarray):
+            about, data = f"{value.dtype.str}{value.shape}", np.ascontiguousarray(value).tobytes()
+        else:
+            about, data = "", json.dumps(value, sort_keys=True).encode()
+        digest.update(f"{name}\0{about}\0{len(data)}\0".encode() + data)
+    return digest.hexdigest()
 
 
 def package_versions() -> dict[str, str]:
@@ -262,15 +319,6 @@ def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
         yield where, value
     for name, item in inner:
         yield from _leaves(item, name)
-
-
-def _recorded_hash(path: Path) -> str | None:
-    try:
-        if path.suffix == ".json":
-            return str(storage.read_json(path).get(_INPUT_HASH))
-        return str(storage.read_npz(path, only=_INPUT_HASH)[_INPUT_HASH])
-    except InputError:
-        return None  # damaged from outside: treat as not done
 
 
 def _now() -> str:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from ident.data.foreign_files import Unread, content_of, shown
 from ident.data.npz_files import npz_arrays
-from workflow.engine import codec
+from workflow.engine import codec, documents
 from workflow.engine.errors import InputError, describe_os_error, naming
 
 TEMPORARY_SUFFIX = ".part"
@@ -119,25 +119,10 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(tagged, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def read_text(path: Path) -> str:
-    """UTF-8 text of a file. Raises InputError naming it."""
-    try:
-        return path.read_text(encoding="utf-8-sig")  # editors on Windows like to put a mark in front
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
-
-
 def read_json(path: Path) -> dict[str, Any]:
     """The document written by `write_json`. Raises InputError naming the file."""
-    try:
-        document = codec.unpack(dict, json.loads(read_text(path)), {})
-    except codec.CodecError as error:
-        raise InputError(f"{path}: {error}") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from error
-    return document
+    with naming(str(path)):
+        return codec.unpack(dict, documents.read_json(path), {})
 
 
 def npz_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
@@ -163,13 +148,13 @@ def write_npz(path: Path, arrays: Mapping[str, AnyArray]) -> None:
     write_bytes(path, npz_bytes(arrays))
 
 
-def read_npz(path: Path, *, only: str | None = None) -> dict[str, AnyArray]:
-    """All arrays of an npz file (or just the one called `only`), read without pickle.
+def read_npz(path: Path) -> dict[str, AnyArray]:
+    """All arrays of an npz file, read without pickle.
 
     Raises InputError naming the file.
     """
     try:
-        arrays = npz_arrays(content_of(path), only)
+        arrays = npz_arrays(content_of(path))
     except OSError as error:
         raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
     except ValueError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from diagnosis.machine.flexible_arm import Output
+from plant.rig import Output
 from workflow.figures import style
 
 # The three models a gap is measured against, in the order of the waterfall, each with a line style.

@@ -9,7 +9,6 @@ Several sources are several plants that one controller has to serve.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.design_file import DesignFile, PlantSection, StatedUncertainty
 from workflow.config.run_config import RunConfig
-from workflow.engine import codec, storage
+from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.model_files import read_model
@@ -127,11 +126,7 @@ def _read_document(path: Path) -> dict[str, Any]:
     if suffix == ".npz":
         return storage.read_npz(path)
     if suffix == ".json":
-        with naming(str(path)):
-            document = json.loads(storage.read_text(path))
-            if not isinstance(document, dict):
-                raise ValueError(f"expected a JSON object, found {type(document).__name__}")
-            return document
+        return documents.read_json(path)
     if suffix != ".mat":
         raise InputError(f"{path}: not a run directory, and the ending is none of .json, .mat, .npz, .csv")
     with naming(str(path)):

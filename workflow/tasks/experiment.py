@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from plant import ExperimentPlan, Rig, crest_factor, linear_arm, simulate
-from workflow.config.rig_settings import PRESETS
-from workflow.engine.errors import InputError, naming
+from plant import ExperimentPlan, Rig, crest_factor, linear_arm
+from workflow.config.rig_settings import PRESETS, read_rig
+from workflow.engine.errors import InputError
 
 Real = npt.NDArray[np.float64]
 
@@ -104,14 +104,15 @@ class PlannedExperiment:
 
 def rig_called(name: str) -> Rig:
     """A preset by its name, or a rig file. Raises InputError."""
-    with naming(name):
-        return PRESETS[name]() if name in PRESETS else Rig.from_toml(Path(name))
+    return PRESETS[name]() if name in PRESETS else read_rig(Path(name))
 
 
 def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
     """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
     rig, gain = limits.rig, limits.gain_rad_per_Vs
     if rig is not None:
+        from plant import simulate  # takes a second to load: limits that are refused do not need it
+
         return lambda voltage: simulate(rig, voltage, dt_s=limits.dt_s).hub_angle_true_rad
     if gain is not None:
         return lambda voltage: gain * limits.dt_s * np.cumsum(voltage)

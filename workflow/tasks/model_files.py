@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ident.basis.model_files import ModelFile
 from ident.data.foreign_files import content_of
-from workflow.engine import storage
+from workflow.engine import documents, storage
 from workflow.engine.errors import naming
 
 MODEL_SUFFIXES = (".json", ".mat")
@@ -23,4 +23,4 @@ def read_model(path: Path) -> ModelFile:
     with naming(str(path)):
         if path.suffix.lower() == ".mat":
             return ModelFile.from_mat(content_of(path), str(path))
-        return ModelFile.from_json(storage.read_text(path), str(path))
+        return ModelFile.from_json(documents.read_text(path), str(path))

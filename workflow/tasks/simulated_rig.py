@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 
 from ident.data.record import Record
 from plant import Rig, SampledArm, parse_effect, simulate
-from workflow.config.rig_settings import PRESETS
+from workflow.config.rig_settings import PRESETS, read_rig
 from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedRecord, SimulatedSource
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine
@@ -24,7 +25,7 @@ def rig_of(source: SimulatedSource) -> Rig:
     """The nominal rig. Raises ValueError (one line) or OSError for a rig file that cannot be read."""
     if isinstance(source.rig, str) and source.rig in PRESETS:
         return PRESETS[source.rig]()
-    return Rig.from_toml(source.rig)
+    return read_rig(Path(source.rig))
 
 
 def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> Record:

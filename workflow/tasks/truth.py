@@ -5,7 +5,6 @@ Nothing but the display reads it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from plant.effects import make_machine
 from plant.modal import default_n_modes, equations_of_motion
 from workflow.config.run_config import SimulatedSource
 from workflow.config.settings import Section, check
-from workflow.engine.errors import InputError
+from workflow.engine import documents
 from workflow.tasks.results import IdentifiedChannel
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, rig_of
 
@@ -64,11 +63,8 @@ def truth_beside(logs: Sequence[Path], output: str) -> tuple[TrueMode, ...]:
     path = folders.pop() / FILE_NAME
     if folders or not path.is_file():
         return ()
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not readable as JSON ({' '.join(str(error).split())})") from None
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+    document = documents.read_json(path)
+    if document.get("format") != _FORMAT:
         return ()
     return check(Truth, document, source=str(path)).modes.get(output, ())
 

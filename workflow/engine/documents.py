@@ -1,0 +1,78 @@
+"""The one door for text that somebody wrote (docs/limits.md): size, nesting and numbers are checked before
+anything looks at what is said."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from workflow.engine.errors import InputError, describe_os_error, shortened
+
+MOST_BYTES = 32 * 2**20
+MOST_TOML_BYTES = 2**20
+MOST_LEVELS = 40
+LARGEST_INTEGER = 2**63 - 1
+# The parser's time grows with the square of a dotted key's length.
+_LONGEST_TOML_LINE = 20_000
+
+
+def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
+    """UTF-8 text of a file. Raises InputError naming it."""
+    try:
+        with open(path, "rb") as stream:  # pipes have no size: read one byte more than is allowed
+            content = stream.read(most_bytes + 1)
+        if len(content) > most_bytes:
+            raise InputError(f"{path}: larger than {most_bytes / 2**20:g} MiB")
+        return content.decode("utf-8-sig")  # editors on Windows like to put a mark in front
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+
+
+def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
+    """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
+    text = read_text(path, MOST_TOML_BYTES)
+    longest = max(map(len, text.splitlines()), default=0)
+    if longest > _LONGEST_TOML_LINE:
+        raise InputError(f"{path}: a line of {longest} characters, at most {_LONGEST_TOML_LINE} are read")
+    return text, _parsed(tomllib.loads, text, path, "TOML")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises InputError naming the file."""
+    document = _parsed(json.loads, read_text(path), path, "JSON")
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
+    return document
+
+
+def _parsed(parse: Callable[[str], Any], text: str, path: Path, what: str) -> Any:
+    try:
+        document = parse(text)
+    except RecursionError:
+        raise InputError(f"{path}: nested deeper than {MOST_LEVELS} levels") from None
+    except ValueError as error:  # syntax, or an integer of more digits than Python reads
+        raise InputError(f"{path}: not valid {what}: {error}") from error
+    _refuse_extremes(document, path)
+    return document
+
+
+def _refuse_extremes(document: Any, path: Path) -> None:
+    """Level by level, so that no depth is too much for the check itself."""
+    level: list[tuple[str, Any]] = [("", document)]
+    for _ in range(MOST_LEVELS + 1):
+        below: list[tuple[str, Any]] = []
+        for key, value in level:
+            if isinstance(value, dict):
+                below += [(str(name), item) for name, item in value.items()]
+            elif isinstance(value, list):
+                below += [(key, item) for item in value]
+            elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+                raise InputError(f"{path}: {shortened(key)}: an integer beyond 64 bits, {shortened(value)}")
+        level = below
+    if level:
+        raise InputError(f"{path}: nested deeper than {MOST_LEVELS} levels")
