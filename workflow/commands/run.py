@@ -49,6 +49,7 @@ def run_from_files(
         config,
         out if out is not None else default_directory(config.run.name),
         config_text=text,
+        called=str(config_path or "default arm"),
         page=REPORT,
         resume=resume,
         replace=replace,

@@ -28,7 +28,7 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
 
     texts = {}
     for index, entry in enumerate(config.source.records):
-        with naming(f"{config.file}: source.records[{index}] ({entry.name})"):
+        with naming(f"{config_path or 'default arm'}: source.records[{index}] ({entry.name})"):
             record = simulate_record(config.source, entry, config.run.seed)
         signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), [*record.input.T, *record.output.T], strict=True))
         safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import tomlkit
-from pydantic import AfterValidator, Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -24,7 +24,6 @@ from workflow.config.rig_settings import EffectTable, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated
 from workflow.config.uncertainty_options import UncertaintyOptions
 
-ConfigT = TypeVar("ConfigT", bound="_FromFile")
 Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
 
@@ -312,23 +311,14 @@ class Notes(Section):
     unknown: tuple[str, ...] = ()
 
 
-class _FromFile(Section):
-    _file: str = PrivateAttr("the configuration")
-
-    @property
-    def file(self) -> str:
-        """Where it was read from, for complaints."""
-        return self._file
-
-
-class SimulationConfig(_FromFile):
+class SimulationConfig(Section):
     """The experiments of a simulated machine alone. Load with `load_simulation`."""
 
     run: RunSection = Field(default_factory=RunSection)
     source: SimulatedSource
 
 
-class RunConfig(_FromFile):
+class RunConfig(Section):
     """A whole run. Load with `load_config`."""
 
     run: RunSection = Field(default_factory=RunSection)
@@ -486,21 +476,15 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
     """Configuration and its text. Raises InputError: one line naming file, dotted key and what was
     expected."""
     text, document = read_toml(path)
-    return _checked(RunConfig, document, path), text
+    return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
 
 
 def load_simulation(path: Path) -> RunConfig | SimulationConfig:
     """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_config`."""
     _, document = read_toml(path)
     if document.keys() <= SimulationConfig.model_fields.keys():
-        return _checked(SimulationConfig, document, path)
-    return _checked(RunConfig, document, path)
-
-
-def _checked(kind: type[ConfigT], document: dict[str, Any], path: Path) -> ConfigT:
-    found = check(kind, document, source=str(path), context={"base": path.absolute().parent})
-    found._file = str(path)
-    return found
+        return check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
+    return load_config(path)[0]
 
 
 def built_in_config() -> tuple[RunConfig, str]:

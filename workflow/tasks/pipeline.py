@@ -25,6 +25,7 @@ def run_pipeline(
     out: Path,
     *,
     config_text: str = "",
+    called: str = "the configuration",
     resume: bool = False,
     replace: bool = False,
     page: Stage | None = None,
@@ -32,8 +33,8 @@ def run_pipeline(
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
-    `config_text` is kept as config.toml (the file as the user wrote it); `resume` takes up a run that is
-    there, `replace` starts it afresh; `page` is the stage that comes last and writes the page. A result that
+    `config_text` is kept as config.toml (the file as the user wrote it; `called` in complaints); `resume`
+    takes up a run that is there, `replace` starts it afresh; `page` is the stage that comes last and writes the page. A result that
     is not certified is no error: the page is written all the same and `RunSummary.certified` says so.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
@@ -48,7 +49,7 @@ def run_pipeline(
     started = time.monotonic()
     ready: RecordsResult | None = None
     if not (resume and out.exists()):
-        ready = first.run(StageInput(config, None, progress))
+        ready = first.run(StageInput(config, None, progress, called))
     ready_s = time.monotonic() - started
     existed = out.exists()
     run = RunDirectory.begin(

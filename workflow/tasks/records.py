@@ -33,7 +33,7 @@ def make_records(stage: StageInput) -> RecordsResult:
     if isinstance(source, SimulatedSource):
         for index, entry in enumerate(source.records):
             stage.progress.update("records", index / len(source.records), entry.name)
-            with naming(f"{stage.config.file}: source.records[{index}] ({entry.name})"):
+            with naming(f"{stage.called}: source.records[{index}] ({entry.name})"):
                 made.append(simulate_record(source, entry, stage.config.run.seed))
     else:
         made = [read_record(source, entry, stage.config.channels) for entry in source.records]

@@ -19,11 +19,13 @@ from workflow.tasks.results import RunResults
 
 @dataclass(frozen=True)
 class StageInput:
-    """What a stage may look at. `earlier` is None for the first stage only, which reads no earlier result."""
+    """What a stage may look at. `earlier` is None for the first stage only, which reads no earlier result.
+    `called`: what to call the configuration in a complaint."""
 
     config: RunConfig
     earlier: RunResults | None
     progress: Progress
+    called: str = "the configuration"
 
     @property
     def results(self) -> RunResults:
