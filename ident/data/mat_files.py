@@ -48,7 +48,7 @@ class _File:
 
     def __init__(self, content: bytes) -> None:
         mark, version = content[126:128], content[124:126]
-        if content.startswith(b"\x89HDF") or content[512:516] == b"\x89HDF":
+        if b"\x89HDF\r\n" in content[:1024]:
             raise ValueError("a version 7.3 .mat file where one of version 7 is expected: save it with '-v7'")
         if mark not in (b"IM", b"MI") or version not in (b"\x00\x01", b"\x01\x00"):
             raise ValueError("not a MATLAB .mat file of version 5 to 7.2; save it with '-v7'")

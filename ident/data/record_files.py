@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 import zlib
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from ident.data.child_process import read_in_child
 from ident.data.foreign_files import LARGEST_BYTES, content_of, shown
 from ident.data.mat_files import mat_variables
 from ident.data.npz_files import npz_arrays
@@ -83,8 +85,35 @@ def _read_npz(file: Path, content: bytes) -> Table:
 
 @reads(".mat")
 def _read_mat(file: Path, content: bytes) -> Table:
-    """A MATLAB file up to version 7.2; what stands in structs is called log.signals[0].values."""
+    """A MATLAB file; what stands in structs is called log.signals[0].values."""
+    if b"\x89HDF\r\n" in content[:1024]:  # version 7.3
+        return _read_columns(file, content, "HDF5", "h5py")
     return Table(file, _flat("", mat_variables(content, file)))
+
+
+@reads(".h5", ".hdf5")
+def _read_hdf5(file: Path, content: bytes) -> Table:
+    """Datasets by their path: group/signal; of compound ones group/table.field."""
+    return _read_columns(file, content, "HDF5", "h5py")
+
+
+@reads(".parquet")
+def _read_parquet(file: Path, content: bytes) -> Table:
+    return _read_columns(file, content, "parquet", "pyarrow")
+
+
+@reads(".xlsx")
+def _read_xlsx(file: Path, content: bytes) -> Table:
+    """The first sheet with a table, laid out as in a text file; rows are called lines."""
+    layout, columns = read_text(read_in_child("xlsx", "openpyxl", content).decode("utf-8"))
+    return Table(file, columns, layout.first, layout, layout.units)
+
+
+def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
+    arrays = npz_arrays(read_in_child(kind, library, content))
+    about = json.loads(arrays.pop("about").tobytes())
+    columns = {name: arrays[str(k)] for k, (name, _) in enumerate(about)}
+    return Table(file, columns, units={name: unit for name, unit in about if unit})
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:

@@ -1,0 +1,156 @@
+"""Run as a script, alone: the columns of an HDF5, parquet or xlsx file, from standard input to output.
+
+The libraries that read these formats are compiled, and a file can be made to end their process or to fill
+the memory. Here that process is not ours, and has limits of memory and time. Out come an npz archive (arrays
+0, 1, ..., and `about`: names and units as JSON) or, of a spreadsheet, a text table with tabs. Exit code 2:
+one line on standard error says what is wrong; 3: the library it names is not there.
+"""
+
+import io
+import json
+import resource
+import sys
+import zipfile
+from typing import Any
+
+LARGEST_BYTES = 2**30
+CPU_SECONDS = 120
+_MEMORY_BYTES = 8 * LARGEST_BYTES
+_NUMBERS = "fiub"
+
+
+class RefusedError(ValueError):
+    """Something in the file that is not read; the message is for the user."""
+
+
+Columns = dict[str, tuple[Any, str]]  # array and unit by name
+
+
+def hdf5_columns(content: bytes) -> Columns:
+    """Datasets by their path; in a file of MATLAB (version 7.3) by the name that they have there."""
+    import h5py
+    import numpy as np
+
+    found: Columns = {}
+    with h5py.File(io.BytesIO(content), "r") as file:
+        parts: list[tuple[str, Any]] = []
+        file.visititems(
+            lambda name, item: parts.append((name, item)) if isinstance(item, h5py.Dataset) else None
+        )
+        matlab = any("MATLAB_class" in item.attrs for _, item in parts)
+        total = 0
+        for path, data in parts:
+            if path.startswith("#") or data.external or data.is_virtual or "MATLAB_empty" in data.attrs:
+                continue  # what other files hold is none of this log's business
+            if data.shape is None or not 0 < data.ndim <= 2:
+                continue
+            total += data.size * data.dtype.itemsize
+            if total > LARGEST_BYTES:
+                raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
+            name = path.replace("/", ".") if matlab else path
+            kind = data.attrs.get("MATLAB_class", b"")
+            unit = data.attrs.get("unit", data.attrs.get("units", ""))
+            unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+            fields = data.dtype.names or ()
+            if data.dtype.kind in _NUMBERS and kind != b"char":
+                values = np.asarray(data[()])
+                # MATLAB stores column by column.
+                found[name] = (values.T if matlab else values), unit
+            elif fields and not matlab:
+                rows = data[()]
+                for field in fields:
+                    if rows.dtype[field].kind in _NUMBERS and not rows.dtype[field].shape:
+                        found[f"{name}.{field}"] = rows[field], ""
+    return found
+
+
+def parquet_columns(content: bytes) -> Columns:
+    """Columns of numbers and of instants; missing numbers as NaN."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pa.set_cpu_count(1)
+    file = pq.ParquetFile(pa.BufferReader(content))
+    about = file.metadata
+    sizes = (about.row_group(k).total_byte_size for k in range(about.num_row_groups))
+    if sum(sizes) > LARGEST_BYTES or 8 * about.num_rows * about.num_columns > 4 * LARGEST_BYTES:
+        raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
+    table = file.read(use_threads=False)
+    found: Columns = {}
+    for field, column in zip(table.schema, table.columns, strict=True):
+        kind = field.type
+        if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+            values = column.cast(pa.float64()).to_numpy()
+        elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+            values = column.to_numpy()
+        else:
+            continue
+        unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+        found[field.name] = values, unit
+    return found
+
+
+def sheet_text(content: bytes) -> str:
+    """The first sheet that has two rows and more, as text with tabs."""
+    import openpyxl
+
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > LARGEST_BYTES:
+            raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: save it as CSV")
+    book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
+    for sheet in book.worksheets:
+        sheet.reset_dimensions()  # which the file states, and need not be true
+        lines = ["\t".join(_cell(value) for value in row) for row in sheet.iter_rows(values_only=True)]
+        if sum(bool(line.strip()) for line in lines) > 1:
+            return "\n".join(lines) + "\n"
+    raise RefusedError("no sheet has a table; expected a row of names and rows of numbers")
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, float):
+        return repr(value)
+    if hasattr(value, "total_seconds"):
+        return repr(value.total_seconds())
+    text = value.isoformat() if hasattr(value, "isoformat") else str(value)
+    return " ".join(text.split())
+
+
+def _archive(columns: Columns) -> bytes:
+    import numpy as np
+
+    about = json.dumps([[name, unit] for name, (_, unit) in columns.items()]).encode()
+    stream = io.BytesIO()
+    arrays = {str(k): values for k, (values, _) in enumerate(columns.values())}
+    np.savez(stream, about=np.frombuffer(about, dtype=np.uint8), **arrays)
+    return stream.getvalue()
+
+
+def main(kind: str) -> int:
+    """kind: hdf5, parquet or xlsx."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    content = sys.stdin.buffer.read()
+    try:
+        if kind == "xlsx":
+            found = sheet_text(content).encode("utf-8", "replace")
+        else:
+            found = _archive(hdf5_columns(content) if kind == "hdf5" else parquet_columns(content))
+    except ImportError as error:
+        sys.stderr.write(error.name or str(error))
+        return 3
+    except RefusedError as error:
+        sys.stderr.write(str(error))
+        return 2
+    except Exception:  # these libraries raise many kinds on damaged files
+        return 2
+    sys.stdout.buffer.write(found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

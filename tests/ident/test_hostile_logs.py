@@ -1,0 +1,146 @@
+"""Damaged log files: columns or a ValueError of one line, whatever the bytes; no crash, no hang."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import subprocess
+import zipfile
+
+import numpy as np
+import pytest
+
+from ident.data import child_process, foreign_files, record_files
+from ident.data.record_files import read_table
+from tests.ident.mutations import mutated
+from tests.ident.test_forty_logs import LOGS
+
+# Those that a process of its own reads take a second each.
+IN_PROCESS = ("semicolons, decimal commas", "day.month.year", "packed by gzip", "npz, a matrix", "MATLAB 5")
+IN_A_CHILD = (
+    "a spreadsheet with preamble, units and dates",
+    "parquet with instants",
+    "HDF5 with groups and attributes",
+    "MATLAB 7.3",
+)
+
+
+def read_all(path) -> bool:
+    """Whether a table was found; each of its columns is numbers or refused."""
+    try:
+        table = read_table(path)
+    except ValueError as error:
+        fits(error, path)
+        return False
+    for name in table.names:
+        try:
+            assert np.all(np.isfinite(table.columns([name])[name]))
+        except ValueError as error:
+            fits(error, path)
+    return True
+
+
+def fits(error: ValueError, path) -> None:
+    line = str(error)
+    assert line.startswith(str(path))
+    assert "\n" not in line
+    assert len(line) - len(str(path.parent)) <= 300
+
+
+def fuzz(name, tmp_path, count):
+    whole, path = LOGS[name].content, tmp_path / LOGS[name].file
+    rng = np.random.default_rng(40)
+    path.write_bytes(whole)
+    assert read_all(path)
+    for _ in range(count):
+        path.write_bytes(mutated(whole, rng))
+        read_all(path)
+
+
+@pytest.mark.parametrize("name", IN_PROCESS)
+def test_damaged_bytes(name, tmp_path):
+    fuzz(name, tmp_path, 100)
+
+
+@pytest.mark.parametrize("name", IN_A_CHILD)
+def test_damaged_bytes_for_a_child(name, tmp_path):
+    fuzz(name, tmp_path, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_PROCESS)
+def test_many_damaged_bytes(name, tmp_path):
+    fuzz(name, tmp_path, 2000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_A_CHILD)
+def test_many_damaged_bytes_for_a_child(name, tmp_path):
+    fuzz(name, tmp_path, 100)
+
+
+def test_a_child_that_dies_or_hangs_is_a_refusal(tmp_path, monkeypatch):
+    script = tmp_path / "child.py"
+    monkeypatch.setattr(child_process, "_SCRIPT", script)
+    monkeypatch.setattr(child_process, "_SECONDS", 2)
+    for code, words in (
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "not a HDF5 file, or a damaged one"),
+        ("import time; time.sleep(60)", "not read in 2 s"),
+        ("import sys; sys.stderr.write('h5py'); sys.exit(3)", r"need h5py: pip install 'flexlink\[logs\]'"),
+    ):
+        script.write_text(code)
+        with pytest.raises(ValueError, match=words):
+            child_process.read_in_child("HDF5", "h5py", b"")
+
+
+def test_sizes_are_limited(tmp_path, monkeypatch):
+    monkeypatch.setattr(record_files, "LARGEST_BYTES", 2**20)
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(bytes(2**21)))
+    with pytest.raises(ValueError, match="unpacks to more than 1 MiB"):
+        read_table(tmp_path / "a.csv.gz")
+    monkeypatch.setattr(foreign_files, "LARGEST_BYTES", 2**10)
+    (tmp_path / "a.csv").write_bytes(bytes(2**21))
+    with pytest.raises(ValueError, match="2 MiB; expected at most"):
+        read_table(tmp_path / "a.csv")
+
+
+def test_entities_that_grow_do_not_fill_the_memory(tmp_path):
+    """A spreadsheet is XML: each of ten entities is ten of the one before."""
+    source, bomb = LOGS["a spreadsheet"].content, io.BytesIO()
+    entities = "".join(f'<!ENTITY a{k + 1} "{f"&a{k};" * 10}">' for k in range(10))
+    with zipfile.ZipFile(io.BytesIO(source)) as old, zipfile.ZipFile(bomb, "w") as new:
+        for entry in old.infolist():
+            text = old.read(entry)
+            if entry.filename == "xl/worksheets/sheet2.xml":
+                head = f'<!DOCTYPE worksheet [<!ENTITY a0 "aaaaaaaaaa">{entities}]>'.encode()
+                text = head + text.replace(b">t_s<", b">&a10;<")
+            new.writestr(entry, text)
+    (tmp_path / "a.xlsx").write_bytes(bomb.getvalue())
+    with pytest.raises(ValueError, match=r"a\.xlsx: "):
+        read_table(tmp_path / "a.xlsx").columns(["t_s"])
+
+
+def test_the_child_reads_no_other_file(tmp_path):
+    import h5py
+
+    secret = tmp_path / "secret.bin"
+    np.arange(8.0).tofile(secret)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("there", data=np.arange(8.0))
+        file.create_dataset("elsewhere", (8,), "f8", external=[(str(secret), 0, 64)])
+        file["link"] = h5py.ExternalLink(str(tmp_path / "b.h5"), "x")
+    assert read_table(tmp_path / "a.h5").names == ("there",)
+
+
+def test_no_shell_and_no_surroundings(monkeypatch):
+    seen = {}
+
+    def run(command, **options):
+        seen.update(options, command=command)
+        return subprocess.CompletedProcess(command, 0, b"", b"")
+
+    monkeypatch.setattr(child_process.subprocess, "run", run)
+    monkeypatch.setenv("HDF5_PLUGIN_PATH", "/elsewhere")
+    child_process.read_in_child("HDF5", "h5py", b"")
+    assert "HDF5_PLUGIN_PATH" not in seen["env"]
+    assert seen["command"][1] == "-I"
