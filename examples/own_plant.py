@@ -2,9 +2,9 @@
 
     python examples/own_plant.py
 
-What you bring: `simulate(parameters, effects, inputs) -> outputs`, stated parameters with their tolerances, a
-list of what may be missing, and records. Those here come from a simulation with a seal that drags and a
-tilted table; replace `recorded` by your own.
+What you bring: `simulate(parameters, effects, inputs) -> outputs`, stated parameters with their tolerances,
+the names of what may be missing, and records. Those here come from a carriage with a seal that drags and a
+tilted table; replace `recorded` by your own. docs/own_plant.md says what else there is.
 """
 
 from __future__ import annotations
@@ -12,50 +12,36 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
+from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 
 DT_S, NOISE_M = 0.01, 2e-4
 STATED = {"mass_kg": 2.0, "spring_N_m": 80.0, "damper_Ns_m": 3.0}
 TOLERANCES = {"mass_kg": 0.02, "spring_N_m": 0.05, "damper_Ns_m": 0.2}
-EFFECTS = (
-    PlantEffect("dry_friction", (EffectParameter("force_N", 1e-3, 20.0),), dependence="continuous"),
-    # An offset is a candidate like any other: without it something that resembles it wins.
-    PlantEffect("constant_force", (EffectParameter("force_N", 1e-3, 20.0),), signed=True),
-    PlantEffect("sensor_offset", (EffectParameter("offset_m", 1e-5, 0.1),), signed=True),
-    PlantEffect("stiffening", (EffectParameter("cubic_N_m3", 1.0, 1e5),), signed=True),
-    PlantEffect("input_delay", (EffectParameter("delay_s", 1e-4, 0.2),)),
-)
+# Put around the simulation, which knows none of them. An offset is a candidate like any other: without it
+# something that resembles it wins.
+NAMES = ("coulomb_friction", "input_offset", "output_offset", "input_delay")
+# Not on the list: written into the simulation.
+STIFFENING = PlantEffect("stiffening", (EffectParameter("cubic_N_m3", 1.0, 1e5),), signed=True)
 
 
 def simulate(parameters, effects, inputs):
     """Force (T, 1), held over each sample -> position (T, 1)."""
-    values = {(effect, key): value for effect, given in effects.items() for key, value in given.items()}
-    position = carriage(
-        np.ascontiguousarray(inputs[:, 0]) + values.get(("constant_force", "force_N"), 0.0),
-        parameters["mass_kg"],
-        parameters["spring_N_m"],
-        parameters["damper_Ns_m"],
-        values.get(("stiffening", "cubic_N_m3"), 0.0),
-        values.get(("dry_friction", "force_N"), 0.0),
-        values.get(("input_delay", "delay_s"), 0.0),
-    )
-    return position[:, None] + values.get(("sensor_offset", "offset_m"), 0.0)
+    cubic = effects["stiffening"]["cubic_N_m3"] if "stiffening" in effects else 0.0
+    force = np.ascontiguousarray(inputs[:, 0])
+    return carriage(force, *(parameters[key] for key in STATED), cubic, 0.0)[:, None]
 
 
 @njit
-def carriage(force, mass, spring, damper, cubic, dry, delay):
+def carriage(force, mass, spring, damper, cubic, dry):
     """Steps of a tenth of a sample; dry friction takes off what it can, so that the carriage truly sticks."""
     steps = 10
     h = DT_S / steps
     position = np.zeros(force.size)
-    whole = int(delay / DT_S)
-    part = delay / DT_S - whole
     x, v = 0.0, 0.0
     for k in range(force.size):
         position[k] = x
-        now = (1 - part) * force[max(k - whole, 0)] + part * force[max(k - whole - 1, 0)]
         for _ in range(steps):
-            free = v + h / mass * (now - spring * x - cubic * x**3 - damper * v)
+            free = v + h / mass * (force[k] - spring * x - cubic * x**3 - damper * v)
             free = np.sign(free) * max(abs(free) - h / mass * dry, 0.0)
             x += h * (v + free) / 2
             v = free
@@ -65,17 +51,25 @@ def carriage(force, mass, spring, damper, cubic, dry, delay):
 def recorded(seed=0, n_samples=600):
     """Three records to fit and one to judge, of a carriage that is a little other than stated."""
     rng = np.random.default_rng(seed)
-    true = {"mass_kg": 2.03, "spring_N_m": 77.0, "damper_Ns_m": 3.3}
-    lacking = {"dry_friction": {"force_N": 0.8}, "constant_force": {"force_N": -0.5}}
+    dragging, tilt = 0.8, -0.5
     for k, role in enumerate(("estimation", "estimation", "estimation", "held_out")):
-        force = (3.0 + k) * rng.choice([-1.0, 1.0], n_samples // 20).repeat(20)[:, None]
-        position = simulate(true, lacking, force) + NOISE_M * rng.standard_normal((n_samples, 1))
-        yield PlantExperiment(f"steps {k + 1}", role, force, position)
+        force = (3.0 + k) * rng.choice([-1.0, 1.0], n_samples // 20).repeat(20)
+        position = carriage(force + tilt, 2.03, 77.0, 3.3, 0.0, dragging)
+        position += NOISE_M * rng.standard_normal(n_samples)
+        yield PlantExperiment(f"steps {k + 1}", role, force[:, None], position[:, None])
+
+
+def case_of(experiments, **more):
+    """more: of `Plant`, for example model_error=0.05 for a machine that no simulation follows exactly."""
+    experiments = tuple(experiments)
+    plant = Plant(simulate, STATED, TOLERANCES, ("position_m",), np.array([NOISE_M]), (STIFFENING,), **more)
+    return PlantCase(
+        "carriage", with_effects(plant, NAMES, experiments, dt_s=DT_S, motion="position_m"), experiments
+    )
 
 
 def run(seed=0):
-    plant = Plant(simulate, STATED, TOLERANCES, ("position_m",), np.array([NOISE_M]), EFFECTS)
-    return diagnose(PlantCase("carriage", plant, tuple(recorded(seed))))
+    return diagnose(case_of(recorded(seed)))
 
 
 def main() -> None:

@@ -92,6 +92,10 @@ class Case(RecordedCase[Experiment]):
         """Names of the outputs of every experiment."""
         return self.experiments[0].outputs
 
+    @property
+    def dt_s(self) -> float:
+        return self.rig.sampling.dt_s
+
     @cached_property
     def steps(self) -> Real:
         """(Y,) steps of the quantisation grids that the outputs of all records lie on; 0: on none."""

@@ -218,16 +218,16 @@ KINDS: dict[str, Kind] = {
         lambda s: (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
         dependence="non-smooth",
     ),
-    "sensor_lag": Kind("output", _lagged_sensor, _lags),
-    "sensor_delay": Kind("output", _delayed, _delays),
-    "sensor_gain": Kind("output", _scaled, _gains, signed=True),
-    "sensor_offset": Kind(
+    "output_lag": Kind("output", _lagged_sensor, _lags),
+    "output_delay": Kind("output", _delayed, _delays),
+    "output_gain": Kind("output", _scaled, _gains, signed=True),
+    "output_offset": Kind(
         "output",
         _shifted,
         lambda s: (_log("offset", s.output, 1e-6, 3.0, 1e-4, 0.5, 8),),
         signed=True,
     ),
-    "sensor_drift": Kind(
+    "output_drift": Kind(
         "output",
         _drifting,
         lambda s: (_log("rate_per_s", s.output / s.duration_s, 1e-6, 3.0, 1e-4, 1.0, 8),),

@@ -62,6 +62,7 @@ class Plant:
     model_error : float. Share of the motion (RMS of an output about its mean) that the simulation may miss
         even with the right effects. No simulation of a real machine reaches its noise; with zero here what is
         left over makes the answer "unknown".
+    dt_s : float. Sampling period, for pages; `with_effects` states it.
     """
 
     simulation: Simulate
@@ -71,6 +72,7 @@ class Plant:
     noise: Real
     effects: tuple[PlantEffect, ...] = ()
     model_error: float = 0.0
+    dt_s: float = float("nan")
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -237,6 +239,18 @@ class PlantCase(RecordedCase[PlantExperiment]):
     @property
     def machine(self) -> Plant:
         return self.plant
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.plant.output_names
+
+    @property
+    def model_error(self) -> float:
+        return self.plant.model_error
+
+    @property
+    def dt_s(self) -> float:
+        return self.plant.dt_s
 
     @property
     def steps(self) -> Real:

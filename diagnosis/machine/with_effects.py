@@ -24,7 +24,7 @@ _MISSING = {
 }
 _GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
 # What no record of one output can tell from its twin at the input where the machine is linear.
-_TWINS = ("sensor_lag", "sensor_delay", "sensor_gain")
+_TWINS = ("output_lag", "output_delay", "output_gain")
 # A play of a force is rare; friction one way looks like an offset beside friction both ways.
 _BY_NAME_ONLY = ("input_backlash", "one_sided_friction")
 _SMOOTHED = 11  # samples, of a measured position whose speed is asked
@@ -117,7 +117,7 @@ def with_effects(
                 acts=Acts(kind.where, place, kind.change, dt_s, at_rest_before),
             )
         )
-    equipped = replace(plant, effects=tuple(found))
+    equipped = replace(plant, effects=tuple(found), dt_s=dt_s)
     _try(equipped, experiments[0], body)
     return equipped
 

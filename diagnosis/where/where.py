@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import NOISE
-from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.findings import Where, sensors_of
 from diagnosis.where.linear_correction import linear_correction
@@ -77,7 +78,33 @@ def where(
     )
 
 
-def motion_of(case: Case) -> Real:
+def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float) -> Where:
+    """Of any machine: by sensor, experiment and frequency; arguments as of `where`."""
+    model_error = case.machine.weighing.model_error
+    if model_error > 0:
+        _, residuals = over_levels(case, residuals, model_error * motion_of(case))
+    squares = Energy(
+        sum(float(np.sum(e**2)) for e in residuals.values()), sum(e.size for e in residuals.values())
+    )
+    sensors = case.machine.output_names
+    return Where(
+        gap=part_gap(squares, squares, LEVEL),
+        sensors=sensor_gaps(residuals, sensors, LEVEL),
+        experiments=experiment_gaps(residuals, LEVEL),
+        bands=band_gaps(residuals, sensors, dt_s, LEVEL),
+        regimes=(),
+        drift=(),
+        common=(),
+        curves=(),
+        periodic=(),
+        amplitude=None,
+        linear=None,
+        subsystem={},
+        level=LEVEL,
+    )
+
+
+def motion_of(case: CaseOfMachine) -> Real:
     """(Y,) RMS of the outputs about their means over the held-out records."""
     held = case.held_out
     return np.sqrt(
@@ -85,11 +112,19 @@ def motion_of(case: Case) -> Real:
     )
 
 
-def over_levels(case: Case, residuals: Mapping[str, Real], levels: Real) -> tuple[Case, dict[str, Real]]:
-    """Case and residuals with levels (Y,), in the outputs' units, in the place of the sensor noise."""
+AnyCase = TypeVar("AnyCase", bound=CaseOfMachine)
+
+
+def over_levels(
+    case: AnyCase, residuals: Mapping[str, Real], levels: Real
+) -> tuple[AnyCase, dict[str, Real]]:
+    """Case (only of a rig) and residuals with levels (Y,), in the outputs' units, in place of the noise."""
+    weighed = {name: e * (case.noise / levels) for name, e in residuals.items()}
+    if not isinstance(case, Case):
+        return case, weighed
     keys = [f"sensors.{NOISE[output]}" for output in case.outputs]
     seen = replace(case, rig=case.rig.perturbed(dict(zip(keys, levels, strict=True))))
-    return seen, {name: e * (case.noise / levels) for name, e in residuals.items()}
+    return seen, weighed
 
 
 def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:

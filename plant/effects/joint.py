@@ -206,7 +206,7 @@ class HardeningSpring(Effect):
     """Cubic spring from hub (motor side, with backlash) to ground, torque -k3 theta^3, no linear part."""
 
     id = "hardening_spring"
-    words = "a hardening spring at the hub (cable, hose)"
+    words = "a hardening spring (cable, hose)"
     group = "joint"
     absolute_angle = True
 

@@ -142,23 +142,23 @@ def test_effects_of_actuator_and_sensor_are_their_equations():
     held = averaged(np.concatenate([np.full(2300, u[0]), fine])[: fine.size])
     running = _after("input_delay", {"delay_s": 0.023}, u, at_rest_before=False)
     np.testing.assert_allclose(running, held, atol=1e-12)
-    np.testing.assert_allclose(_after("sensor_delay", {"delay_s": 0.02}, u)[2:], u[:-2], atol=1e-12)
+    np.testing.assert_allclose(_after("output_delay", {"delay_s": 0.02}, u)[2:], u[:-2], atol=1e-12)
     grid = DT_S / 1000 * np.arange(fine.size)
     lag = averaged(lsim(([1.0], [0.03, 1.0]), fine, grid, interp=False)[1])
     # The mean of a thousand values from a sample's start is half a thousandth of its change off.
     np.testing.assert_allclose(_after("actuator_lag", {"time_constant_s": 0.03}, u), lag, atol=1e-3)
     ramp = 3.0 * t
     behind = ramp - 3.0 * 0.05 * (1 - np.exp(-t / 0.05))
-    np.testing.assert_allclose(_after("sensor_lag", {"time_constant_s": 0.05}, ramp), behind, atol=1e-12)
+    np.testing.assert_allclose(_after("output_lag", {"time_constant_s": 0.05}, ramp), behind, atol=1e-12)
     assert np.ptp(_after("actuator_saturation", {"limit": 0.5}, u)) == 1.0
     dead = _after("actuator_dead_zone", {"width": 0.5}, u)
     np.testing.assert_allclose(dead[np.abs(u) > 0.5], (u - 0.5 * np.sign(u))[np.abs(u) > 0.5])
     assert not np.any(dead[np.abs(u) <= 0.5])
-    for name in ("actuator_gain", "sensor_gain"):
+    for name in ("actuator_gain", "output_gain"):
         np.testing.assert_allclose(_after(name, {"relative_error": -0.1}, u), 0.9 * u)
-    for name in ("input_offset", "sensor_offset"):
+    for name in ("input_offset", "output_offset"):
         np.testing.assert_allclose(_after(name, {"offset": -0.1}, u), u - 0.1)
-    for name in ("input_drift", "sensor_drift"):
+    for name in ("input_drift", "output_drift"):
         np.testing.assert_allclose(_after(name, {"rate_per_s": 0.2}, u), u + 0.2 * t)
     triangle = np.concatenate([np.arange(100.0), np.arange(100.0, 0, -1)])
     # Behind by half the gap either way, still for a whole one where it turns round.

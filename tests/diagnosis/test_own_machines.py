@@ -177,9 +177,9 @@ def test_emps_by_names_alone_gives_the_published_values(flexlink_data):
     bare = replace(case.plant, effects=())
     plant = with_effects(bare, "all", case.experiments, dt_s=emps_axis.DT_S, measured_motion=(0, 1))
     found = diagnose(replace(case, plant=plant))
-    assert found.combination == ("coulomb_friction", "sensor_offset")
+    assert found.combination == ("coulomb_friction", "output_offset")
     values = {change.id: change.values for change in found.repair}
     published = emps_axis.PUBLISHED
     assert values["coulomb_friction"]["force"] == pytest.approx(published["coulomb_N"], rel=0.05)
-    assert values["sensor_offset"]["offset"] == pytest.approx(published["offset_N"], rel=0.05)
+    assert values["output_offset"]["offset"] == pytest.approx(published["offset_N"], rel=0.05)
     assert found.gap_closed > 0.9

@@ -53,16 +53,8 @@ def _case(acceleration, **changes):
         noise = NOISE_M * np.random.default_rng([8, k]).standard_normal(400)
         output = _integrated(_force(k), acceleration) + noise
         experiments.append(PlantExperiment(f"{k}", role, _force(k)[:, None], output[:, None]))
-    plant = Plant(
-        own_plant.simulate,
-        own_plant.STATED,
-        own_plant.TOLERANCES,
-        ("position_m",),
-        np.array([NOISE_M]),
-        own_plant.EFFECTS,
-        **changes,
-    )
-    return PlantCase("carriage", plant, tuple(experiments))
+    case = own_plant.case_of(experiments, **changes)
+    return replace(case, plant=replace(case.plant, noise=np.array([NOISE_M])))
 
 
 def test_stiffening_spring_is_found_and_sized():
@@ -107,11 +99,11 @@ def test_the_example_runs_and_finds_what_it_lacks(capsys):
     said = capsys.readouterr().out
     assert "verdict: effect" in said
     found = own_plant.run(seed=1)
-    assert set(found.combination) == {"dry_friction", "constant_force"}
+    assert set(found.combination) == {"coulomb_friction", "input_offset"}
     by_name = {effect.name: effect.parameters for effect in found.effects}
-    # Same equations on both sides: 1 % is several of the intervals' widths (0.2 %).
-    assert by_name["dry_friction"]["force_N"] == pytest.approx(0.8, rel=0.01)
-    assert by_name["constant_force"]["force_N"] == pytest.approx(-0.5, rel=0.01)
+    # Friction around the simulation, in the records inside it: 1 % is several of the intervals' widths.
+    assert by_name["coulomb_friction"]["force"] == pytest.approx(0.8, rel=0.01)
+    assert by_name["input_offset"]["offset"] == pytest.approx(-0.5, rel=0.01)
 
 
 def test_a_simulation_that_runs_away_ends_somewhere_finite():

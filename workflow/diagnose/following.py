@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from diagnosis.answer import Diagnosis
+from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits
@@ -58,7 +59,7 @@ def following(found: Diagnosis) -> Following:
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
     if found.verdict == "unknown" and not imitated & set(found.ambiguous_with):
         return Following("confirm" if found.unlisted else "repeat_worst")
-    if found.case.model_error > 0 or "tip_m" not in found.case.outputs:
+    if not isinstance(found.case, Case) or found.case.model_error > 0 or "tip_m" not in found.case.outputs:
         return Following("look" if found.ambiguous_with else "none")
     competing = _left(found)
     if len(competing) < 2:

@@ -36,8 +36,8 @@ def shown(found: Diagnosis) -> Diagnosis:
 
 
 def moved(found: Diagnosis) -> Mapping[str, float]:
-    """Rig values that were re-estimated -> by how many tolerances, positive where the value grew."""
-    stated = found.case.rig
+    """Stated values that were re-estimated -> by how many tolerances, positive where the value grew."""
+    stated = found.case.machine.description
     return {key: copysign(d, found.rig.value(key) - stated.value(key)) for key, d in found.deviations.items()}
 
 

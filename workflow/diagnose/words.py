@@ -9,27 +9,9 @@ from typing import Any
 
 from plant.effects import in_words
 from workflow.text.formats import MISSING, fixed, interval, listing, number, si
+from workflow.text.names import name_words, unit_of
 
-# A unit at the end of a name, as the rig file spells it: units multiplied, then after "_" those divided by.
-_FACTORS = r"(?:(?:rad|ohm|kg|Pa|Hz|N|m|s|V|A)[23]?)"
-_UNIT = re.compile(rf"_({_FACTORS}+)(?:_({_FACTORS}+))?$")
-_POWERS = str.maketrans("23", "²³")
 _SURE = {0.99: "practically certain", 0.9: "very likely", 0.66: "likely", 0.33: "possible", 0.0: "unlikely"}
-
-
-def unit_of(parameter: str) -> str:
-    """Unit from the ending of a parameter's name, "N m/rad" for _Nm_rad; empty for pure numbers."""
-    found = _UNIT.search(parameter)
-    if found is None:
-        return ""
-    over, under = (" ".join(re.findall(_FACTORS, part or "")).translate(_POWERS) for part in found.groups())
-    # An inertia is the one product that is written with a "_" between.
-    return f"{over} {under}" if (over, under) == ("kg", "m²") else f"{over}/{under}" if under else over
-
-
-def name_words(parameter: str) -> str:
-    """Name without its unit: "torque_Nm" as "torque"."""
-    return _UNIT.sub("", parameter).replace("_", " ").replace("youngs", "Young's")
 
 
 def parameter_words(parameter: str, value: float, bounds: Sequence[float] | None = None) -> str:
@@ -39,8 +21,10 @@ def parameter_words(parameter: str, value: float, bounds: Sequence[float] | None
 
 
 def key_words(key: str) -> str:
-    """A dotted key of the rig file: "hub.inertia_kg_m2" as "inertia (hub)"."""
-    section, _, name = key.partition(".")
+    """A key of the rig file, "hub.inertia_kg_m2" as "inertia (hub)"; of one's own plant without a section."""
+    section, _, name = key.rpartition(".")
+    if not section:
+        return name_words(name)
     what = name_words(name)
     return what if re.search(rf"\b{section}\b", what) else f"{what} ({section})"
 

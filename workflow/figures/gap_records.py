@@ -10,6 +10,7 @@ from scipy.signal import welch
 
 from diagnosis.answer import Diagnosis
 from diagnosis.fit.residual import pooled_rms
+from diagnosis.machine.case import Case
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
@@ -25,12 +26,12 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
     """Held-out record with the largest gap, a column per output in its own unit; residuals below."""
     case = found.case
     worst = max(case.held_out, key=lambda e: pooled_rms(found.residuals_before[e.name]))
-    time = np.arange(len(worst.output), dtype=np.float64) * case.rig.sampling.dt_s
+    time = np.arange(len(worst.output), dtype=np.float64) * case.dt_s
     figure, grid = style.panels(
         4.6, 2, len(case.outputs), sharex=True, squeeze=False, height_ratios=[1.6, 1.0]
     )
     for column, output in enumerate(case.outputs):
-        words, unit, _ = gap_style.OUTPUTS[output]
+        words, unit, _ = gap_style.look_of(output)
         (above, below), measured = grid[:, column], worst.output[:, column]
         # Broad and pale: a model that fits lies on top of it.
         above.plot(*outline(time, measured, _TRACE_BINS), color=gap_style.PALE, lw=3.0, label="measured")
@@ -61,7 +62,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
     )
     for row, experiment in zip(grid, case.experiments, strict=True):
         residuals = {model: found.residuals[model][experiment.name] for model in models}
-        time = np.arange(len(experiment.output), dtype=np.float64) * case.rig.sampling.dt_s
+        time = np.arange(len(experiment.output), dtype=np.float64) * case.dt_s
         role = " (held out)" if experiment.role == "held_out" else ""
         for column, axes in enumerate(row):
             if not case.model_error > 0:
@@ -73,7 +74,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
             reach = max(4.0, 1.05 * largest)
             axes.set_ylim(-reach, reach)
             axes.margins(x=0.01)
-            title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.OUTPUTS[case.outputs[column]][0]}"
+            title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.look_of(case.outputs[column])[0]}"
             axes.set_title(title, fontsize=9, fontweight="normal")
         unit = "[% of motion]" if case.model_error > 0 else "over noise [1]"
         row[0].set_ylabel(f"residual\n{unit}", fontsize=8.5)
@@ -89,8 +90,8 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
     The lowest flexible modes of the nominal rig are marked.
     """
     case = found.case
-    dt_s = case.rig.sampling.dt_s
-    poles = linear_arm(case.rig).poles()
+    dt_s = case.dt_s
+    poles = linear_arm(case.rig).poles() if isinstance(case, Case) else np.zeros(0, complex)
     modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
     figure = style.new_figure(3.7)
     panels = figure.subplots(1, len(case.outputs), sharey=True, squeeze=False)[0]
@@ -105,7 +106,7 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.1), max(high, 10.0))
         axes.set(
-            xlabel="frequency [Hz]", title=f"Residual of the {gap_style.OUTPUTS[case.outputs[column]][0]}"
+            xlabel="frequency [Hz]", title=f"Residual of the {gap_style.look_of(case.outputs[column])[0]}"
         )
     panels[0].set_ylabel("power over that of the noise [1]")
     return figure

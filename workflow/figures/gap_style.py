@@ -7,6 +7,7 @@ from typing import Any
 
 from plant.rig import Output
 from workflow.figures import style
+from workflow.text.names import name_words, unit_of
 
 # The three models a gap is measured against, in the order of the waterfall, each with a line style.
 MODELS: Mapping[str, Mapping[str, Any]] = {
@@ -30,6 +31,13 @@ OUTPUTS: Mapping[Output, tuple[str, str, str]] = {
     "tip_m": ("tip position", "m", style.HIGHLIGHT),
     "tip_acceleration_m_s2": ("tip acceleration", "m/s²", style.PREDICTED),
 }
+_OTHERS = (style.UNCERTAIN, style.HIGHLIGHT, style.PREDICTED)
+
+
+def look_of(output: str, place: int = 0) -> tuple[str, str, str]:
+    """Words, unit and colour of an output; of one's own plant by its name and its place among the others."""
+    known = {str(name): look for name, look in OUTPUTS.items()}
+    return known.get(output, (name_words(output), unit_of(output), _OTHERS[place % len(_OTHERS)]))
 
 
 def floor_of(model_error: float) -> dict[str, Any]:

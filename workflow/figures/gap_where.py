@@ -43,6 +43,11 @@ def _of_band(where: Where, band: BandGap, model_error: float) -> tuple[float, Re
     return float(share), np.array(ends)
 
 
+def _look(where: Where, sensor: str) -> tuple[str, str]:
+    words, _, colour = gap_style.look_of(sensor, [one.sensor for one in where.sensors].index(sensor))
+    return _LOOKS.get(sensor, (words, colour))
+
+
 @drawing("gap_bands")
 def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure:
     """Size of the gap, noise (or what a model may miss) taken off: by band and experiment, of every sensor.
@@ -56,7 +61,7 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
     )
     sensors = [one.sensor for one in where.sensors]
     for sensor, shift in zip(sensors, (0.97, 1.03), strict=False):
-        name, colour = _LOOKS[sensor]
+        name, colour = _look(where, sensor)
         for band in (band for band in where.bands if band.sensor == sensor):
             middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
             size, interval = _of_band(where, band, model_error)
@@ -76,7 +81,9 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
     for row, entry in enumerate(experiments):
         for sensor, part, offset in zip(sensors, entry.sensors, (-0.15, 0.15), strict=False):
             pale = 1.0 if part.found else 0.35
-            right.barh(row + offset, factor * part.gap_rms, height=0.27, color=_LOOKS[sensor][1], alpha=pale)
+            right.barh(
+                row + offset, factor * part.gap_rms, height=0.27, color=_look(where, sensor)[1], alpha=pale
+            )
             right.plot(factor * np.array(part.interval), [row + offset] * 2, **_WHISKER)
     right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
     right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=words)

@@ -1,0 +1,56 @@
+"""docs/own_plant.md runs as it stands, and the page it writes says what was found."""
+
+from __future__ import annotations
+
+import doctest
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+import diagnosis
+from workflow.diagnose.plant_page import write_plant_page
+
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "own_plant.md"
+DT_S, SAMPLES = 0.01, 500
+
+
+def _motor():
+    """Records of a motor whose equations are not those of the page: ten steps a sample, Euler."""
+    rng = np.random.default_rng(4)
+
+    def levels(amplitude):
+        return amplitude * rng.uniform(-1, 1, SAMPLES // 20).repeat(20)[:, None]
+
+    def measured(voltage):
+        late = np.concatenate([np.zeros(33), voltage[:, 0].repeat(10)])
+        w, found = 0.0, []
+        for k, u in enumerate(late[: 10 * SAMPLES]):
+            if k % 10 == 0:
+                found.append(w)
+            w += DT_S / 10 / 0.195 * (10.2 * u - w - 0.001 * w * abs(w))
+        return np.array(found)[:, None] + 0.4 + 0.05 * rng.standard_normal((SAMPLES, 1))
+
+    return {"levels": levels, "measured": measured}
+
+
+def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path):
+    given = {name: getattr(diagnosis, name) for name in diagnosis.__all__}
+    given |= {"np": np, "lfilter": lfilter, "replace": replace, "DT_S": DT_S, "folder": tmp_path}
+    given |= {"write_plant_page": write_plant_page, **_motor()}
+    test = doctest.DocTestParser().get_doctest(GUIDE.read_text(), given, GUIDE.name, str(GUIDE), 0)
+    result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, clear_globs=False)
+    assert (result.failed, result.attempted > 8) == (0, True)
+    page = (tmp_path / "motor.html").read_text()
+    for section in ("measured", "gap", "where", "which", "closure", "remains", "next", "unchecked"):
+        assert f'<section id="{section}">' in page
+    # Measured, gap, two of where, probabilities, partial answers, spectra.
+    assert page.count("<img ") == 7
+    words = " ".join(re.sub(r"<[^>]+>", " ", page).split())
+    found = test.globs["found"]
+    assert "a delay of the command" in words
+    assert "output offset" in words
+    assert f"delay {found.repair[0].values['delay_s']:.4g}" in words
+    assert f"{found.rig.parameters['time_constant_s']:.5g} s" in words

@@ -1,0 +1,25 @@
+"""Names of parameters and outputs with their units at the end, as rig files and own plants spell them."""
+
+from __future__ import annotations
+
+import re
+
+# A unit at the end of a name, as the rig file spells it: units multiplied, then after "_" those divided by.
+_FACTORS = r"(?:(?:rad|ohm|kg|Pa|Hz|N|m|s|V|A)[23]?)"
+_UNIT = re.compile(rf"_({_FACTORS}+)(?:_({_FACTORS}+))?$")
+_POWERS = str.maketrans("23", "²³")
+
+
+def unit_of(parameter: str) -> str:
+    """Unit from the ending of a parameter's name, "N m/rad" for _Nm_rad; empty for pure numbers."""
+    found = _UNIT.search(parameter)
+    if found is None:
+        return ""
+    over, under = (" ".join(re.findall(_FACTORS, part or "")).translate(_POWERS) for part in found.groups())
+    # An inertia is the one product that is written with a "_" between.
+    return f"{over} {under}" if (over, under) == ("kg", "m²") else f"{over}/{under}" if under else over
+
+
+def name_words(parameter: str) -> str:
+    """Name without its unit: "torque_Nm" as "torque"."""
+    return _UNIT.sub("", parameter).replace("_", " ").replace("youngs", "Young's")
