@@ -167,6 +167,23 @@ def excite(
     _show_files(files, as_json)
 
 
+@app.command(short_help="What a log holds: columns, units, sampling, ranges.")
+def look(
+    log: Annotated[Path, typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md).")],
+    time: Annotated[
+        str | None, typer.Option(help="Name of the time column [default: what looks like it]")
+    ] = None,
+    time_unit: Annotated[str | None, typer.Option(help="Unit of the time column, as in identify.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write a page here (HTML, one file).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Columns, units, sampling (period, jitter, missing rows), ranges, clipping and quantisation of a log."""
+    need(log)
+    from workflow.commands.look import look as look_at_log
+
+    _show(look_at_log(log, time=time, time_unit=time_unit, out=out), as_json)
+
+
 @app.command(short_help="Identify one channel from log files; one-page report.")
 def identify(
     log: Annotated[

@@ -38,7 +38,7 @@ def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
     Raises ValueError where a role has no column or several: it lists all columns, and says what to type.
     """
     moving = [name for name in table.names if _is_signal(table, name)]
-    time = stated.get("time") or _only([name for name in table.names if _is_time(table, name)])
+    time = stated.get("time") or _only([name for name in table.names if is_time(table, name)])
     rest = [name for name in moving if name not in (time, stated.get("input"), stated.get("output"))]
     inputs = [name for name in rest if _says(table, name, _DRIVEN, _INPUT)]
     outputs = [name for name in rest if _says(table, name, _MOVED, _OUTPUT)]
@@ -59,13 +59,14 @@ def _only(names: list[str]) -> str | None:
     return names[0] if len(names) == 1 else None
 
 
-def _is_time(table: Table, name: str) -> bool:
+def is_time(table: Table, name: str) -> bool:
+    """Whether a column looks like time: dates, a unit of time, or its name."""
     return table.is_clock(name) or _TIME.match(name) is not None or table.unit(name).lower() in TIME_UNITS
 
 
 def _is_signal(table: Table, name: str) -> bool:
     try:
-        return not _is_time(table, name) and bool(np.ptp(table.columns([name])[name]) > 0)
+        return not is_time(table, name) and bool(np.ptp(table.columns([name])[name]) > 0)
     except ValueError:
         return False
 

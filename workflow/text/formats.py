@@ -10,9 +10,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
 MISSING = "–"
+_BARS = "▁▂▃▄▅▆▇█"
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -110,6 +112,15 @@ def listing(items: Iterable[object]) -> str:
     return " and ".join([part for part in (", ".join(words[:-1]), words[-1]) if part]) if words else ""
 
 
+def sparkline(values: Sequence[float], width: int = 60) -> str:
+    """A signal as one line of bars: of each part the sample that is farthest from the mean of all."""
+    signal = np.asarray(values, dtype=np.float64)
+    parts = np.array_split(signal - signal.mean(), min(width, signal.size))
+    peaks = np.array([part[np.argmax(np.abs(part))] for part in parts])
+    span = float(np.ptp(peaks))
+    return "".join(_BARS[round(7 * (peak - peaks.min()) / span)] for peak in peaks) if span > 0 else ""
+
+
 def count(n: int, one: str, many: str | None = None) -> str:
     """1 record, 3 records, no records."""
     words = one if n == 1 else (many or one + "s")
@@ -153,7 +164,7 @@ def _finite(value: float | None) -> bool:
 TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
 _NAMED: tuple[Callable[..., Any], ...] = (
     number, si, percent, share, signed, fixed, interval, extent, frequency, hertz, decibels, in_decibels,
-    unit, listing, count, sentence, yes_no, setting,
+    unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
     **{function.__name__: function for function in _NAMED},

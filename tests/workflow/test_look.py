@@ -1,0 +1,89 @@
+"""`flexlink look` against logs whose sampling, steps, limits and gaps are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.ident.test_forty_logs import LOGS
+from tests.workflow.command import Answer
+from workflow.tasks.log_look import look_at
+from workflow.text.formats import sparkline
+
+RNG = np.random.default_rng(8)
+K = np.delete(np.arange(4000), [1000, 1001, 3000])
+T_S = 0.004 * (K + np.clip(0.01 * RNG.standard_normal(K.size), -0.05, 0.05))
+SWING = np.sin(0.01 * K) + 0.01 * RNG.standard_normal(K.size)
+COLUMNS = {
+    "t_ms": 1e3 * T_S,
+    "u_V": np.clip(12 * SWING, -9, 9),
+    "hub_rad": 0.002 * np.round(SWING / 0.002),
+    "still": np.ones(K.size),
+}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("look") / "a.npz"
+    np.savez(path, **COLUMNS)
+    return path
+
+
+def test_numbers(log):
+    found = look_at(log)
+    time = found.time
+    assert (time.name, time.unit, time.missing, time.gap_place) == ("t_ms", "ms", 3, "index 1000")
+    # The median of 4000 steps with a deviation of sqrt(2) % each; the largest of them is below 10 %.
+    assert time.period_s == pytest.approx(0.004, rel=4 * 1.25 * 0.0142 / np.sqrt(K.size))
+    assert 0.03 < time.jitter <= 0.11
+    assert time.gap_s == pytest.approx(0.012, rel=0.05)
+    u, hub, still = found.columns
+    assert (u.unit, hub.unit, still.unit) == ("V", "rad", "")
+    assert u.clipped == pytest.approx(np.mean(np.abs(COLUMNS["u_V"]) == 9), rel=0.01)
+    assert hub.step == pytest.approx(0.002, rel=1e-9)
+    assert (u.step, hub.clipped, still.step) == (0.0, 0.0, 0.0)
+    assert (found.roles.input, found.roles.output, found.roles.time) == ("u_V", "hub_rad", "t_ms")
+
+
+def test_table_and_page(log, flexlink, tmp_path):
+    answer: Answer = flexlink("look", log, "--out", tmp_path / "page.html")
+    assert answer.code == 0, answer.err
+    for words in ("3 rows missing", "milliseconds", "steps of 0.002 rad", "stands still", "clipped?", "▁"):
+        assert words in answer.out
+    assert f"flexlink identify {log} --input u_V --output hub_rad --time t_ms" in answer.out
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.count("<img") == 1
+    assert "steps of 0.002 rad" in page
+    document = flexlink("look", log, "--json").document()
+    assert document["numbers"]["columns"]["hub_rad"]["step"] == pytest.approx(0.002, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("preamble", "semicolons, decimal comma, names in line 5, numbers from line 6"),
+        ("128 Hz rounded to milliseconds", "rounded to their last digit"),
+        ("no names", "which columns? It has column 1"),
+        ("words in another column", "note"),
+    ],
+)
+def test_what_is_said_of_text(name, words, flexlink, tmp_path):
+    path = tmp_path / LOGS[name].file
+    path.write_bytes(LOGS[name].content)
+    answer = flexlink("look", path)
+    assert answer.code == 0
+    assert words in " ".join(answer.out.split())
+
+
+def test_a_log_that_is_none_is_one_line(flexlink, tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"none")
+    answer = flexlink("look", tmp_path / "a.npz")
+    assert (answer.code, answer.err.count("\n")) == (2, 1)
+    assert "not a numpy .npz archive" in answer.err
+
+
+def test_sparkline():
+    assert sparkline(np.arange(8.0)) == "▁▂▃▄▅▆▇█"
+    assert sparkline(np.ones(5)) == ""
+    # A short pulse among many samples is seen.
+    assert sparkline(np.eye(1, 6000, 3030)[0]).index("█") == 30

@@ -1,0 +1,69 @@
+"""`flexlink look`: what a log holds, as a table and a page."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from workflow.engine import storage
+from workflow.tasks.log_look import LogLook, look_at
+from workflow.tasks.summary import RunSummary
+from workflow.text.templates import rows_of
+
+
+def look(
+    log: Path, *, time: str | None = None, time_unit: str | None = None, out: Path | None = None
+) -> RunSummary:
+    """Columns, units, sampling, ranges, clipping and quantisation of one log; out: the same as a page.
+
+    Raises InputError.
+    """
+    storage.refuse_in_the_way([log], [] if out is None else [("--out", out)])
+    found = look_at(log, time, time_unit)
+    if out is not None:
+        from workflow.report.rendering import render_page  # loads matplotlib: a second
+
+        title = f"Log {log.name}"
+        storage.write_text(out, render_page("look.html.j2", title=title, found=found, next=_next(found)).html)
+    return RunSummary(
+        title=str(log),
+        sections=rows_of("summary/look.j2", found=found),
+        numbers=_numbers(found),
+        verdict=_next(found),
+        report_path=None if out is None else str(out),
+    )
+
+
+def _next(found: LogLook) -> str:
+    """The command that goes on from here."""
+    if found.roles is None:
+        return found.unclear
+    roles = found.roles
+    named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
+    options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
+    return " ".join(
+        [
+            "flexlink identify",
+            shlex.quote(str(found.path)),
+            *options,
+            *(["--dt-s SECONDS"] * (not roles.time)),
+        ]
+    )
+
+
+def _numbers(found: LogLook) -> dict[str, object]:
+    from workflow.engine import codec
+
+    columns = {
+        column.name: {
+            "unit": column.unit,
+            "refused": column.why,
+            "lowest": None if column.values is None else float(column.values.min()),
+            "highest": None if column.values is None else float(column.values.max()),
+            "clipped_share": column.clipped,
+            "step": column.step,
+        }
+        for column in found.columns
+    }
+    time, layout = codec.plain(found.time), codec.plain(found.layout)
+    return {"rows": found.rows, "layout": layout, "time": time, "columns": columns}

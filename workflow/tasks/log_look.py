@@ -1,0 +1,121 @@
+"""What a log holds, before anything is identified from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from diagnosis.machine.quantisation_grid import grid_step
+from ident.checks.input_checks import clipped_share
+from ident.data.arrays import RealArray
+from ident.data.record_files import read_table
+from ident.data.roles import Roles, is_time, roles_of
+from ident.data.table import Table, only_rounded
+from ident.data.text_tables import Layout
+from workflow.engine.errors import naming
+
+
+@dataclass(frozen=True, eq=False)
+class TimeLook:
+    """How a time column is sampled.
+
+    unit: of the column, as `TimeColumn.unit`. period_s: the usual step. jitter: largest distance of a step
+    from a whole number of them, as a share, 0 where it is the rounding of the stamps. missing: rows that
+    larger steps lack; gap_s: the largest step; gap_row: after which row. why: why the stamps are none.
+    """
+
+    name: str
+    unit: str = ""
+    period_s: float = 0.0
+    jitter: float = 0.0
+    rounded: bool = False
+    missing: int = 0
+    gap_s: float = 0.0
+    gap_place: str = ""
+    why: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnLook:
+    """One signal: its numbers (T,), or why there are none. clipped: share of samples that stand at an
+    extreme; step: of its quantisation grid, 0 where there is none."""
+
+    name: str
+    unit: str
+    values: RealArray | None
+    why: str = ""
+    clipped: float = 0.0
+    step: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class LogLook:
+    """A log: layout of a text file, time, signals; roles: the channel that its names and units tell, if they
+    do, else `unclear` says what to type."""
+
+    path: Path
+    rows: int
+    layout: Layout | None
+    time: TimeLook | None
+    columns: tuple[ColumnLook, ...]
+    roles: Roles | None
+    unclear: str
+
+
+def look_at(path: Path, time: str | None = None, time_unit: str | None = None) -> LogLook:
+    """Raises InputError: no such file, another format, damaged, no such column."""
+    with naming(str(path)):
+        table = read_table(path)
+        if time is not None and time not in table.names:
+            table.columns([time])
+    times = [name for name in table.names if is_time(table, name)]
+    time = time or (times[0] if times else None)
+    roles, unclear = None, ""
+    try:
+        roles = roles_of(table, str(path), time=time)
+    except ValueError as error:
+        unclear = str(error)
+    columns = tuple(_column(table, name) for name in table.names if name != time)
+    rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
+    about = None if time is None else _time(table, time, time_unit)
+    return LogLook(path, rows, table.layout, about, columns, roles, unclear)
+
+
+def _time(table: Table, name: str, unit: str | None) -> TimeLook:
+    try:
+        stamps, column = table.seconds(name, table.columns([name])[name], unit)
+        table.increasing(stamps, name)
+    except ValueError as error:
+        return TimeLook(name, why=str(error).removeprefix(str(table.path)).lstrip(":, "))
+    steps = np.diff(stamps)
+    period = float(np.median(steps))
+    counts = np.maximum(np.rint(steps / period), 1)
+    rounded = only_rounded(stamps)
+    row = int(np.argmax(steps))
+    return TimeLook(
+        name,
+        column.unit,
+        float((stamps[-1] - stamps[0]) / steps.size) if rounded else period,
+        0.0 if rounded else float(np.max(np.abs(steps / period - counts))),
+        rounded,
+        int(np.sum(counts - 1)),
+        float(steps[row]),
+        table.place(row + 1),
+    )
+
+
+def _column(table: Table, name: str) -> ColumnLook:
+    try:
+        values = table.columns([name])[name]
+    except ValueError as error:
+        return ColumnLook(
+            name, table.unit(name), None, str(error).removeprefix(str(table.path)).lstrip(":, ")
+        )
+    if not values.size:
+        return ColumnLook(name, table.unit(name), None, "empty")
+    # Of a signal that takes a few levels by design the grid says nothing.
+    levels = np.unique(values).size
+    step = grid_step([values], np.finfo(np.float64).tiny) if levels > 10 else 0.0
+    return ColumnLook(name, table.unit(name), values, "", clipped_share(values), step)
