@@ -58,6 +58,9 @@ class Shares:
     small : effects in the repaired model that carry less than what interests.
     closes : (effects, share of the gap closed by them alone), most first; also where the answer is unknown.
     not_tried : what a time limit left out.
+    horizon_samples : length of windows, each from the state that fits it best (`imperfect.horizon`), and
+        horizon_before, horizon_after : what is left in them, as before and after; 0 and empty for a machine
+        that says no states.
     """
 
     names: tuple[str, ...]
@@ -68,6 +71,15 @@ class Shares:
     small: tuple[str, ...]
     closes: tuple[tuple[tuple[str, ...], float], ...]
     not_tried: tuple[str, ...]
+    horizon_samples: int = 0
+    horizon_before: tuple[float, ...] = ()
+    horizon_after: tuple[float, ...] = ()
+
+    @property
+    def horizon_closed(self) -> float:
+        """Share of the gap that the effects close in the windows; nan without a gap there."""
+        before, after = (float(np.sum(np.square(s))) for s in (self.horizon_before, self.horizon_after))
+        return 1 - after / before if before > 0 else float("nan")
 
 
 @dataclass(frozen=True, eq=False)

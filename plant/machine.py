@@ -100,7 +100,7 @@ class JointPath:
 
 @dataclass(frozen=True)
 class SensorPath:
-    """The tip sensor, in this order: lag, gain, drift, noise, quantisation."""
+    """The tip sensor, in this order: lag, gain, drift, noise, quantisation; of other sensors the gain."""
 
     lag_s: float = 0.0
     gain: float = 1.0

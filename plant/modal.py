@@ -48,6 +48,7 @@ class Equations:
     encoder : (N,). Measured hub angle (hub minus base).
     root : (N,). Absolute angle of the link root.
     tip : (N,). Tip position (r + L) * root angle + w(L).
+    bending : (N,). Deflection w(L) of the tip from the straight link.
     backlash : (N,) or None. Motor side minus hub, where there is a gap between them.
     modes : BeamModes
     first_mode : int. Index of the first modal coordinate; the last one is the last coordinate.
@@ -62,6 +63,7 @@ class Equations:
     encoder: Real
     root: Real
     tip: Real
+    bending: Real
     backlash: Real | None
     modes: BeamModes
     first_mode: int
@@ -147,9 +149,9 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
     deflection[:, first:] = np.eye(n_modes)
     coupling = modes.coupling @ deflection
     mass += np.outer(root, coupling) + np.outer(coupling, root) + deflection.T @ deflection
-    bending = deflection.T @ (modes.omega_rad_s[:, None] ** 2 * deflection)
-    stiffness += bending
-    damping += rig.link.kelvin_voigt_s * bending
+    elastic = deflection.T @ (modes.omega_rad_s[:, None] ** 2 * deflection)
+    stiffness += elastic
+    damping += rig.link.kelvin_voigt_s * elastic
     damping += (rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms) * np.outer(shaft, shaft)
     for spring, twist in ((joint.compliance, root - hub), (joint.base, base)):
         if spring is not None:
@@ -158,6 +160,7 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
     stiffness += joint.ground_spring_Nm_rad * np.outer(motor, motor)
     if joint.base is not None:
         mass += joint.base.inertia_kg_m2 * np.outer(base, base)
+    bending = modes.tip @ deflection
     return Equations(
         mass=mass,
         damping=damping,
@@ -167,7 +170,8 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         motor=motor,
         encoder=hub - base,
         root=root,
-        tip=(rig.hub.radius_m + rig.link.length_m) * root + modes.tip @ deflection,
+        tip=(rig.hub.radius_m + rig.link.length_m) * root + bending,
+        bending=bending,
         backlash=motor - hub if joint.backlash_gap_rad is not None else None,
         modes=modes,
         first_mode=first,

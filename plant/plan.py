@@ -58,7 +58,7 @@ class PlanState(NamedTuple):
 class Plan:
     """The last arguments of `plant.kernel.run`, from `substeps` on, and what is needed beside them.
 
-    parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (4, N).
+    parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (6, N).
     start_columns: (N, 3 + 2M). State per unit of hub angle, hub speed, voltage, modal deflections and rates.
     slider_rows: (E, N). Angle of every switching element.
     """
@@ -72,7 +72,7 @@ class Plan:
     delay_samples: int
 
     def advance(self, inputs: Real, observed: Real, state: PlanState) -> None:
-        """Run the compiled stepper over inputs (T, 4), filling observed (T, 3) and changing the state."""
+        """Run the compiled stepper over inputs (T, 4), filling observed (T, 6) and changing the state."""
         run(inputs, observed, *state, *self.arguments)
 
     def at(self, start: Real | None = None) -> PlanState:
@@ -95,8 +95,8 @@ def make_plan(
 ) -> Plan:
     """Prepare the stepper for a machine sampled at dt_s.
 
-    Its outputs are the hub angle, the true tip position, the tip position behind the sensor's lag and, with
-    an accelerometer, the second derivative of the true tip position (else zero).
+    Its outputs are the hub angle, the true tip position, the tip position behind the sensor's lag, with an
+    accelerometer the second derivative of the true tip position (else zero), hub speed and tip deflection.
     """
     equations = equations_of_motion(machine, default_n_modes(machine.rig) if n_modes is None else n_modes)
     builder = _Builder(machine, equations, accelerometer=accelerometer)
@@ -319,11 +319,14 @@ class _Builder:
         )
 
     def outputs(self) -> Real:
-        """Rows: encoder, tip, tip behind the sensor lag, tip acceleration."""
-        tip = self._position(self.equations.tip)
+        """Rows: encoder, tip, tip behind the sensor lag, tip acceleration, encoder speed, deflection."""
+        eq = self.equations
+        tip, encoder = self._position(eq.tip), self._position(eq.encoder)
         behind = np.eye(self.n)[self.sensor_state] if self.sensor_state >= 0 else tip
         acceleration = self._acceleration() if self.accelerometer >= 0 else np.zeros(self.n)
-        return np.array([self._position(self.equations.encoder), tip, behind, acceleration])
+        return np.array(
+            [encoder, tip, behind, acceleration, self._speed(eq.encoder), self._position(eq.bending)]
+        )
 
     def _acceleration(self) -> Real:
         """The accelerometer as a spring-mass system: the force on its mass per unit of mass."""

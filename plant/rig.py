@@ -22,7 +22,8 @@ _LARGEST = 1e15
 Positive = Annotated[float, Field(gt=0, le=_LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
 
-Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2"]  # what is measured
+# What is measured, in the order of a record's columns.
+Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2", "hub_speed_rad_s", "tip_deflection_m"]
 
 
 class _Checked(BaseModel):
@@ -88,6 +89,12 @@ class Sensors(_Checked):
     tip_noise_m: NotNegative = Field(0.0, description="standard deviation of the tip position noise")
     tip_acceleration_noise_m_s2: NotNegative = Field(
         0.0, description="standard deviation of the noise of an accelerometer at the tip"
+    )
+    hub_speed_noise_rad_s: NotNegative = Field(
+        0.0, description="standard deviation of the noise of a tachometer at the hub"
+    )
+    tip_deflection_noise_m: NotNegative = Field(
+        0.0, description="standard deviation of the noise of a strain gauge or camera that shows the bending"
     )
     noise_is: Literal["measured", "data sheet"] = Field("measured", description="where the levels come from")
 

@@ -29,8 +29,10 @@ class Trajectory:
     hub_angle_rad, tip_m : As measured at t_k, before the voltage of the same row takes effect: with the
         effects on the sensors, and with noise if the simulation was given a generator.
     hub_angle_true_rad, tip_true_m : Before every sensor effect and without noise.
-    tip_acceleration_m_s2 : Second derivative of the true tip position, with noise if there is any; zero
-        unless the simulator has an accelerometer.
+    tip_acceleration_m_s2 : Second derivative of the tip position as measured; zero unless the simulator has
+        an accelerometer.
+    hub_speed_rad_s, tip_deflection_m : Speed of the hub, and deflection of the tip from the straight link, as
+        measured. The gain of the sensor is that of tip position, acceleration and deflection alike.
     """
 
     time_s: Real
@@ -40,6 +42,8 @@ class Trajectory:
     hub_angle_true_rad: Real
     tip_true_m: Real
     tip_acceleration_m_s2: Real
+    hub_speed_rad_s: Real
+    tip_deflection_m: Real
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -160,9 +164,9 @@ class Simulator:
             inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
         if tip_force_N is not None:
             inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
-        observed = np.empty((n_samples, 4))
+        observed = np.empty((n_samples, 6))
         plan.advance(inputs, observed, plan.at(None if start is None else start.vector()))
-        hub, tip, tip_behind, acceleration = observed.T
+        hub, tip, tip_behind, acceleration, speed, deflection = observed.T
         time = np.arange(n_samples, dtype=np.float64) * self.dt_s
         noise = _noise(machine, rng, n_samples, accelerometer=self.accelerometer)
         return Trajectory(
@@ -172,7 +176,9 @@ class Simulator:
             tip_m=_tip_reading(machine.sensor, tip_behind, time, noise[:, 1]),
             hub_angle_true_rad=hub,
             tip_true_m=tip,
-            tip_acceleration_m_s2=acceleration + noise[:, 2],
+            tip_acceleration_m_s2=machine.sensor.gain * acceleration + noise[:, 2],
+            hub_speed_rad_s=speed + noise[:, 3],
+            tip_deflection_m=machine.sensor.gain * deflection + noise[:, 4],
         )
 
 
@@ -217,7 +223,7 @@ class SampledArm(Simulator):
     def measure(self) -> Real:
         """(2,) hub_angle_rad, tip_m at t_k as measured; asking twice at one instant gives the same sample."""
         if self._measurement is None:
-            hub, _, tip, _ = (self._rows @ self._state.x).tolist()
+            hub, _, tip, *_ = (self._rows @ self._state.x).tolist()
             hub_noise, tip_noise = (0.0, 0.0) if self._rng is None else self._rng.standard_normal(2).tolist()
             sensors = self.machine.rig.sensors
             time = self._sample * self.dt_s
@@ -244,12 +250,16 @@ class SampledArm(Simulator):
 
 
 def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int, *, accelerometer: bool) -> Real:
-    """(T, 3) noise of hub angle, tip and, where there is one, accelerometer, drawn sample by sample."""
-    noise = np.zeros((n_samples, 3))
+    """(T, 5) noise of hub angle, tip and, where there is one, accelerometer, drawn sample by sample; then of
+    hub speed and deflection, where they have any."""
+    noise = np.zeros((n_samples, 5))
     if rng is not None:
         sensors, drawn = machine.rig.sensors, 3 if accelerometer else 2
         levels = sensors.hub_angle_noise_rad, sensors.tip_noise_m, sensors.tip_acceleration_noise_m_s2
         noise[:, :drawn] = rng.standard_normal((n_samples, drawn)) * levels[:drawn]
+        for column, level in ((3, sensors.hub_speed_noise_rad_s), (4, sensors.tip_deflection_noise_m)):
+            if level > 0:
+                noise[:, column] = level * rng.standard_normal(n_samples)
     return noise
 
 

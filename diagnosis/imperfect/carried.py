@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from math import factorial
+from typing import Any
 
 import numpy as np
 
 from diagnosis.answer import Shares
+from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.verdict import Verdict
 from diagnosis.machine.machine_protocol import Real
 
 # Blocks of the bootstrap [samples]; draws; partial answers that are told.
 _BLOCK, _DRAWS, _MOST_TOLD = 50, 1000, 5
-_LEAST_CLOSED = 0.02
+_LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
 
 
 def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.random.Generator) -> Shares:
@@ -42,9 +44,9 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
     closed = {
         e.key: 1 - float(np.sum(_blocks(search, e))) / whole
         for e in sorted(search.found, key=lambda e: e.evidence)
-        if 0 < len(e.names) < 3
+        if e.names
     }
-    told = sorted(((c, key) for key, c in closed.items() if c > _LEAST_CLOSED), reverse=True)[:_MOST_TOLD]
+    told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:_MOST_TOLD]
     return Shares(
         names=tuple(search.case.machine.output_names),
         before=tuple(map(float, base.shares[1])),
@@ -54,7 +56,28 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         small=tuple(name for name in accepted.names if name not in names),
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
+        **_over_horizon(search, accepted),
     )
+
+
+def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:
+    """Whether a set closes more than any part of it does."""
+    parts = [closed[rest] for rest in combinations(key, len(key) - 1) if rest in closed]
+    more = _LEAST_CLOSED if len(key) < 3 else _WORTH_A_THIRD
+    return closed[key] > max([0.0, *parts]) + more
+
+
+def _over_horizon(search: Search, accepted: Explanation) -> dict[str, Any]:
+    held, samples = search.held_out, horizon_samples(search.held_out)
+    longest = max(len(record.output) for record in held.experiments)
+    found = []
+    for e in (search.base, accepted):
+        responses = held.nominal.at(e.end.deviations).unknown_start.responses
+        if not samples or responses is None:
+            return {}
+        shares = shares_over_horizon(held, e.left_held_out, responses(e.end.effects, longest))
+        found.append(tuple(map(float, shares)))
+    return {"horizon_samples": samples, "horizon_before": found[0], "horizon_after": found[1]}
 
 
 def _blocks(search: Search, explanation: Explanation) -> Real:

@@ -93,7 +93,7 @@ def normal_equations(
     weighted = shared * weights[:, None]
     H, g = np.zeros((k + R * S, k + R * S)), np.zeros(k + R * S)
     H[:k, :k], g[:k] = shared.T @ weighted, weighted.T @ e
-    free = np.concatenate([np.zeros(min(S, 1)), 1 / records.state_spread[1:] ** 2])
+    free = 1 / records.state_spread**2
     for r, (part, own) in enumerate(zip(records.parts, columns.states, strict=True)):
         at = slice(k + r * S, k + (r + 1) * S)
         own_weighted = own * weights[part, None]
@@ -146,7 +146,7 @@ def descend(
             step = np.full(P, _DEVIATION_STEP)
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
         if columns is None or iteration == _AGAIN[0]:
-            columns = records.start_columns(d, effects_at(candidates, x))
+            columns = records.start_columns(d, effects_at(candidates, x), start)
         if columns.zeros.shape[1] and any(c.kind.absolute_angle for c in candidates):
             columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
         by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
@@ -163,7 +163,7 @@ def descend(
             step[free] = -np.linalg.solve(damped[np.ix_(free, free)], g[free])
             d2 = np.clip(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP), -FARTHEST, FARTHEST)
             x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_MOVE, _LARGEST_MOVE), low, high)
-            start2 = start.moved(step[P + A :])
+            start2 = columns.moved(start, step[P + A :])
             e2 = left(d2, x2, start2)
             loss2, prior2 = loss_at(records, e2, d2, start2)
             if loss2 < loss:
@@ -194,7 +194,7 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[fl
     step = np.asarray(-np.linalg.solve(H, equations.gradient), dtype=np.float64)
     step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
     moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
-    d, start2 = around.deviations + step[:P], start.moved(step[around.jacobian.shape[1] :])
+    d, start2 = around.deviations + step[:P], around.columns.moved(start, step[around.jacobian.shape[1] :])
     S = start.states.shape[1]
     first = step.size - start.states.size
     for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):

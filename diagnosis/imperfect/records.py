@@ -14,6 +14,8 @@ from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMach
 
 _NOISE_ALLOWED = 1.5
 _ANGLE_STEP_RAD = 1e-3
+# Of the spread of a state at the start.
+_STATE_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +25,6 @@ class Start:
     states: Real
     zeros: Real
 
-    def moved(self, step: Real) -> Start:
-        """step: (Z + R S,)."""
-        Z = self.zeros.size
-        return Start(self.states + step[Z:].reshape(self.states.shape), self.zeros + step[:Z])
-
     def with_zeros(self, zeros: Real, columns: Real) -> Start:
         """The same measured start with other zeros; columns (S, Z): states per unit of a zero."""
         return Start(self.states + (zeros - self.zeros) @ columns.T, zeros)
@@ -35,10 +32,26 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class StartColumns:
-    """Derivatives of the coefficients by a `Start`: zeros (N, Z), states of every record (T Y, S) each."""
+    """Derivatives of the coefficients by a `Start`: zeros (N, Z), states of every record (T Y, S) each.
+
+    A zero takes the measured start along: per_zero (S, Z) as `Start.with_zeros`. Apart, both would move what
+    is measured by so much more than their difference moves anything that a damped step goes nowhere.
+    """
 
     zeros: Real
     states: tuple[Real, ...]
+    per_zero: Real
+
+    @classmethod
+    def of(cls, fixed: Real, states: Sequence[Real], per_zero: Real) -> StartColumns:
+        """fixed (N, Z): derivatives by the zeros with the states held."""
+        return cls(fixed + np.concatenate([own @ per_zero for own in states]), tuple(states), per_zero)
+
+    def moved(self, start: Start, step: Real) -> Start:
+        """step: (Z + R S,)."""
+        Z = start.zeros.size
+        turned = start.with_zeros(start.zeros + step[:Z], self.per_zero)
+        return Start(turned.states + step[Z:].reshape(start.states.shape), turned.zeros)
 
 
 class Records:
@@ -78,20 +91,38 @@ class Records:
     def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
         return np.concatenate([coefficients(e) for e in self.residuals(deviations, effects, start)])
 
-    def start_columns(self, deviations: Real, effects: Sequence[Any]) -> StartColumns:
-        """Of the linear part of the machine."""
+    def start_columns(self, deviations: Real, effects: Sequence[Any], start: Start) -> StartColumns:
+        """Of the linear part of the machine; of one whose linear part nobody knows, difference quotients."""
         longest = max(len(e.output) for e in self.experiments)
         outputs = self.case.noise.size
-        by_state = self.nominal.at(deviations).unknown_start.responses(effects, longest)
-        states, zeros = [], []
+        responses = self.nominal.at(deviations).unknown_start.responses
+        if responses is None:
+            states = self._differences(deviations, effects, start)
+        else:
+            whole = responses(effects, longest)
+            states = [
+                -np.array([coefficients(response[: len(e.output)]) for response in whole])
+                .reshape(-1, e.output.size)
+                .T
+                for e in self.experiments
+            ]
+        zeros = []
         for e in self.experiments:
             T = len(e.output)
-            columns = [coefficients(response[:T]) for response in by_state]
-            states.append(-np.array(columns).reshape(-1, T * outputs).T)
             shapes = self.case.machine.unknown_start.zero_outputs
             constant = [coefficients(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
             zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
-        return StartColumns(np.concatenate(zeros), tuple(states))
+        return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)
+
+    def _differences(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
+        here = self.coefficients(deviations, effects, start)
+        steps = _STATE_STEP * self.state_spread
+        columns = [
+            (self.coefficients(deviations, effects, Start(start.states + step, start.zeros)) - here) / size
+            for step, size in zip(np.diag(steps), steps, strict=True)
+        ]
+        whole = np.column_stack(columns)
+        return [whole[part] for part in self.parts]
 
     def with_true_angles(
         self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: Start, e: Real
@@ -105,12 +136,14 @@ class Records:
             np.column_stack([moved[part] / _ANGLE_STEP_RAD, own[:, 1:]])
             for part, own in zip(self.parts, columns.states, strict=True)
         )
-        return StartColumns(columns.zeros, states)
+        before = np.concatenate([own @ columns.per_zero for own in columns.states])
+        return StartColumns.of(columns.zeros - before, states, columns.per_zero)
 
     def prior_cost(self, start: Start) -> float:
         """-2 log prior density of a start."""
-        free = start.states[:, 1:] / self.state_spread[1:]
-        return float(np.sum(free**2) + np.sum((start.zeros / self.zero_spread) ** 2))
+        return float(
+            np.sum((start.states / self.state_spread) ** 2) + np.sum((start.zeros / self.zero_spread) ** 2)
+        )
 
     def shares(self, residuals: Sequence[Real]) -> Real:
         """(Y,) RMS left beyond sensor noise over the RMS of the motion (about the mean), all records.

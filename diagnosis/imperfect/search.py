@@ -19,9 +19,9 @@ from plant.effects.search_space import Candidate
 
 Progress = Callable[[float, str], None]
 
-# Starts descended from alone; parents extended and effects fitted beside each, by size of the set.
+# Starts descended from alone; parents extended and effects fitted beside each: pairs, larger sets.
 _ALONE, _BESIDE_POINTS = 2, 4
-_PARENTS, _TRIED = {2: 3, 3: 1}, {2: 6, 3: 4}
+_PARENTS, _TRIED = (3, 1), (6, 4)
 _FINISHED = 6
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
@@ -84,13 +84,20 @@ class Search:
         return self.records.simulations + self.held_out.simulations
 
     def run(self) -> None:
-        """The nominal, every effect alone, then sets of two and three beside the likeliest."""
+        """The nominal, every effect alone, then sets of two, three and more beside the likeliest.
+
+        Beyond three only while the likeliest leaves more of the motion than is stated not to interest.
+        """
+        weighing = self.case.machine.weighing
         P = self.records.nominal.count
         nominal = descend(self.records, (), np.zeros(P), np.zeros(0), self.records.at_rest(), iterations=12)
         self.add(nominal)
         self._alone()
         self._containing()
-        for count in (2, 3):
+        for count in range(2, weighing.most_effects + 1):
+            likeliest = max(self.found, key=lambda e: e.evidence)
+            if count > 3 and np.max(likeliest.shares) <= weighing.model_error:
+                break
             self._together(count)
         self._look_alikes()
 
@@ -173,14 +180,14 @@ class Search:
         pool = sorted((e for e in self.found if len(e.names) == count - 1), key=lambda e: -e.evidence)
         parents: dict[tuple[str, ...], Explanation] = {}
         for explanation in pool:
-            if len(parents) < _PARENTS[count]:
+            if len(parents) < _PARENTS[count > 2]:
                 parents.setdefault(explanation.key, explanation)
         for k, parent in enumerate(parents.values()):
             words = f"fitting more beside {' and '.join(parent.names)}"
-            self.progress(0.45 + 0.25 * (count - 2) + 0.25 * k / len(parents), words)
+            self.progress(min(0.45 + 0.25 * (count - 2) + 0.25 * k / len(parents), 0.95), words)
             if self._late(f"further effects beside {' and '.join(parent.names)}"):
                 return
-            self._beside(parent.end, _TRIED[count])
+            self._beside(parent.end, _TRIED[count > 2])
 
     def _beside(self, parent: Descent, most: int) -> None:
         trials: list[tuple[Candidate, Point]] = []
@@ -272,9 +279,7 @@ class Search:
         start, e = self._started(held, end.deviations, end.effects, end.start)
         left = tuple(records.residuals(end.deviations, end.effects, end.start))
         left_held_out = tuple(held.residuals(end.deviations, end.effects, start))
-        held_out_loss = held.levels.loss(e) + 0.5 * float(
-            np.sum((start.states[:, 1:] / held.state_spread[1:]) ** 2)
-        )
+        held_out_loss = held.levels.loss(e) + 0.5 * float(np.sum((start.states / held.state_spread) ** 2))
         return Explanation(
             end,
             -records.levels.loss(end.left) - held_out_loss,
@@ -296,8 +301,8 @@ class Search:
         if not S:
             return start, e
         loss, _ = loss_at(held, e, d, start)
-        columns = held.start_columns(d, effects)
-        free = np.concatenate([[0.0], 1 / held.state_spread[1:] ** 2])
+        columns = held.start_columns(d, effects, start)
+        free = 1 / held.state_spread**2
         for _ in range(_HELD_OUT_STEPS):
             weights = held.levels.weights(e)
             step = np.zeros((len(held.parts), S))

@@ -76,7 +76,8 @@ def _turned(records: Records, start: Start, candidate: Candidate) -> list[Start]
     if records.case.machine.unknown_start.zero_seen or not candidate.kind.absolute_angle:
         return [start]
     turns = np.arange(_ZEROS_AROUND) * 2 * np.pi / _ZEROS_AROUND - np.pi
-    return [_with_zeros(records, start, start.zeros + turn) for turn in turns]
+    first = np.eye(start.zeros.size)[0]
+    return [_with_zeros(records, start, start.zeros + turn * first) for turn in turns]
 
 
 def _with_zeros(records: Records, start: Start, zeros: Real) -> Start:

@@ -7,7 +7,7 @@ no more than imperfections leave. Both are judged on shares of the motion, of es
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -21,28 +21,34 @@ from diagnosis.imperfect.search import Explanation, Search
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
 TEMPER = 4.0
-_VOLUME = 0.5
+_VOLUME = 0.25
 # Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
-_PRIOR_COUNT = {0: 0.2, 1: 0.35, 2: 0.3, 3: 0.15}
+_PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
 # An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
 _INTERESTS, _INTERESTS_WIDTH = 1.15, 0.06
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
-_IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.5, 0.5
+_IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
+# A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
+_WORSE, _WORSE_BY = 1.15, 0.2
 # What an effect that contains a simpler one has to gain over it.
 _CONTAINING = 2.0
-# A cause beyond the list that looks like an effect is a third as probable as that.
-_UNLISTED = 1.1
+# Logarithm of how much less probable a cause beyond the list is that looks like an effect.
+_UNLISTED = 0.55
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS = 8.0, 8
 
 
 @dataclass(frozen=True)
 class Part:
-    """What one effect of a set carries: share of the motion, probability that it matters."""
+    """What one effect of a set carries: share of the motion, probability that it matters.
+
+    share : geometric mean of what it carries on estimation and on held-out records. An effect that is real
+        carries something of both.
+    """
 
     name: str
     share: float
@@ -51,7 +57,8 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A set with its parts, its score and the probability that it leaves no more than imperfections."""
+    """A set with its listed parts, its score and the probability that it leaves no more than imperfections,
+    nor needs a cause beyond the list for more than these."""
 
     explanation: Explanation
     parts: tuple[Part, ...]
@@ -97,8 +104,12 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
         known = best.get(explanation.key)
         if known is None or explanation.evidence > known.evidence:
             best[explanation.key] = explanation
-    score = {key: score_of(explanation, listed, model_error) for key, explanation in best.items()}
-    ranked = sorted(best.values(), key=lambda e: -score[e.key])
+    score = {
+        key: score_of(explanation, listed, model_error)
+        for key, explanation in best.items()
+        if not _contradicted(explanation, best.values(), model_error)
+    }
+    ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
     sets = tuple(_judged(search, e, best, model_error, listed, fit=k == 0) for k, e in enumerate(chosen))
@@ -110,6 +121,14 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
     main = next(s for s in sets if set(found) <= {p.name for p in s.parts})
     accepted = tuple(p.name for p in sorted(main.parts, key=lambda p: -p.share) if p.name in found)
     return Verdict(probabilities, sets, answer, accepted)
+
+
+def _contradicted(explanation: Explanation, others: Iterable[Explanation], model_error: float) -> bool:
+    """Whether held-out records are left notably more by a set than by a part of it: what it adds is fitted to
+    the other records and true of none."""
+    left = float(np.max(explanation.shares[1]))
+    parts = [float(np.max(e.shares[1])) for e in others if set(e.key) < set(explanation.key)]
+    return bool(parts) and left > max(_WORSE * min(parts), min(parts) + _WORSE_BY * model_error)
 
 
 def _judged(
@@ -126,7 +145,7 @@ def _judged(
         key = tuple(sorted(n for n in explanation.names if n != name))
         rest = search.without(explanation, k) if fit and key else best.get(key, search.base)
         carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
-        share = float(np.sqrt(np.mean(np.max(carried, axis=1) ** 2)))
+        share = float(np.sqrt(np.prod(np.max(carried, axis=1))))
         matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
         off = _tolerances_off(search, explanation, k)
         if off is not None:
@@ -138,10 +157,12 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    beyond = at_edge or any(name not in listed for name in explanation.names)
     enough, more = _remaining(explanation, model_error)
-    complete = 0.0 if beyond else enough / (enough + more)
-    return Judged(explanation, tuple(parts), score_of(explanation, listed, model_error), complete)
+    complete = 0.0 if at_edge else enough / (enough + more)
+    for part in parts:
+        complete *= 1.0 if part.name in listed else 1 - part.matters
+    within = tuple(part for part in parts if part.name in listed)
+    return Judged(explanation, within, score_of(explanation, listed, model_error), complete)
 
 
 def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float | None:
@@ -164,8 +185,9 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
 
 
 def _remaining(explanation: Explanation, model_error: float) -> tuple[float, float]:
-    """Densities of what is left of held-out motion after a complete answer, and beside an unknown cause."""
-    size = np.log(max(float(np.max(explanation.shares[1])) / model_error, 1e-3))
+    """Densities of what is left of the motion after a complete answer, and beside an unknown cause."""
+    left = np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2))
+    size = np.log(max(float(left) / model_error, 1e-3))
     z = max(size - np.log(_IMPERFECTIONS), 0.0) / _IMPERFECTIONS_WIDTH
     u = min(size - np.log(_UNKNOWN), 0.0) / _UNKNOWN_WIDTH
     enough = (1 - _PRIOR_UNKNOWN) / _IMPERFECTIONS_WIDTH * np.exp(-0.5 * z**2)

@@ -10,16 +10,24 @@ import numpy as np
 from diagnosis.machine.machine_protocol import KNOWN_START, Real, RecordOfMachine, UnknownStart, Weighing
 from plant.effects import EFFECTS, Effect, make_machine
 from plant.effects.search_space import Candidate, Scales
+from plant.modal import link_modes
 from plant.plan import SUBSTEP_S
 from plant.rig import Output, Rig
 from plant.simulation import Simulator, Start
-
-"""What a flexible link can be measured by, in the order of a record's columns."""
 
 NOISE: dict[Output, str] = {
     "hub_angle_rad": "hub_angle_noise_rad",
     "tip_m": "tip_noise_m",
     "tip_acceleration_m_s2": "tip_acceleration_noise_m_s2",
+    "hub_speed_rad_s": "hub_speed_noise_rad_s",
+    "tip_deflection_m": "tip_deflection_noise_m",
+}
+# What a zero may be off by (standard deviation): an encoder's by any angle; that of tip_m is known.
+_ZERO: dict[Output, float] = {
+    "hub_angle_rad": np.pi,
+    "tip_acceleration_m_s2": 1.0,
+    "hub_speed_rad_s": 1.0,
+    "tip_deflection_m": 0.05,
 }
 _TIP: Output = "tip_m"
 _ACCELERATION: Output = "tip_acceleration_m_s2"
@@ -64,20 +72,23 @@ class FlexibleArm:
 
     @property
     def unknown_start(self) -> UnknownStart:
-        """Beside a model error: hub angle and speed, first modes of the link, and the encoder's zero."""
+        """Beside a model error: hub angle and speed, first modes of the link, zeros of the sensors."""
         if not self.model_error > 0:
             return KNOWN_START
         spread = [np.inf, _SPEED_RAD_S, *[_DEFLECTION] * _MODES, *[_RATE] * _MODES]
-        hub = np.eye(len(self.outputs))[:1]
-        per_zero = -np.eye(len(spread))[:, :1]
+        moved = [k for k, name in enumerate(self.outputs) if name in _ZERO]
+        per_zero = np.zeros((len(spread), len(moved)))
+        per_zero[0, 0] = -1.0
+        slowest_rad_s = link_modes(self.rig, 1).omega_rad_s[0]
         return UnknownStart(
             np.array(spread),
-            np.array([np.pi]),
-            hub,
+            np.array([_ZERO[self.outputs[k]] for k in moved]),
+            np.eye(len(self.outputs))[moved],
             per_zero,
             self._first_sample,
             self._responses,
             zero_seen=_TIP in self.outputs,
+            slowest_period_samples=float(2 * np.pi / slowest_rad_s / self.rig.sampling.dt_s),
         )
 
     def _first_sample(self, record: RecordOfMachine) -> Real:
@@ -86,10 +97,11 @@ class FlexibleArm:
     def _responses(self, effects: Sequence[Effect], samples: int) -> list[Real]:
         linear = [effect for effect in effects if make_machine(self.rig, [effect]).linear]
         simulate, still = self.simulator(linear), np.zeros((samples, 1))
-        return [simulate(still, state, np.zeros(1)) for state in np.eye(2 + 2 * _MODES)]
+        return [simulate(still, state) for state in np.eye(2 + 2 * _MODES)]
 
     def simulator(self, effects: Sequence[Effect]) -> Callable[..., Real]:
         prepared = self._prepared(effects)
+        moved = [k for k, name in enumerate(self.outputs) if name in _ZERO]
 
         def outputs(inputs: Real, state: Real | None = None, zeros: Real | None = None) -> Real:
             start = None
@@ -97,7 +109,7 @@ class FlexibleArm:
                 start = Start(state[0], state[1], state[2 : 2 + _MODES], state[2 + _MODES :])
             found = prepared.run(inputs[:, 0], start=start).columns(self.outputs)
             if zeros is not None:
-                found[:, 0] += zeros[0]
+                found[:, moved] += zeros
             return found
 
         return outputs
@@ -117,10 +129,15 @@ class FlexibleArm:
         return found, self.rig.sampling.dt_s
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
-        """Every effect of the registry that a fit can find; signed ones twice. Those on the sensor of tip_m
-        only where it is measured."""
+        """Every effect of the registry that a fit can find; signed ones twice. Of a sensor of the link that
+        is not tip_m only its gain is one."""
         scales = scales_of(self.rig, experiments)
-        seen = [effect for effect in EFFECTS.values() if effect.group != "sensor" or _TIP in self.outputs]
+        gain = ("sensor_gain",) if set(self.outputs) - {"hub_angle_rad", "hub_speed_rad_s"} else ()
+        seen = [
+            effect
+            for effect in EFFECTS.values()
+            if effect.group != "sensor" or _TIP in self.outputs or effect.id in gain
+        ]
         return tuple(found for effect in seen for found in effect.candidates(scales))
 
 

@@ -31,22 +31,26 @@ class Weighing:
     listed : tuple of str. Effects that are looked for; prior probabilities are shared among them.
     model_error : float. Share of the motion (RMS of an output about its mean) that a good model may miss;
         zero where the simulation is as good as the sensors.
+    most_effects : int. Beside a model error, effects that are looked for together.
     """
 
     listed: tuple[str, ...] = tuple(EFFECTS)
     model_error: float = 0.0
+    most_effects: int = 3
 
 
 @dataclass(frozen=True, eq=False)
 class UnknownStart:
     """What nobody knows about the start of a record and the zeros of its sensors.
 
-    state_spread : (S,) prior standard deviations of the states at the start; the first one is free.
+    state_spread : (S,) prior standard deviations of the states at the start; infinite: free.
     zero_spread : (Z,) the same of zeros, which all records share. zero_outputs : (Z, Y) outputs per zero.
     state_per_zero : (S, Z) what a zero moves of a start that was read off the measurement.
     guess : record -> (S,) start as its first samples say.
-    responses : effects, samples -> S arrays (T, Y): outputs per unit of a state, of the linear part.
+    responses : effects, samples -> S arrays (T, Y): outputs per unit of a state, of the linear part; None
+        where nobody knows that, and spreads are finite.
     zero_seen : bool. Another output tells the zero; else it matters only to what depends on the true angle.
+    slowest_period_samples : float. Period of the slowest mode; 0 where it is not known.
     """
 
     state_spread: Real
@@ -54,8 +58,9 @@ class UnknownStart:
     zero_outputs: Real
     state_per_zero: Real
     guess: Callable[[Any], Real]
-    responses: Callable[[Sequence[Any], int], list[Real]]
+    responses: Callable[[Sequence[Any], int], list[Real]] | None
     zero_seen: bool = True
+    slowest_period_samples: float = 0.0
 
 
 KNOWN_START = UnknownStart(

@@ -14,7 +14,7 @@ or effects that merely resemble it win.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -35,12 +35,15 @@ from diagnosis.machine.plant_effect import Change, PlantEffect, WrongValue
 from ident.data.arrays import lock
 from plant.effects.search_space import Candidate
 
-Simulate = Callable[[Mapping[str, float], Mapping[str, Mapping[str, float]], Real], Real]
+# Parameters, effects, inputs (T, U) and, where a start is unknown, its states -> outputs (T, Y).
+Simulate = Callable[..., Real]
 
+# Of a machine of which nothing else is known; searched as long as something of interest is left.
+_MOST_EFFECTS = 5
 # In noise deviations: beyond any record, and its square is still a number.
 _RUNAWAY = 1e12
 # What a simulation may raise where a trial runs away; any other error is one of the simulation.
-_NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)
+_NUMERICAL = (ArithmeticError, RuntimeWarning, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,9 @@ class Plant:
         even with the right effects. No simulation of a real machine reaches its noise; with zero here what is
         left over makes the answer "unknown".
     dt_s : float. Sampling period, for pages; `with_effects` states it.
+    start : name -> standard deviation (around zero) of a state at the start of a record that nobody knows
+        Beside a model error it is fitted for every record; the simulation takes the states (name -> value) as
+        a fourth argument.
     """
 
     simulation: Simulate
@@ -73,6 +79,7 @@ class Plant:
     effects: tuple[PlantEffect, ...] = ()
     model_error: float = 0.0
     dt_s: float = float("nan")
+    start: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -80,6 +87,10 @@ class Plant:
         object.__setattr__(self, "output_names", tuple(self.output_names))
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "tolerances", MappingProxyType(dict(self.tolerances)))
+        object.__setattr__(self, "start", MappingProxyType(dict(self.start)))
+        for name, spread in self.start.items():
+            if not 0 < spread < np.inf:
+                raise ValueError(f"plant: spread of {name} at the start must be positive; got {spread}")
         count = len(self.output_names)
         if self.noise.shape != (count,) or not np.all(self.noise > 0):
             raise ValueError(
@@ -104,7 +115,7 @@ class Plant:
 
     @cached_property
     def weighing(self) -> Weighing:
-        return Weighing(tuple(kind.id for kind in self.missing), float(self.model_error))
+        return Weighing(tuple(kind.id for kind in self.missing), float(self.model_error), _MOST_EFFECTS)
 
     @property
     def description(self) -> Plant:
@@ -121,17 +132,28 @@ class Plant:
 
     @property
     def unknown_start(self) -> UnknownStart:
-        """None: a simulation of one's own starts as it says."""
-        return replace(KNOWN_START, zero_outputs=np.zeros((0, self.noise.size)))
+        """Of the states that are named as such, beside a model error."""
+        known = replace(KNOWN_START, zero_outputs=np.zeros((0, self.noise.size)))
+        if not (self.start and self.model_error > 0):
+            return known
+        states = len(self.start)
+        return replace(
+            known,
+            state_spread=np.array(list(self.start.values())),
+            state_per_zero=np.zeros((states, 0)),
+            guess=lambda record: np.zeros(states),
+            responses=None,
+        )
 
     def torque_response(self, samples: int) -> None:
         return None
 
     def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
-        far, run = _RUNAWAY * self.noise, self.simulated(effects)
+        far, at_rest = _RUNAWAY * self.noise, self.simulated(effects)
 
-        def outputs(inputs: Real, *_start: Real) -> Real:
+        def outputs(inputs: Real, states: Real | None = None, zeros: Real | None = None) -> Real:
+            run = self.simulated(effects, states) if self.start and states is not None else at_rest
             try:
                 found = run(inputs)
             except _NUMERICAL:
@@ -140,7 +162,7 @@ class Plant:
 
         return outputs
 
-    def simulated(self, effects: Sequence[Change]) -> Callable[[Real], Real]:
+    def simulated(self, effects: Sequence[Change], states: Real | None = None) -> Callable[[Real], Real]:
         """Inputs (T, U) -> outputs (T, Y) as the simulation gives them, listed effects around it.
 
         Raises ValueError, one line: a shape that does not fit, an error of the simulation that is not
@@ -149,7 +171,9 @@ class Plant:
         wrong = {kind.id: kind.multiplies for kind in WrongValue.all_of(self.tolerances)}
         ratios = {wrong[e.id]: e.values["ratio"] for e in effects if e.id in wrong}
         if ratios:
-            return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong])
+            return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong], states)
+        begun = np.zeros(len(self.start)) if states is None else states
+        start = ({name: float(v) for name, v in zip(self.start, begun, strict=True)},) if self.start else ()
         listed = {effect.name: effect.acts for effect in self.effects if effect.acts is not None}
         told = {effect.id: effect.values for effect in effects if effect.id not in listed}
         acting = [
@@ -162,7 +186,7 @@ class Plant:
 
         def told_simulation(inputs: Real) -> Real:
             try:
-                found = np.asarray(self.simulation(self.parameters, told, inputs), dtype=np.float64)
+                found = np.asarray(self.simulation(self.parameters, told, inputs, *start), dtype=np.float64)
             except _NUMERICAL:
                 raise
             except Exception as error:

@@ -48,6 +48,8 @@ _FACTORS: dict[str, tuple[tuple[float, str], ...]] = {
     "hub_angle_rad": (_DEGREES, (1000.0, "milli")),
     "tip_m": ((1000.0, "milli"), (100.0, "centi"), (1 / 0.0254, "inches per metre")),
     "tip_acceleration_m_s2": ((9.80665, "g"), (1000.0, "milli"), (1000 / 9.80665, "milli-g")),
+    "hub_speed_rad_s": (_DEGREES, (1000.0, "milli"), (30 / np.pi, "revolutions per minute")),
+    "tip_deflection_m": ((1000.0, "milli"), (100.0, "centi")),
     "voltage_V": ((1000.0, "milli"),),
 }
 

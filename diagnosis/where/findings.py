@@ -22,6 +22,8 @@ SENSORS: dict[Output, tuple[str, str]] = {
     "hub_angle_rad": ("hub_angle", "rad/s"),
     "tip_m": ("tip", "m/s"),
     "tip_acceleration_m_s2": ("tip_acceleration", "m/s^3"),
+    "hub_speed_rad_s": ("hub_speed", "rad/s^2"),
+    "tip_deflection_m": ("tip_deflection", "m/s"),
 }
 
 _Z95 = float(norm.ppf(0.975))

@@ -1,4 +1,4 @@
-"""Effects on the tip sensor. They act in the order lag, gain, drift, noise, quantisation."""
+"""Effects on the sensor of the link. They act in the order lag, gain, drift, noise, quantisation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plant.machine import Machine
 
 @register
 class SensorGain(RatioEffect):
-    """tip_m multiplied by a ratio, before its noise."""
+    """tip_m (or tip acceleration, or deflection) multiplied by a ratio, before its noise."""
 
     id = "sensor_gain"
     words = "a wrong gain of the tip sensor"

@@ -15,6 +15,7 @@ from diagnosis.imperfect.search import Search
 from diagnosis.imperfect.verdict import judged
 from plant.effects import parse_effect
 from plant.presets import paper_link
+from validation.blind.truth import Background, Before, Truth
 from workflow.diagnose.case_files import load_case
 
 RIG = paper_link()
@@ -85,11 +86,11 @@ def test_an_encoder_zero_is_no_motion_of_a_linear_arm():
 def test_start_columns_are_the_derivatives_of_the_residuals():
     case = _case(np.random.default_rng(5))
     records = Records(case, case.estimation)
-    columns = records.start_columns(np.zeros(0), ())
+    columns = records.start_columns(np.zeros(0), (), records.at_rest())
     here = records.coefficients(np.zeros(0), (), records.at_rest())
     for k in range(1 + records.state_spread.size):
         step = np.eye(1 + records.state_spread.size)[k]
-        moved = records.coefficients(np.zeros(0), (), records.at_rest().moved(step))
+        moved = records.coefficients(np.zeros(0), (), columns.moved(records.at_rest(), step))
         column = columns.zeros[:, 0] if k == 0 else columns.states[0][:, k - 1]
         np.testing.assert_allclose(moved - here, column, atol=1e-9)
 
@@ -159,3 +160,38 @@ def test_a_stated_value_far_off_is_named_though_the_others_could_imitate_it():
     (effect,) = [e for e in found.effects if e.name == "hub_inertia"]
     low, high = effect.intervals["ratio"]
     assert low < 1.5 < high
+
+
+def test_gain_and_zeros_of_a_strain_gauge_and_a_tachometer():
+    # Records of an independent simulator, read by sensors whose zeros and gain nobody knows.
+    rng = np.random.default_rng(8)
+    levels = {"sensors.tip_deflection_noise_m": 2e-4, "sensors.hub_speed_noise_rad_s": 0.02}
+    rig = RIG.perturbed(levels).model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05}})
+    truth = Truth(
+        RIG.model_dump(exclude={"tolerances"}), (), Background(dry_friction_Nm=2e-3, presliding_rad=1e-3)
+    )
+    lever, dt_s = RIG.hub.radius_m + RIG.link.length_m, RIG.sampling.dt_s
+    names = ("hub_angle_rad", "hub_speed_rad_s", "tip_deflection_m")
+    records = []
+    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
+        voltage = rng.choice([-3.0, 3.0], 40).repeat(15)
+        clean = truth.record(voltage, None, None, Before(0.4))
+        bent = clean.tip_m - lever * clean.hub_angle_rad
+        read = np.column_stack(
+            [clean.hub_angle_rad - 0.2, np.gradient(clean.hub_angle_rad, dt_s) + 0.1, 1.4 * bent + 0.004]
+        )
+        noise = np.array([RIG.sensors.hub_angle_noise_rad, *levels.values()])[[0, 2, 1]]
+        records.append(
+            Experiment(name, role, voltage, read + noise * rng.standard_normal(read.shape), outputs=names)
+        )
+    found = diagnose(Case("gauge", rig, tuple(records), 0.05))
+    assert found.combination == ("sensor_gain",)
+    (gain,) = [e for e in found.effects if e.name == "sensor_gain"]
+    low, high = gain.intervals["ratio"]
+    assert low < 1.4 < high
+    assert high - low < 0.2
+    # Over windows as in a free run: the gain closes the gap of the deflection.
+    shares = found.shares
+    assert shares is not None
+    assert shares.horizon_closed > 0.95
+    assert found.gap_closed > 0.95

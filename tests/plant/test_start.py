@@ -74,3 +74,22 @@ def test_the_accelerometer_reads_the_second_derivative_of_the_tip(voltage_V: np.
 def test_deflections_and_rates_come_in_pairs() -> None:
     with pytest.raises(ValueError, match="as many rates as deflections"):
         Simulator(paper_link()).run(np.zeros(5), start=Start(deflections=np.zeros(2)))
+
+
+def test_speed_and_deflection_are_what_angle_and_tip_say(voltage_V: np.ndarray) -> None:
+    rig = paper_link()
+    start = Start(0.3, 1.0, np.array([0.01, -0.002]), np.array([0.1, 0.4]))
+    effects = [parse_effect({"name": "sensor_gain", "ratio": 1.3})]
+    found = Simulator(rig, effects, dt_s=1e-4).run(voltage_V, start=start)
+    middle = (found.hub_angle_rad[2:] - found.hub_angle_rad[:-2]) / 2e-4
+    np.testing.assert_allclose(found.hub_speed_rad_s[1:-1], middle, atol=2e-3 * np.ptp(middle))
+    lever = rig.hub.radius_m + rig.link.length_m
+    bent = found.tip_true_m - lever * found.hub_angle_true_rad
+    np.testing.assert_allclose(found.tip_deflection_m, 1.3 * bent, atol=1e-12)
+    levels = {"sensors.hub_speed_noise_rad_s": 0.02, "sensors.tip_deflection_noise_m": 1e-3}
+    voltage = np.tile(voltage_V, 20)
+    noisy = Simulator(rig.perturbed(levels), effects).run(voltage, rng=np.random.default_rng(2))
+    clean = Simulator(rig, effects).run(voltage)
+    for name, level in zip(("hub_speed_rad_s", "tip_deflection_m"), levels.values(), strict=True):
+        spread = np.std(getattr(noisy, name) - getattr(clean, name))
+        assert spread == pytest.approx(level, rel=4 / np.sqrt(2 * len(noisy.time_s)))

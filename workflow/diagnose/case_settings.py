@@ -52,6 +52,10 @@ class Columns(Section):
     hub_angle_rad: ColumnChoice | None = Field(None, description="hub angle")
     tip_m: ColumnChoice | None = Field(None, description="tip position, arc plus deflection")
     tip_acceleration_m_s2: ColumnChoice | None = Field(None, description="across the link, at the tip")
+    hub_speed_rad_s: ColumnChoice | None = Field(None, description="speed of the hub")
+    tip_deflection_m: ColumnChoice | None = Field(
+        None, description="of the tip from the straight link: strain gauge or camera; scale is its length"
+    )
     reference_rad: ColumnChoice | None = Field(None, description="controller's reference, where there is one")
 
 

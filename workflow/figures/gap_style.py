@@ -30,6 +30,8 @@ OUTPUTS: Mapping[Output, tuple[str, str, str]] = {
     "hub_angle_rad": ("hub angle", "rad", style.UNCERTAIN),
     "tip_m": ("tip position", "m", style.HIGHLIGHT),
     "tip_acceleration_m_s2": ("tip acceleration", "m/s²", style.PREDICTED),
+    "hub_speed_rad_s": ("hub speed", "rad/s", style.PREDICTED),
+    "tip_deflection_m": ("tip deflection", "m", style.HIGHLIGHT),
 }
 _OTHERS = (style.UNCERTAIN, style.HIGHLIGHT, style.PREDICTED)
 

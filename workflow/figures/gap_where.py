@@ -60,7 +60,8 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
         max(3.7, 1.7 + 0.36 * len(experiments)), 1, 2, width_ratios=[1.25, 1.0]
     )
     sensors = [one.sensor for one in where.sensors]
-    for sensor, shift in zip(sensors, (0.97, 1.03), strict=False):
+    apart = np.linspace(-1.0, 1.0, len(sensors)) if len(sensors) > 1 else np.zeros(1)
+    for sensor, shift in zip(sensors, 1 + 0.03 * apart, strict=True):
         name, colour = _look(where, sensor)
         for band in (band for band in where.bands if band.sensor == sensor):
             middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
@@ -79,10 +80,14 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
     left.set_ylim(bottom=factor * _SMALLEST)
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
-        for sensor, part, offset in zip(sensors, entry.sensors, (-0.15, 0.15), strict=False):
+        for sensor, part, offset in zip(sensors, entry.sensors, 0.15 * apart, strict=True):
             pale = 1.0 if part.found else 0.35
             right.barh(
-                row + offset, factor * part.gap_rms, height=0.27, color=_look(where, sensor)[1], alpha=pale
+                row + offset,
+                factor * part.gap_rms,
+                height=0.54 / len(sensors),
+                color=_look(where, sensor)[1],
+                alpha=pale,
             )
             right.plot(factor * np.array(part.interval), [row + offset] * 2, **_WHISKER)
     right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
