@@ -23,6 +23,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from flexlink.own_packages import find_own_first
+
 if TYPE_CHECKING:
     from flexlink.causes import *
     from flexlink.design import *
@@ -54,6 +56,8 @@ _MODULES = {
 _WHERE = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = sorted(_WHERE)
+
+find_own_first()
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import os
 import subprocess
 import sys
 from importlib import import_module
@@ -123,3 +124,20 @@ def test_what_is_wrong_is_said_in_one_line(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_a_plant_module_of_the_users_own_is_not_taken_for_ours(tmp_path):
+    (tmp_path / "plant.py").write_text("raise RuntimeError('not ours')\n")
+    for arguments in (
+        ["-c", "import flexlink; flexlink.paper_link()"],
+        ["-c", "from flexlink.__main__ import main; import workflow.commands.run"],
+    ):
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": f".{os.pathsep}{Path(flexlink.__file__).parents[1]}"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from workflow.cli import Json, print_json
+from workflow.cli import Json, Quiet, print_json
 
 
 def paper(
@@ -56,6 +56,7 @@ def blind(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in --out; completed cases are reused.")
     ] = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Test the diagnosis on sealed cases of its own.
@@ -65,7 +66,7 @@ def blind(
     from validation.blind.protocol import run_blind
     from workflow.console import TerminalProgress, print_summary
 
-    with TerminalProgress() as progress:
+    with TerminalProgress(quiet=quiet) as progress:
         summary = run_blind(
             cases, seed, out, jobs=jobs, only=only, workshop=workshop, resume=resume, progress=progress
         )

@@ -36,7 +36,7 @@ from workflow.engine.errors import (
     need,
     one_line,
 )
-from workflow.engine.threads import one_thread_unless_told
+from workflow.engine.threads import one_thread
 
 if TYPE_CHECKING:
     from workflow.tasks.summary import RunSummary
@@ -48,7 +48,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # markup would swallow every [unit], [section] and [default] in the help
     epilog="Exit codes: 0 done; 1 internal error; 2 something given is wrong (one line says what and where); "
-    "3 the result is not certified, the report says why; 130 interrupted. Example: flexlink run --out "
+    "3 the result is not certified, the report says why; 130, 143, 129 interrupted by Ctrl-C, "
+    "SIGTERM, SIGHUP. Example: flexlink run --out "
     "runs/first",
 )
 
@@ -59,6 +60,7 @@ Resume = Annotated[
     bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is taken up.")
 ]
 Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -88,6 +90,7 @@ def run(
     ] = None,
     resume: Resume = False,
     replace: Replace = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
@@ -95,7 +98,7 @@ def run(
     from workflow.commands.run import run_from_files
     from workflow.console import TerminalProgress
 
-    with TerminalProgress() as progress:
+    with TerminalProgress(quiet=quiet) as progress:
         summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
     _show(summary, as_json)
     _leave(summary)
@@ -298,6 +301,7 @@ def identify(
     out: Annotated[
         Path | None, typer.Option(help="Write model and posterior here (npz), for `flexlink design`.")
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
@@ -316,7 +320,7 @@ def identify(
         "relative_degree": _degree(relative_degree),
     }
     options = check(IdentOptions, chosen, source="options")
-    with TerminalProgress() as progress:
+    with TerminalProgress(quiet=quiet) as progress:
         summary = identify_logs(
             log,
             input_name,
@@ -380,13 +384,16 @@ def design(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
     need(*source, specification)
     from workflow.commands.design import design_controller
+    from workflow.console import TerminalProgress
 
-    summary = design_controller(source, specification, out=out, seed=seed)
+    with TerminalProgress(quiet=quiet) as progress:
+        summary = design_controller(source, specification, out=out, seed=seed, progress=progress)
     _show(summary, as_json)
     _leave(summary)
 
@@ -414,6 +421,7 @@ def study(
     ] = None,
     resume: Resume = False,
     replace: Replace = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
@@ -421,7 +429,7 @@ def study(
     from workflow.console import TerminalProgress
     from workflow.study.run import run_study
 
-    with TerminalProgress() as progress:
+    with TerminalProgress(quiet=quiet) as progress:
         summary = run_study(
             config, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
         )
@@ -460,6 +468,7 @@ def diagnose(
             "left out. [default: none]",
         ),
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
@@ -472,7 +481,7 @@ def diagnose(
     from workflow.console import TerminalProgress
     from workflow.diagnose.command import diagnose_cases
 
-    with TerminalProgress() as progress:
+    with TerminalProgress(quiet=quiet) as progress:
         found = diagnose_cases(
             case,
             out,
@@ -561,7 +570,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.filterwarnings("always", category=RenamedKeyWarning)
         warnings.showwarning = _warn
     if argv is None:
-        one_thread_unless_told()  # read by the libraries when they load, which is after this line
+        one_thread()  # read by the libraries when they load, which is after this line
     if not arguments:
         arguments = ["--help"]
     try:
@@ -619,7 +628,7 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
             again += ["--out", str(out)]
         if out is not None and out.is_dir():
             hint = f"; {shlex.join(['flexlink', *again, '--resume'])} continues"
-    return _complain(f"interrupted{hint}", EXIT_INTERRUPTED)
+    return _complain(f"interrupted{hint}", interrupts.exit_code())
 
 
 def _warn(message: Warning | str, *about: object, **more: object) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -19,12 +21,18 @@ if TYPE_CHECKING:
     from workflow.tasks.summary import RunSummary
 
 
-class TerminalProgress(progress.Progress):
-    """Progress with remaining time on standard error; silent when that is no terminal. Use as a context
-    manager."""
+LINE_EVERY_S = 10.0
 
-    def __init__(self) -> None:
+
+class TerminalProgress(progress.Progress):
+    """Progress with remaining time on standard error: a bar, or, where that is no terminal, a line every ten
+    seconds; nothing with `quiet`. Use as a context manager."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
         console = Console(stderr=True)
+        self._lines = not quiet and not console.is_terminal
+        self._doing, self._share, self._began_s = "", 0.0, time.monotonic()
+        self._over = threading.Event()
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
@@ -33,7 +41,7 @@ class TerminalProgress(progress.Progress):
             TimeRemainingColumn(compact=True),
             console=console,
             transient=True,
-            disable=not console.is_terminal,
+            disable=quiet or not console.is_terminal,
         )
         self._task: TaskID | None = None
         self._expected: dict[str, float] = {}
@@ -41,12 +49,24 @@ class TerminalProgress(progress.Progress):
 
     def __enter__(self) -> Self:
         self._bar.start()
+        if self._lines:
+            threading.Thread(target=self._tell, daemon=True).start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._over.set()
         self._bar.stop()
+
+    def _tell(self) -> None:
+        while not self._over.wait(LINE_EVERY_S):
+            spent_s = time.monotonic() - self._began_s
+            line = f"flexlink: {spent_s:.0f} s: {printable(self._doing) or 'starting'}"
+            if self._share > 0.02:  # less says nothing about the whole
+                left_s = spent_s * (1 - self._share) / self._share
+                line += f" ({100 * self._share:.0f} %, about {left_s:.0f} s left)"
+            print(line, file=sys.stderr, flush=True)  # noqa: T201
 
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
         self._expected = dict(stages)
@@ -57,12 +77,10 @@ class TerminalProgress(progress.Progress):
 
     def update(self, stage: str, fraction: float, message: str = "") -> None:
         if self._task is not None:
-            self._bar.update(
-                self._task,
-                completed=self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0),
-                total=sum(self._expected.values()) or 1.0,
-                description=escape(f"{stage}: {message}" if message else stage),
-            )
+            done = self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0)
+            total = sum(self._expected.values()) or 1.0
+            self._doing, self._share = f"{stage}: {message}" if message else stage, done / total
+            self._bar.update(self._task, completed=done, total=total, description=escape(self._doing))
 
     def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
         if taken_up:

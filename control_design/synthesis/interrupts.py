@@ -1,4 +1,4 @@
-"""Interrupts from the keyboard (SIGINT) that compiled code swallows, and processes that must not see them."""
+"""Interrupts (SIGINT, SIGTERM, SIGHUP) that compiled code swallows, and processes that must not see them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 @contextmanager
 def interrupts_kept() -> Iterator[None]:
@@ -22,8 +24,9 @@ def interrupts_kept() -> Iterator[None]:
     the status; what CasADi prints about the exception that it swallowed is not for the user. Python runs
     handlers in the main thread only: elsewhere there is nothing to do.
     """
-    before: Any = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    before: dict[int, Any] = {number: signal.getsignal(number) for number in _SIGNALS}
+    before = {number: handler for number, handler in before.items() if callable(handler)}
+    if threading.current_thread() is not threading.main_thread() or not before:
         yield
         return
     seen, stderr = False, sys.stderr
@@ -32,13 +35,15 @@ def interrupts_kept() -> Iterator[None]:
         nonlocal seen
         seen = True
         sys.stderr = io.StringIO()
-        before(number, frame)
+        before[number](number, frame)
 
     try:
-        signal.signal(signal.SIGINT, watch)
+        for number in before:
+            signal.signal(number, watch)
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         sys.stderr = stderr
         if seen:
             raise KeyboardInterrupt

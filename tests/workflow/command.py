@@ -31,12 +31,14 @@ class Answer:
         return json.loads(self.out)
 
 
-def start_flexlink(*arguments: object, stdout: IO[bytes] | int = subprocess.PIPE) -> subprocess.Popen[bytes]:
+def start_flexlink(
+    *arguments: object, stdout: IO[bytes] | int = subprocess.PIPE, threads: int = 1
+) -> subprocess.Popen[bytes]:
     """`flexlink` in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "workflow", *(str(argument) for argument in arguments)],
         cwd=ROOT,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "OMP_NUM_THREADS": str(threads)},
         stdout=stdout,
         stderr=subprocess.PIPE,
     )

@@ -230,3 +230,18 @@ def test_wrong_calls_are_one_line(folder, refused, tmp_path):
 def test_a_damaged_case_names_itself(tmp_path):
     with pytest.raises(InputError, match=r"case\.toml"):
         load_case(tmp_path)
+
+
+def test_a_case_folder_reads_nothing_outside_itself(folder, tmp_path):
+    """Unless the user names the case file himself."""
+    inside = folder / "experiments/01_prbs.csv"
+    inside.rename(tmp_path / "01_prbs.csv")
+    inside.symlink_to(tmp_path / "01_prbs.csv")
+    with pytest.raises(InputError, match=r"experiments\[0\].file: .* lies outside the case folder"):
+        load_case(folder)
+    for other in ("../01_prbs.csv", str(tmp_path / "01_prbs.csv")):
+        edit(folder / "case.toml", "experiments/01_prbs.csv", other)
+        with pytest.raises(InputError, match="lies outside the case folder"):
+            load_case(folder)
+        assert load_case(folder / "case.toml").case.experiments[0].name == "01_prbs"
+        edit(folder / "case.toml", other, "experiments/01_prbs.csv")

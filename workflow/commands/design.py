@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from workflow.config.design_file import DesignFile, read_design_file
 from workflow.engine.errors import InputError, need
+from workflow.engine.progress import Progress
 
 if TYPE_CHECKING:
     from workflow.tasks.summary import RunSummary
@@ -19,6 +20,7 @@ def design_controller(
     *,
     out: Path | None = None,
     seed: int = 2006,
+    progress: Progress | None = None,
 ) -> RunSummary:
     """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
 
@@ -35,4 +37,6 @@ def design_controller(
     # Here: what designs takes seconds to load, and a design file that is refused does not need it.
     from workflow.commands.designed import designed
 
-    return designed(paths, file, name=str(specification_path or paths[0]), out=out, seed=seed)
+    return designed(
+        paths, file, name=str(specification_path or paths[0]), out=out, seed=seed, progress=progress
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from control_design.specification import Specification
 from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
+from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.achievable_performance import bracket_numbers, find_bracket
 from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
@@ -33,11 +34,15 @@ class _Designed:
 
 
 def _design(
-    plants: Sequence[UncertainPlant], specification: Specification, asked: DesignFile, seed: int
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    asked: DesignFile,
+    seed: int,
+    report: Callable[..., None],
 ) -> _Designed:
     with naming("design"):
         design = find_design(
-            plants, specification, asked.synthesis, asked.certificate, stage_rng(seed, "design")
+            plants, specification, asked.synthesis, asked.certificate, stage_rng(seed, "design"), report
         )
         nothing = CertifyResult(None, certified=False, reason=design.reason)
         if design.synthesis is None:
@@ -60,7 +65,13 @@ def _design(
 
 
 def designed(
-    paths: Sequence[Path], file: DesignFile, *, name: str, out: Path | None, seed: int
+    paths: Sequence[Path],
+    file: DesignFile,
+    *,
+    name: str,
+    out: Path | None,
+    seed: int,
+    progress: Progress | None = None,
 ) -> RunSummary:
     """`design_controller` with the design file that was read; name: what to call it in a complaint."""
     written = [] if out is None else targets(out)
@@ -69,14 +80,18 @@ def designed(
     storage.refuse_in_the_way(
         paths, [("--out", one) for path in written for one in (path, filter_file(path))]
     )
-    sources_found = load_sources(paths, file)
+    progress = progress or Progress()
+    progress.plan([("plants", 5.0), ("design", 30.0)])
+    with progress.stage("plants"):
+        sources_found = load_sources(paths, file)
     asked = file.completed(sources_found[0].config)
     specification = file.specification if len(paths) > 1 else asked.specification
     if specification is None:
         raise InputError(f"{', '.join(map(str, paths))}: no specification for all: give --spec FILE")
     plants = [source.plant for source in sources_found]
     check_filter(asked.reference_filter, plants[0].dt_s, name)
-    done = _design(plants, specification, asked, seed)
+    with progress.stage("design") as update:
+        done = _design(plants, specification, asked, seed, update)
     certificate, certified = done.certify.certificate, done.certify.certified
     synthesis, order = done.design.synthesis, specification.controller_order
     files: list[Path] = []

@@ -56,10 +56,14 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     name = settings.case or (folder.resolve().name if file.name == CASE_FILE else file.stem)
     if name in _TAKEN_NAMES:
         raise InputError(f"{file}: case: {name!r} is the name of a file of the overview; choose another")
+    # A folder may come from anybody; who names a case file himself knows what it reads.
+    within = folder.resolve() if place.is_dir() else None
     rig_path = folder / (rig or settings.rig)
+    if rig is None:
+        _refuse_outside(within, rig_path, f"{file}: rig")
     machine = _rig(rig_path)
     experiments = [
-        _experiment(file, i, entry, settings, machine) for i, entry in enumerate(settings.experiments)
+        _experiment(file, i, entry, settings, machine, within) for i, entry in enumerate(settings.experiments)
     ]
     with naming(str(file)):
         case = Case(name, machine, tuple(experiments), settings.model_error)
@@ -76,6 +80,12 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     )
 
 
+def _refuse_outside(folder: Path | None, path: Path, where: str) -> None:
+    """Links and `..` lead nowhere else from a case folder."""
+    if folder is not None and not path.resolve().is_relative_to(folder):
+        raise InputError(f"{where}: {path} lies outside the case folder; name {CASE_FILE} itself to read it")
+
+
 def _rig(path: Path) -> Rig:
     if not path.is_file():
         beside = sorted(p.name for p in path.parent.glob("*.toml") if p.name != CASE_FILE)
@@ -85,11 +95,12 @@ def _rig(path: Path) -> Rig:
 
 
 def _experiment(
-    file: Path, index: int, entry: ExperimentEntry, settings: CaseSettings, rig: Rig
+    file: Path, index: int, entry: ExperimentEntry, settings: CaseSettings, rig: Rig, within: Path | None
 ) -> Experiment:
     here = f"{file}: experiments[{index}]"
     with naming(f"{here}.file"):
         path = file.parent / expand(entry.file)
+    _refuse_outside(within, path, f"{here}.file")
     if not path.is_file():
         raise InputError(f"{here}.file: no such file: {path}")
     stamped = entry.columns.time_s or settings.columns.time_s or settings.dt_s is None

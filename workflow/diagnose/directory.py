@@ -14,6 +14,7 @@ made from the same inputs by the same code, is done.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,10 @@ class DiagnosisDirectory(Store):
         if not self.manifest_path.is_file():
             return self.own_files
         cases = storage.read_json(self.manifest_path).get("inputs", {})
-        return (*(f"{case}{ending}" for case in cases for ending in _ENDINGS), *self.own_files)
+        named = [
+            case for case in cases if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", case)
+        ]  # no path elsewhere
+        return (*(f"{case}{ending}" for case in named for ending in _ENDINGS), *self.own_files)
 
     @classmethod
     def begin(

@@ -83,9 +83,10 @@ class LocalProcesses:
         self._jobs = jobs
         self._context: ForkServerContext | SpawnContext
         if sys.platform.startswith("linux"):
-            # Forked off a process that has loaded the libraries (seconds) and done nothing else.
+            # Forked off a process that has loaded the libraries (seconds) and done nothing else; first
+            # flexlink, which sees to it that a plant.py in the current folder is not taken for ours.
             self._context = multiprocessing.get_context("forkserver")
-            self._context.set_forkserver_preload([__name__, *preload])
+            self._context.set_forkserver_preload(["flexlink", __name__, *preload])
         else:
             self._context = multiprocessing.get_context("spawn")
         self._running: dict[Connection, tuple[int, BaseProcess]] = {}

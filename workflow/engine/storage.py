@@ -193,7 +193,10 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
     """
     import fcntl
 
-    with open(directory / "lock", "w") as stream:
+    for place in below:
+        if place.is_symlink():  # files of others must not be written or deleted through it
+            raise InputError(f"{place}: a link; a {what} keeps its files in its own directory")
+    with open(directory / "lock", "w", opener=_no_link) as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -201,6 +204,10 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
         for place in (directory, *below):
             remove_leftovers(place)
         yield
+
+
+def _no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def _flush_directory(directory: Path) -> None:

@@ -1,7 +1,8 @@
 """How many threads numerical libraries take: one, here and in the processes begun here.
 
 Matrices in flexlink are small: threads would only wait for one another, beside another busy process for most
-of the time.
+of the time. And sums that are split otherwise round otherwise: whatever OMP_NUM_THREADS says, a command ends
+with the same bytes.
 """
 
 from __future__ import annotations
@@ -13,10 +14,9 @@ from contextlib import contextmanager
 _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def one_thread_unless_told() -> None:
-    """For this process, before numpy is loaded; what the user has set stays."""
-    if not any(name in os.environ for name in _VARIABLES):
-        os.environ.update(dict.fromkeys(_VARIABLES, "1"))
+def one_thread() -> None:
+    """For this process, before numpy is loaded."""
+    os.environ.update(dict.fromkeys(_VARIABLES, "1"))
 
 
 @contextmanager

@@ -73,16 +73,24 @@ def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Seq
         {
             "number": row.number,
             "name": row.name,
-            **{a.key: v if isinstance(v := row.values[a.key], (int, float)) else short(v) for a in axes},
+            **{
+                a.key: v if isinstance(v := row.values[a.key], (int, float)) else _cell(short(v))
+                for a in axes
+            },
             "state": row.state,
             **row.numbers,
             **{f"front_{k}": "yes" if row.number in on else "no" for k, on in enumerate(front, 1)},
-            "why": row.why,
+            "why": _cell(row.why),
         }
         for row in rows
     ]
     # As objects: a whole number stays one beside a cell without a number.
     return str(pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n"))
+
+
+def _cell(text: str) -> str:
+    """Text that no spreadsheet takes for a formula."""
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@") else text
 
 
 def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:

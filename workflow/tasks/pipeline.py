@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
@@ -50,7 +52,8 @@ def run_pipeline(
     started = time.monotonic()
     ready: RecordsResult | None = None
     if not (resume and out.exists()):
-        ready = first.run(StageInput(config, None, progress, called))
+        with threadpool_limits(1):
+            ready = first.run(StageInput(config, None, progress, called))
     ready_s = time.monotonic() - started
     existed = out.exists()
     run = RunDirectory.begin(
@@ -62,7 +65,7 @@ def run_pipeline(
         resume=resume,
         replace=replace,
     )
-    with run.locked():
+    with run.locked(), threadpool_limits(1):  # more threads round otherwise
         run.record_status("running")
         stages = STAGES if page is None else (*STAGES, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])

@@ -1,0 +1,8 @@
+"""`flexlink` and `python -m flexlink`: the command line, whatever the current folder holds."""
+
+import sys
+
+from workflow.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
