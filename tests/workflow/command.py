@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -45,10 +46,10 @@ def start_flexlink(
 
 
 def finish(process: subprocess.Popen[bytes], code: int = 0, *, seconds: float = 600.0) -> str:
-    """Standard error of a process that ends with this code."""
+    """Standard error of a process that ends with this code, lines of progress left out."""
     _, error = process.communicate(timeout=seconds)
     assert process.returncode == code, error.decode()
-    return error.decode()
+    return re.sub(r"^flexlink: \d+ s: .*\n", "", error.decode(), flags=re.MULTILINE)
 
 
 def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
