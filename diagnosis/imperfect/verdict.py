@@ -113,7 +113,7 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
     sets = tuple(_judged(search, e, best, model_error, listed, fit=k == 0) for k, e in enumerate(chosen))
-    probabilities = _probabilities(sets, listed)
+    probabilities = _probabilities(sets, listed, _enough(search.base, model_error))
     answer = probabilities.answer
     if answer in ("none", "unknown"):
         return Verdict(probabilities, sets, answer, ())
@@ -157,8 +157,7 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    enough, more = _remaining(explanation, model_error)
-    complete = 0.0 if at_edge else enough / (enough + more)
+    complete = 0.0 if at_edge else _enough(explanation, model_error)
     for part in parts:
         complete *= 1.0 if part.name in listed else 1 - part.matters
     within = tuple(part for part in parts if part.name in listed)
@@ -184,6 +183,12 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
     return abs(float(moved / stated) - 1) / tolerance
 
 
+def _enough(explanation: Explanation, model_error: float) -> float:
+    """Probability that what is left is no more than imperfections."""
+    enough, more = _remaining(explanation, model_error)
+    return enough / (enough + more)
+
+
 def _remaining(explanation: Explanation, model_error: float) -> tuple[float, float]:
     """Densities of what is left of the motion after a complete answer, and beside an unknown cause."""
     left = np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2))
@@ -198,8 +203,9 @@ def _soft(ratio: float, width: float) -> float:
     return float(expit(np.log(max(ratio, 1e-6)) / width))
 
 
-def _probabilities(sets: Sequence[Judged], listed: Sequence[str]) -> Probabilities:
-    """Every set shared out: unknown where it is not complete, else those of its effects that matter."""
+def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: float) -> Probabilities:
+    """Every set shared out: unknown where it is not complete, else those of its effects that matter; none of
+    them only as far as the nominal alone leaves no more than imperfections (none_enough)."""
     weights = softmax([s.score for s in sets])
     shared: dict[tuple[str, ...], float] = {}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
@@ -214,6 +220,10 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str]) -> Probabiliti
                 share = weight * one.complete
                 for part in one.parts:
                     share *= part.matters if part in chosen else 1 - part.matters
+                if one.parts and not chosen:
+                    shared[("unknown",)] += share * (1 - none_enough)
+                    cause["unknown"] += share * (1 - none_enough)
+                    share *= none_enough
                 names = tuple(sorted(part.name for part in chosen))
                 shared[names] = shared.get(names, 0.0) + share
                 lead = max(chosen, key=lambda part: part.share).name if chosen else "none"
