@@ -13,6 +13,7 @@ from diagnosis.evidence.look_alikes import look_alike
 from diagnosis.imperfect.descent import Descent, descend, loss_at, occam
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.imperfect.starts import Point, beside, points_of
+from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
@@ -213,6 +214,8 @@ class Search:
 
     def _look_alikes(self) -> None:
         """Causes beyond the list in place of what they look like, wherever that may be the answer."""
+        if not isinstance(self.case, Case):
+            return
         ranked = sorted(self.found, key=lambda e: -e.evidence)[:_FINISHED]
         for kind in LOOK_ALIKES.values():
             for explanation in [e for e in ranked if kind.look_alike_of in e.names]:

@@ -191,20 +191,20 @@ class Plant:
                 raise
             except Exception as error:
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
-                raise ValueError(f"{self._at(told)} the simulation ended with {reason}") from error
+                raise ValueError(f"{self._at(effects)} the simulation ended with {reason}") from error
             if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
                 raise ValueError(
-                    f"{self._at(told)} the simulation must give outputs ({len(inputs)}, {self.noise.size}); "
-                    f"got {found.shape}"
+                    f"{self._at(effects)} the simulation must give outputs "
+                    f"({len(inputs)}, {self.noise.size}); got {found.shape}"
                 )
             return found
 
         run = around(told_simulation, acting, known)
         return lambda inputs: run(inputs)[:, : self.noise.size]
 
-    def _at(self, told: Mapping[str, Mapping[str, float]]) -> str:
+    def _at(self, effects: Sequence[Change]) -> str:
         values = ", ".join(f"{key} {value:.6g}" for key, value in self.parameters.items())
-        added = " and ".join(f"{name} {dict(given)}" for name, given in told.items())
+        added = " and ".join(f"{effect.id} {dict(effect.values)}" for effect in effects)
         return f"plant: with {values}" + (f" and {added}" if added else "")
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
