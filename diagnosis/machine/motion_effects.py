@@ -20,8 +20,9 @@ from numba import njit
 from diagnosis.machine.machine_protocol import Real
 
 _ROUNDS = 12
-# Of the change that the effects make: what rounds may still move.
-_CONVERGED = 1e-5
+# Of the change that the effects make: what rounds may still move, or may where they no longer get closer (an
+# integrator with a step of its own has noise).
+_CONVERGED, _SETTLED = 1e-5, 0.01
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
 _FORGOTTEN = 1e-7
@@ -88,7 +89,7 @@ class PulseResponse:
         if not abs(speed[ahead]) > 0.1 * largest:
             raise ValueError(
                 "friction and springs need a force that moves the body at once; the simulated motion follows "
-                "the stated input later"
+                "the stated input later, or its steps are too coarse for a pulse of one sample"
             )
         kept = np.abs(speed) > _FORGOTTEN * largest
         kept |= np.abs(position) > _FORGOTTEN * np.max(np.abs(position))
@@ -124,6 +125,7 @@ def with_forces(
     outputs, now = free
     error = np.inf
     for _ in range(_ROUNDS):
+        before = error
         if not np.all(np.isfinite(now)):
             return outputs, np.inf
         held, position, speed = _solve(
@@ -139,7 +141,7 @@ def with_forces(
         k = int(response.of_speed)
         missed = np.sqrt(np.mean((seen[k] - (position, speed)[k]) ** 2))
         error = float(missed / max(np.sqrt(np.mean((now - free[1]) ** 2)), 1e-300))
-        if error < _CONVERGED:
+        if error < _CONVERGED or 0.5 * before < error < _SETTLED:
             break
     return outputs, error
 
