@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.workflow.command import Answer
+from tests.workflow.command import Answer, without_progress
 from workflow.cli import main
 
 # The same examples on every machine, and no time limit for an example that happens to compile something.
@@ -52,7 +52,7 @@ def flexlink(capfd: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
         capfd.readouterr()
         code = main([str(argument) for argument in arguments])
         captured = capfd.readouterr()
-        return Answer(code, captured.out, captured.err)
+        return Answer(code, captured.out, without_progress(captured.err))
 
     return call
 

@@ -49,7 +49,12 @@ def finish(process: subprocess.Popen[bytes], code: int = 0, *, seconds: float = 
     """Standard error of a process that ends with this code, lines of progress left out."""
     _, error = process.communicate(timeout=seconds)
     assert process.returncode == code, error.decode()
-    return re.sub(r"^flexlink: \d+ s: .*\n", "", error.decode(), flags=re.MULTILINE)
+    return without_progress(error.decode())
+
+
+def without_progress(error: str) -> str:
+    """Standard error without the lines that come every ten seconds."""
+    return re.sub(r"^flexlink: \d+ s: .*\n", "", error, flags=re.MULTILINE)
 
 
 def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
