@@ -370,7 +370,7 @@ def test_damaged_model_files_are_one_line(identified, tmp_path):
         ("cut.json", whole[:200], "not JSON"),
         ("other.json", b"{}", "'format' is missing"),
         ("bytes.json", b"\xff\xfe", "not UTF-8 text"),
-        ("cut.mat", ModelFile.from_json(whole.decode()).to_mat()[:200], "not a MATLAB"),
+        ("cut.mat", ModelFile.from_json(whole.decode()).to_mat()[:200], "damaged"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=words) as error:
