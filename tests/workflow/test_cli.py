@@ -182,7 +182,7 @@ def test_bad_simulated_source(refused, tmp_path, old, new, words):
         (["report", "absent"], ["absent: no such run directory"]),
         (["design", "absent.npz", "--specification", "absent.toml"], ["absent.npz"]),
         (["identify", "absent.csv", "--input", "u", "--output", "y", "--dt-s", "0.1"], ["absent.csv"]),
-        (["identify", "absent.csv"], ["--input"]),
+        (["identify", "absent.csv"], ["absent.csv", "no such file"]),
     ],
 )
 def test_bad_arguments(refused, tmp_path, monkeypatch, arguments, words):
