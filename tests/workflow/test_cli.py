@@ -423,10 +423,13 @@ def test_output_that_cannot_be_written_is_one_line(fast_run):
 
 
 def test_terminal_codes_in_names_are_shown_as_text(refused, tmp_path):
-    (tmp_path / "log.csv").write_text("t,\x1b[31mu,y\n0,1,2\n1,2,3\n")
-    line = refused("identify", tmp_path / "log.csv", "--input", "u", "--output", "y", "--time", "t")
+    log = tmp_path / "log.csv"
+    log.write_text("t,u,y\n0,1,2\n1,2,3\n")
+    line = refused("identify", log, "--input", "\x1b[31mu", "--output", "y", "--time", "t")
     assert "\x1b" not in line
     assert r"\x1b[31mu" in line
+    log.write_text("t,\x1b[31mu,y\n0,1,2\n1,2,3\n")
+    assert "control characters" in refused("identify", log, "--input", "u", "--output", "y", "--time", "t")
 
 
 @pytest.mark.parametrize("given", [{}, {"OMP_NUM_THREADS": "2"}])
@@ -441,8 +444,8 @@ def test_numpy_is_loaded_after_its_threads_are_settled(given):
     answer = subprocess.run(
         [sys.executable, "-c", code], env=kept | given, cwd=ROOT, check=True, capture_output=True, text=True
     )
-    expected = "False 2 None" if given else "False 1 1"
-    assert answer.stdout.splitlines()[-1] == expected
+    # One thread whatever was asked for: results are the same to the last byte (docs/limits.md).
+    assert answer.stdout.splitlines()[-1] == "False 1 1"
 
 
 _ARM = FAST_ARM.read_text()
