@@ -211,7 +211,7 @@ def test_files_of_another_kind(tmp_path, good):
         (good, "csv.npz", "not a numpy .npz archive"),
         (good, "csv.mat", "not a MATLAB .mat file"),
         (tmp_path / "one.npy", "npy.npz", "not a numpy .npz archive"),
-        (good, "log.xlsx", "unknown kind of file '.xlsx'; expected one of .csv"),
+        (good, "log.docx", "unknown kind of file '.docx'; expected one of .csv"),
     ):
         path = tmp_path / name
         path.write_bytes(source.read_bytes())

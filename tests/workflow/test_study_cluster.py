@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -98,9 +99,10 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
     out, complaint = process.communicate(timeout=60)
     assert process.returncode == 1
     assert out == b""
-    assert complaint.decode() == (
-        f"flexlink: the Dask scheduler at {cluster.address} was lost; --resume continues the study\n"
-    )
+    lines = [line for line in complaint.decode().splitlines() if not re.match(r"flexlink: \d+ s: ", line)]
+    assert lines == [
+        f"flexlink: the Dask scheduler at {cluster.address} was lost; --resume continues the study"
+    ]
     done = finished_points(tmp_path / "out")
     assert 1 <= done < 6
     run_study(study, tmp_path / "out", resume=True, jobs=2)

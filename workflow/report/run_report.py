@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from workflow.config.run_config import RunConfig
-from workflow.engine import storage
+from workflow.engine import documents, storage
 from workflow.figures.subjects import RunView
 from workflow.report.rendering import render_page
 from workflow.tasks.results import RunResults
@@ -23,9 +23,7 @@ def write_report(
     """
     run = results.run
     text = run.path / "config.toml"
-    view = RunView(
-        config, results, text.read_text(encoding="utf-8") if text.is_file() else "", run.manifest()
-    )
+    view = RunView(config, results, documents.read_text(text) if text.is_file() else "", run.manifest())
     title = config.run.title or config.run.name
     page = render_page("report.html.j2", progress, title=title, run=view, summary=summarise(results, config))
     run.figures_path.mkdir(exist_ok=True)
