@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -27,6 +28,7 @@ from workflow.figures.bode import draw_bode
 from workflow.figures.closed_loop import draw_closed_loop
 from workflow.figures.distortion import draw_distortion
 from workflow.figures.excitation import draw_excitation
+from workflow.figures.gap_answer import draw_waterfall
 from workflow.figures.nyquist import uncertain_loop
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import draw_records
@@ -348,3 +350,20 @@ def test_stabilisation_marks_say_what_the_record_says():
     assert marks["stays, but the data would not miss it"] == int(np.count_nonzero(plot.stable & ~plot.needed))
     columns = [line.get_xdata()[0] for line in right.lines if line.get_label().startswith("_")]
     np.testing.assert_allclose(columns, [mode.omega_rad_s for mode in plot.columns()])
+
+
+@pytest.mark.parametrize(("model_error", "floor", "repaired"), [(0.05, 5.0, 0.02), (0.0, 1.0, 0.97)])
+def test_every_gap_is_inside_its_panel(model_error, floor, repaired):
+    gaps = {"stated": 28.0, "refit": 21.0, "repaired": repaired}
+    found = SimpleNamespace(
+        gaps=gaps,
+        gap_by_experiment={"a": gaps, "b": gaps},
+        noise_floor=floor,
+        case=SimpleNamespace(model_error=model_error),
+    )
+    right = draw_waterfall(found).axes[1]
+    low, high = right.get_xlim()
+    drawn = np.concatenate([np.atleast_1d(line.get_xdata()) for line in right.lines])
+    assert np.min(drawn) == min(repaired, floor)
+    assert low < np.min(drawn)
+    assert high > np.max(drawn)

@@ -85,5 +85,8 @@ def test_a_log_that_is_none_is_one_line(flexlink, tmp_path):
 def test_sparkline():
     assert sparkline(np.arange(8.0)) == "▁▂▃▄▅▆▇█"
     assert sparkline(np.ones(5)) == ""
+    # Two levels, each in every part: what is drawn is how much of which.
+    levels = np.where(np.arange(6000) % 100 < np.arange(6000) // 100, 5.0, -5.0)
+    assert set(sparkline(levels)) >= {"▁", "▄", "█"}
     # A short pulse among many samples is seen.
     assert sparkline(np.eye(1, 6000, 3030)[0]).index("█") == 30

@@ -70,8 +70,9 @@ def draw_waterfall(found: Diagnosis) -> Figure:
         at = np.arange(len(rows)) + offset
         right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
     right.axvline(floor, **line)
-    largest = max(max(entry.values()) for entry in rows.values())
-    right.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(largest, 2 * floor)))
+    every = [value for entry in rows.values() for value in entry.values()]
+    # Beside a model error the repaired model may lie far below what does not interest.
+    right.set(xscale="log", xlim=(0.8 * min(*every, floor), 1.3 * max(*every, 2 * floor)))
     right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
     right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words)
     right.set_title("Every experiment alone")

@@ -113,12 +113,12 @@ def listing(items: Iterable[object]) -> str:
 
 
 def sparkline(values: Sequence[float], width: int = 60) -> str:
-    """A signal as one line of bars: of each part the sample that is farthest from the mean of all."""
+    """A signal as one line of bars: the mean of each part. Of a farthest sample a signal of two levels would
+    show one of them only."""
     signal = np.asarray(values, dtype=np.float64)
-    parts = np.array_split(signal - signal.mean(), min(width, signal.size))
-    peaks = np.array([part[np.argmax(np.abs(part))] for part in parts])
-    span = float(np.ptp(peaks))
-    return "".join(_BARS[round(7 * (peak - peaks.min()) / span)] for peak in peaks) if span > 0 else ""
+    means = np.array([part.mean() for part in np.array_split(signal, min(width, signal.size))])
+    span = float(np.ptp(means))
+    return "".join(_BARS[round(7 * (mean - means.min()) / span)] for mean in means) if span > 0 else ""
 
 
 def count(n: int, one: str, many: str | None = None) -> str:
