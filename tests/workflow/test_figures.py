@@ -29,6 +29,7 @@ from workflow.figures.closed_loop import draw_closed_loop
 from workflow.figures.distortion import draw_distortion
 from workflow.figures.excitation import draw_excitation
 from workflow.figures.gap_answer import draw_waterfall
+from workflow.figures.gap_records import draw_residual_spectra
 from workflow.figures.nyquist import uncertain_loop
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import draw_records
@@ -367,3 +368,16 @@ def test_every_gap_is_inside_its_panel(model_error, floor, repaired):
     assert np.min(drawn) == min(repaired, floor)
     assert low < np.min(drawn)
     assert high > np.max(drawn)
+
+
+def test_spectra_of_every_output_are_inside_the_shared_panel():
+    rng = np.random.default_rng(3)
+    sizes = np.array([0.1, 30.0])
+    outputs = {"a": sizes * rng.standard_normal((600, 2))}
+    case = SimpleNamespace(dt_s=0.01, outputs=("hub_angle_rad", "tip_m"))
+    found = SimpleNamespace(case=case, models=("stated",), residuals={"stated": outputs})
+    for axes in draw_residual_spectra(found).axes:
+        low, high = axes.get_ylim()
+        power = axes.lines[0].get_ydata()
+        assert low < np.min(power)
+        assert high > np.max(power)

@@ -103,11 +103,12 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
         for number, mode in enumerate(modes_Hz[:_MODES], 1):
             if mode < 0.5 / dt_s:
                 style.tag_below(axes, mode, f"mode {number}")
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, 0.1), max(high, 10.0))
         axes.set(
             xlabel="frequency [Hz]", title=f"Residual of the {gap_style.look_of(case.outputs[column])[0]}"
         )
+    # Once all are drawn: a limit that is set ends the scaling of the panels that share it.
+    low, high = panels[0].get_ylim()
+    panels[0].set_ylim(min(low, 0.1), max(high, 10.0))
     panels[0].set_ylabel("power over that of the noise [1]")
     return figure
 
