@@ -1,4 +1,4 @@
-"""Logs taken in closed loop with a known reference: two-stage and indirect identification."""
+"""Logs taken in closed loop with a known reference: two-stage identification."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import numpy as np
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
-from ident.data.ellipses import factor_matrices
 from ident.data.finding import Finding, FindingKind, finding
-from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.one_input import Identification, identify
+from ident.one_input import identify
 from ident.uncertainty.embedding import tangent
 
 # A first stage that explains less of the input than this has gone wrong.
@@ -26,14 +24,12 @@ class TwoStage:
     """Open-loop records made from closed-loop ones, and how good the first stage is.
 
     records: as given, but with the noise-free input u_hat = S_hat r (the reference dropped: it has done its
-    work); sensitivities: posterior of S, r -> u, one per record (the same one throughout if it was shared);
-    fit_percent (per record) of u by u_hat; first_stage: the identification that chose the poles of S.
+    work); sensitivities: posterior of S, r -> u, one per record; fit_percent (per record) of u by u_hat.
     """
 
     records: tuple[Record, ...]
     sensitivities: tuple[ResponsePosterior, ...]
     fit_percent: tuple[float, ...]
-    first_stage: Identification
 
     @property
     def finding(self) -> Finding:
@@ -68,19 +64,15 @@ def two_stage(
     records: Sequence[Record],
     options: IdentOptions | None = None,
     embedding: EmbeddingOptions | None = None,
-    *,
-    shared: bool = False,
 ) -> TwoStage:
     """Van den Hof and Schrama (Automatica 29(6), 1993): turn r -> u -> y into an open-loop problem.
 
     The sensitivity r -> u is identified first (direct term on, no integrators or delay, whatever `options`
     say about the plant), the records' inputs are replaced by its simulation from rest, which the noise does
-    not touch. With shared = False each record gets its own sensitivity on common poles: the error of S_hat
-    then differs between records and shows in their scatter, so `combine_posteriors` over the records accounts
-    for it. With shared = True one sensitivity serves all, which is more accurate, but its error
-    (`relative_error`) is common and in no bound of the second stage: where the loop gain is large those
-    bounds do not cover. With a single record and a known feedback use `indirect`, whose bounds do. Raises
-    ValueError when a record has not exactly one reference and input.
+    not touch. Each record gets its own sensitivity on common poles: the error of S_hat then differs between
+    records and shows in their scatter, so `combine_posteriors` over the records accounts for it; no bound of
+    a single second stage does (`relative_error`). Raises ValueError when a record has not exactly one
+    reference and input.
     """
     plant_options = options or IdentOptions()
     stage = plant_options.model_copy(
@@ -88,41 +80,14 @@ def two_stage(
     )
     closed = [_reference_to_input(record) for record in records]
     first = identify(closed, stage)
-    if shared:
-        sensitivities = [tangent(closed, first.model, embedding)] * len(closed)
-    else:
-        sensitivities = [tangent([record], first.model, embedding) for record in closed]
+    sensitivities = [tangent([record], first.model, embedding) for record in closed]
     opened, fits = [], []
     for record, sensitivity in zip(records, sensitivities, strict=True):
         u, u_hat = record.input[:, 0], sensitivity.simulate(_reference(record))
         spread = float(np.linalg.norm(u - u.mean()))
         fits.append(100 * (1 - float(np.linalg.norm(u - u_hat)) / spread))
         opened.append(replace(record, input=u_hat[:, None], reference=None, reference_names=()))
-    return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits), first)
-
-
-def indirect(
-    closed_loop: FrequencyUncertainty, reference_gain: float, feedback_gain: float
-) -> FrequencyUncertainty:
-    """Plant from the closed-loop response T (r -> y) under u = reference_gain r - feedback_gain y.
-
-    G = T / (a - g T); dG/dT = a / (a - g T)^2 turns and scales each ellipse (first order: good while the
-    ellipse is small against |a - g T|). Raises ValueError where a - g T is within its own ellipse of zero.
-    """
-    rest = reference_gain - feedback_gain * closed_loop.centre
-    lost = np.abs(rest) <= abs(feedback_gain) * closed_loop.enclosing_radius()
-    if np.any(lost):
-        at = closed_loop.omega_rad_s[int(np.argmax(lost))]
-        raise ValueError(
-            f"at omega = {at:.6g} rad/s the closed loop tells nothing about the plant: a - g T may be zero"
-        )
-    turn = factor_matrices(reference_gain / rest**2)
-    return replace(
-        closed_loop,
-        centre=closed_loop.centre / rest,
-        covariance=turn @ closed_loop.covariance @ turn.transpose(0, 2, 1),
-        method=f"{closed_loop.method}, indirect",
-    )
+    return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits))
 
 
 def _reference(record: Record) -> RealArray:

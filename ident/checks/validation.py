@@ -1,21 +1,19 @@
-"""Does the model hold on other data? Fit on fresh records, invalidation by a response, repeat scatter."""
+"""Does the model hold on other data? Fit on fresh records, repeat scatter."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import binom, chi2
+from scipy.stats import chi2
 
 from ident.basis.functions import nuisance_columns
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, lock
-from ident.data.ellipses import chi2_radius
-from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
@@ -74,61 +72,6 @@ def fit_on_fresh_data(
         simulated = simulated + nuisance @ coefficients
     residual = y - simulated
     return FreshFit(record.name, 100 * (1 - float(np.linalg.norm(residual)) / spread), simulated, residual)
-
-
-@dataclass(frozen=True, eq=False)
-class Invalidation:
-    """Comparison of a predicted and a measured response, both with covariances.
-
-    distance (F,): length of the difference in units of the ellipse of both covariances together at `level` (1
-    = on its boundary).
-    """
-
-    omega_rad_s: RealArray
-    distance: RealArray
-    level: float
-
-    def __post_init__(self) -> None:
-        lock(self, "omega_rad_s", "distance")
-
-    @property
-    def probability(self) -> RealArray:
-        """(F,) of a difference as large if the prediction holds."""
-        return np.asarray(chi2.sf((self.distance * chi2_radius(self.level)) ** 2, 2))
-
-    @property
-    def joint_probability(self) -> float:
-        """That of the least probable difference among F independent frequencies."""
-        least = min(float(self.probability.min()), 1 - 1e-16)
-        return float(-np.expm1(self.distance.size * np.log1p(-least)))
-
-    @property
-    def finding(self) -> Finding:
-        """Invalidated where the joint probability is below 1 - level; by chance no more than `expected`
-        frequencies lie outside, at that level."""
-        n = self.distance.size
-        return finding(
-            FindingKind.INVALIDATION,
-            invalidated=self.joint_probability < 1 - self.level,
-            level=self.level,
-            n=n,
-            outside=int(np.count_nonzero(self.distance > 1)),
-            expected=int(binom.ppf(self.level, n, 1 - self.level)),
-            worst_rad_s=self.omega_rad_s[np.argmax(self.distance)],
-            worst_distance=self.distance.max(),
-        )
-
-
-def invalidate(predicted: FrequencyUncertainty, measured: FrequencyUncertainty) -> Invalidation:
-    """Does a new record's empirical response leave the predicted ellipses, where, and how improbable is that?
-
-    Both on one grid (`posterior.at(measured.omega_rad_s)`), errors independent; the level is that of
-    `predicted`. Raises ValueError when the grids differ.
-    """
-    if not np.array_equal(predicted.omega_rad_s, measured.omega_rad_s):
-        raise ValueError("predicted and measured responses are on different frequency grids")
-    both = replace(predicted, covariance=predicted.covariance + measured.covariance)
-    return Invalidation(both.omega_rad_s, both.normalised_distance(measured.centre), both.level)
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,6 @@ class FindingKind(Enum):
     NOT_WHITE = auto()
     NOT_INDEPENDENT = auto()
     CHI_SQUARE = auto()
-    INVALIDATION = auto()
     # Records made in closed loop.
     TWO_STAGE = auto()
     UNEXPLAINED_INPUT = auto()

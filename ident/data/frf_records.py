@@ -82,8 +82,7 @@ class FrfRepeats:
         """Plant responses from those of the closed loop r -> y under u = reference_gain r - feedback_gain y.
 
         G = T / (a - g T) point by point, so that repeats keep their own, bent distribution where 1 - g T / a
-        is small; `ident.closed_loop.indirect` maps ellipses, to first order. Raises ValueError where a - g T
-        is zero.
+        is small. Raises ValueError where a - g T is zero.
         """
         rest = reference_gain - feedback_gain * self.response
         if np.any(rest == 0):

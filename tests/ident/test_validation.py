@@ -1,4 +1,4 @@
-"""Fresh-data fit, invalidation and repeat scatter on systems whose answer is known."""
+"""Fresh-data fit and repeat scatter on systems whose answer is known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.checks.validation import fit_on_fresh_data, invalidate, repeat_scatter
+from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from tests.ident.benchmark_plants import as_record
@@ -61,33 +61,6 @@ def estimate(rng, centre, sd):
     noise = sd * (rng.standard_normal(OMEGA.size) + 1j * rng.standard_normal(OMEGA.size))
     covariance = np.broadcast_to(sd**2 * np.eye(2), (OMEGA.size, 2, 2))
     return FrequencyUncertainty(OMEGA, centre + noise, covariance, DT)
-
-
-def test_invalidation_alarms_at_its_level_and_finds_a_change():
-    truth = 1 / (1 + 0.1j * OMEGA)
-    alarms = 0
-    for seed in range(300):
-        rng = np.random.default_rng(seed)
-        same = invalidate(estimate(rng, truth, 0.01), estimate(rng, truth, 0.02))
-        alarms += same.finding.values["invalidated"]
-    # 5 % of 300 is 15, sd 3.8; 4 of those.
-    assert abs(alarms - 15) <= 15
-    rng = np.random.default_rng(1000)
-    changed = truth + 0.2 * (np.abs(OMEGA - 50) < 3)
-    report = invalidate(estimate(rng, truth, 0.01), estimate(rng, changed, 0.02))
-    found = report.finding.values
-    assert found["invalidated"]
-    assert found["worst_rad_s"] == pytest.approx(50, abs=3)
-    assert found["outside"] >= 3
-    same = invalidate(estimate(rng, truth, 0.01), estimate(rng, truth, 0.02))
-    assert not same.finding.values["invalidated"]
-
-
-def test_invalidation_needs_one_grid():
-    rng = np.random.default_rng(3)
-    other = FrequencyUncertainty(OMEGA + 0.1, np.ones(60), np.zeros((60, 2, 2)), DT)
-    with pytest.raises(ValueError, match="different frequency grids"):
-        invalidate(estimate(rng, 1.0, 0.1), other)
 
 
 def test_repeat_scatter_ratio_is_one_for_honest_bounds_and_shows_dishonest_ones():

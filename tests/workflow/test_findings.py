@@ -64,7 +64,6 @@ VALUES = {
     "degrees_of_freedom": 224,
     "expected_low": 178.0,
     "expected_high": 276.12,
-    "invalidated": False,
     "n": 60,
     "outside": 9,
     "expected": 6,
@@ -123,7 +122,6 @@ OTHERWISE = {
     "NOT_PERIODIC": [{"from_Hz": 0.0, "to_Hz": 0.0}],
     "REPEATED": [{"n_amplitudes": 1}],
     "AMPLITUDE_EFFECT": [{"shift_percent": 0.65, "gain_percent": 0.0}, {"gain_percent": -5.6}],
-    "INVALIDATION": [{"invalidated": True}, {"outside": 2}],
 }
 
 
