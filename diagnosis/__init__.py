@@ -1,32 +1,7 @@
 """Why simulation and machine differ: which unmodelled effect, how sure, how far the gap shrinks with it."""
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from diagnosis.answer import Diagnosis, NamedEffect
-    from diagnosis.diagnosis import diagnose
-    from diagnosis.fit.residual import ResidualModel, pooled_rms
-    from diagnosis.machine.case import Case, Experiment
-    from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
-    from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
-    from diagnosis.machine.with_effects import with_effects
-
-__all__ = [
-    "Case",
-    "Diagnosis",
-    "EffectParameter",
-    "Experiment",
-    "NamedEffect",
-    "Plant",
-    "PlantCase",
-    "PlantEffect",
-    "PlantExperiment",
-    "ResidualModel",
-    "diagnose",
-    "pooled_rms",
-    "with_effects",
-]
+from typing import Any
 
 _MODULES = {
     "answer": ("Diagnosis", "NamedEffect"),
@@ -38,6 +13,7 @@ _MODULES = {
     "machine.with_effects": ("with_effects",),
 }
 _WHERE = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_WHERE)
 
 
 def __getattr__(name: str) -> Any:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import diagnosis
-from diagnosis import Case, Experiment
+from diagnosis import answer
+from diagnosis import diagnosis as chain
+from diagnosis.machine.case import Case, Experiment
 from flexlink.shown import Shown, dressed
 
 __all__ = ["Case", "Diagnosis", "Experiment", "diagnose"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Shown, diagnosis.Diagnosis):
+class Diagnosis(Shown, answer.Diagnosis):
     """What `diagnose` found, see there: `flexlink.Diagnosis` is `diagnosis.Diagnosis` that shows itself."""
 
 
@@ -34,4 +35,4 @@ def diagnose(case: Any, **more: Any) -> Diagnosis:
     >>> found.verdict, found.effects[0].name
     ('effect', 'coulomb_friction')
     """
-    return dressed(Diagnosis, diagnosis.diagnose(case, **more))
+    return dressed(Diagnosis, chain.diagnose(case, **more))

@@ -10,17 +10,15 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-import control_design
-from control_design import (
-    Controller,
-    LinearMachine,
-    RationalWeight,
-    SampledMachine,
-    Specification,
-    SynthesisOptions,
-    c_source,
-    step_metrics,
-)
+from control_design.analysis import certificate, closed_loop
+from control_design.analysis.closed_loop import LinearMachine, SampledMachine, step_metrics
+from control_design.controllers.c_code import c_source
+from control_design.controllers.controller import Controller
+from control_design.plants import plant_set
+from control_design.plants.weights import RationalWeight
+from control_design.specification import Specification
+from control_design.synthesis import synthesis, synthesis_result
+from control_design.synthesis.synthesis_options import SynthesisOptions
 from flexlink.models import Uncertainty
 from flexlink.shown import Shown, dressed
 
@@ -41,7 +39,7 @@ __all__ = [
 ]
 
 
-class UncertainPlant(Shown, control_design.UncertainPlant):
+class UncertainPlant(Shown, plant_set.UncertainPlant):
     """What a controller is designed for: a nominal state space and the ellipses around its response.
 
     plant : Uncertainty, or control.StateSpace, or a model with `to_control()`
@@ -77,10 +75,10 @@ class UncertainPlant(Shown, control_design.UncertainPlant):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SynthesisResult(Shown, control_design.SynthesisResult):
+class SynthesisResult(Shown, synthesis_result.SynthesisResult):
     """What `synthesise` found, and what was asked of it."""
 
-    plants: tuple[control_design.UncertainPlant, ...] = ()
+    plants: tuple[plant_set.UncertainPlant, ...] = ()
     specification: Specification = field(default_factory=Specification)
 
     def to_control(self) -> control.StateSpace:
@@ -89,21 +87,21 @@ class SynthesisResult(Shown, control_design.SynthesisResult):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Certificate(Shown, control_design.Certificate):
+class Certificate(Shown, certificate.Certificate):
     """What `certify` checked, and on what."""
 
     controller: Controller | None = None
-    uncertain_plants: tuple[control_design.UncertainPlant, ...] = ()
+    uncertain_plants: tuple[plant_set.UncertainPlant, ...] = ()
     specification: Specification = field(default_factory=Specification)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LoopRun(Shown, control_design.ClosedLoopTrajectory):
+class LoopRun(Shown, closed_loop.ClosedLoopTrajectory):
     """A closed loop in time, from `simulate_loop`."""
 
 
 def synthesise(
-    plants: control_design.UncertainPlant | Sequence[control_design.UncertainPlant],
+    plants: plant_set.UncertainPlant | Sequence[plant_set.UncertainPlant],
     specification: Specification,
     options: SynthesisOptions | None = None,
     *,
@@ -123,13 +121,13 @@ def synthesise(
     """
     chosen = _several(plants)
     generator = np.random.default_rng(rng)
-    result = control_design.synthesise(chosen, specification, options, rng=generator, **more)
+    result = synthesis.synthesise(chosen, specification, options, rng=generator, **more)
     return dressed(SynthesisResult, result, plants=chosen, specification=specification)
 
 
 def certify(
     controller: Controller | SynthesisResult,
-    plants: control_design.UncertainPlant | Sequence[control_design.UncertainPlant] | None = None,
+    plants: plant_set.UncertainPlant | Sequence[plant_set.UncertainPlant] | None = None,
     specification: Specification | None = None,
     **more: Any,
 ) -> Certificate:
@@ -150,7 +148,7 @@ def certify(
     if plants is None or specification is None:
         raise ValueError("certify needs plants and a specification beside a controller")
     chosen = _several(plants)
-    found = control_design.certify(controller, chosen, specification, **more)
+    found = certificate.certify(controller, chosen, specification, **more)
     return dressed(
         Certificate, found, controller=controller, uncertain_plants=chosen, specification=specification
     )
@@ -169,13 +167,13 @@ def simulate_loop(controller: Controller, machine: Any, reference: npt.ArrayLike
     >>> abs(flexlink.step_metrics(run).steady_error) < 1e-3
     True
     """
-    if isinstance(machine, control_design.UncertainPlant):
+    if isinstance(machine, plant_set.UncertainPlant):
         machine = machine.nominal
     chosen: SampledMachine = LinearMachine(machine) if isinstance(machine, control.StateSpace) else machine
-    return dressed(LoopRun, control_design.simulate(controller, chosen, reference, **more))
+    return dressed(LoopRun, closed_loop.simulate(controller, chosen, reference, **more))
 
 
 def _several(
-    plants: control_design.UncertainPlant | Sequence[control_design.UncertainPlant],
-) -> tuple[control_design.UncertainPlant, ...]:
-    return (plants,) if isinstance(plants, control_design.UncertainPlant) else tuple(plants)
+    plants: plant_set.UncertainPlant | Sequence[plant_set.UncertainPlant],
+) -> tuple[plant_set.UncertainPlant, ...]:
+    return (plants,) if isinstance(plants, plant_set.UncertainPlant) else tuple(plants)

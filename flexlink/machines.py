@@ -9,17 +9,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-import plant
 from flexlink.models import Record
 from flexlink.shown import Shown, dressed
-from plant import Rig, SampledArm, multisine, paper_link, parse_effect, prbs
-from plant.effects import Effect
+from plant import simulation
+from plant.effects import Effect, parse_effect
+from plant.excitation import multisine, prbs
+from plant.presets import paper_link
+from plant.rig import Rig
+from plant.simulation import SampledArm
 
 __all__ = ["Rig", "SampledArm", "Simulation", "effect", "multisine", "paper_link", "prbs", "simulate"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Simulation(Shown, plant.Trajectory):
+class Simulation(Shown, simulation.Trajectory):
     """A simulated experiment: `plant.Trajectory`, and the record that an identification takes."""
 
     @property
@@ -28,8 +31,8 @@ class Simulation(Shown, plant.Trajectory):
 
     def record(self, output: str = "hub_angle_rad", name: str = "simulated") -> Record:
         """Voltage and one measured output, `hub_angle_rad` or `tip_m`, as a `Record`."""
-        if output not in plant.SampledArm.output_names:
-            raise ValueError(f"no output {output!r}; there are {', '.join(plant.SampledArm.output_names)}")
+        if output not in SampledArm.output_names:
+            raise ValueError(f"no output {output!r}; there are {', '.join(SampledArm.output_names)}")
         return Record(
             self.voltage_V, getattr(self, output), self.dt_s,
             name=name, input_names=("voltage_V",), output_names=(output,),
@@ -67,5 +70,5 @@ def simulate(
     >>> arm.record("tip_m").output.shape
     (500, 1)
     """
-    result = plant.simulate(rig, voltage_V, effects, rng=rng, **settings)
+    result = simulation.simulate(rig, voltage_V, effects, rng=rng, **settings)
     return dressed(Simulation, result)

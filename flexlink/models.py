@@ -10,14 +10,20 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ValidationError
 
-import ident
 from flexlink.shown import Shown, dressed
-from ident import GobfModel, IdentOptions, Poles, band_limited, identify_frf, identify_miso
 from ident.basis import posterior
-from ident.basis.options import EmbeddingOptions
+from ident.basis.model import GobfModel
+from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident.basis.poles import Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
+from ident.data.record import Record as PlainRecord
+from ident.data.signal_filter import band_limited
+from ident.frequency_fit import identify_frf
+from ident.identification import Identification as Identified
+from ident.one_input import identify as identify_records
+from ident.several_inputs import identify_miso
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
@@ -47,7 +53,7 @@ Options = TypeVar("Options", bound=BaseModel)
 _NOMINAL_POINTS = 400
 
 
-class Record(Shown, ident.Record):
+class Record(Shown, PlainRecord):
     """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
 
     u, y : (T,) or (T, n), or a pandas column or table
@@ -139,7 +145,7 @@ def _signals(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification(Shown, ident.Identification):
+class Identification(Shown, Identified):
     """What `identify` found: `ident.Identification` and the records it came from.
 
     Examples
@@ -149,7 +155,7 @@ class Identification(Shown, ident.Identification):
     array([20.])
     """
 
-    records: tuple[ident.Record, ...] = ()
+    records: tuple[PlainRecord, ...] = ()
 
     def to_control(self) -> Any:
         """The model as `control.StateSpace`."""
@@ -190,7 +196,7 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
 
 
 def identify(
-    records: ident.Record | Sequence[ident.Record], options: IdentOptions | None = None, **settings: Any
+    records: PlainRecord | Sequence[PlainRecord], options: IdentOptions | None = None, **settings: Any
 ) -> Identification:
     """Model of one input and one output, poles searched globally, order chosen from the data unless given.
 
@@ -204,13 +210,13 @@ def identify(
       mode at 20 rad/s (3.18 Hz), damping ratio 0.0499
     """
     chosen = _options(IdentOptions, options, settings)
-    used = (records,) if isinstance(records, ident.Record) else tuple(records)
-    return dressed(Identification, ident.identify(used, chosen), records=used)
+    used = (records,) if isinstance(records, PlainRecord) else tuple(records)
+    return dressed(Identification, identify_records(used, chosen), records=used)
 
 
 def uncertainty(
-    identification: ident.Identification,
-    records: Sequence[ident.Record] | None = None,
+    identification: Identified,
+    records: Sequence[PlainRecord] | None = None,
     options: EmbeddingOptions | None = None,
     **settings: Any,
 ) -> Uncertainty:

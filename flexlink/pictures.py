@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from control_design import Controller, Specification, UncertainPlant
-from diagnosis import Diagnosis
+from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
+from diagnosis.answer import Diagnosis
 from flexlink.design import Certificate, LoopRun, SynthesisResult
 from flexlink.machines import Simulation
-from ident import GobfModel, Identification, Record
+from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
+from ident.identification import Identification
 from ident.uncertainty import ResponsePosterior
 
 if TYPE_CHECKING:

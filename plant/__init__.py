@@ -1,38 +1,7 @@
 """The machine: rig, beam modes, motor, effects, sensors, excitation signals, simulation."""
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from plant.effects import EFFECTS, Effect, parse_effect, parse_effects
-    from plant.excitation import bang_bang, crest_factor, doublet, log_chirp, multisine, multisine_lines, prbs
-    from plant.experiment_plan import ExperimentPlan
-    from plant.modal import linear_arm
-    from plant.presets import paper_link
-    from plant.rig import Rig, parameter_keys
-    from plant.simulation import SampledArm, Trajectory, simulate
-
-__all__ = [
-    "EFFECTS",
-    "Effect",
-    "ExperimentPlan",
-    "Rig",
-    "SampledArm",
-    "Trajectory",
-    "bang_bang",
-    "crest_factor",
-    "doublet",
-    "linear_arm",
-    "log_chirp",
-    "multisine",
-    "multisine_lines",
-    "paper_link",
-    "parameter_keys",
-    "parse_effect",
-    "parse_effects",
-    "prbs",
-    "simulate",
-]
+from typing import Any
 
 _MODULES = {
     "effects": ("EFFECTS", "Effect", "parse_effect", "parse_effects"),
@@ -46,6 +15,7 @@ _MODULES = {
     "simulation": ("SampledArm", "Trajectory", "simulate"),
 }
 _WHERE = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_WHERE)
 
 
 def __getattr__(name: str) -> Any:

@@ -6,11 +6,11 @@ import control
 import numpy as np
 import numpy.typing as npt
 
-from plant import Rig, paper_link
 from plant.beam import clamped_free_modes
 from plant.machine import Machine
 from plant.modal import equations_of_motion
-from plant.rig import Hub, Link, Motor
+from plant.presets import paper_link
+from plant.rig import Hub, Link, Motor, Rig
 
 Real = npt.NDArray[np.float64]
 

@@ -16,7 +16,12 @@ import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
-from plant import Effect, Rig, linear_arm, paper_link, parse_effect, prbs, simulate
+from plant.effects import Effect, parse_effect
+from plant.excitation import prbs
+from plant.modal import linear_arm
+from plant.presets import paper_link
+from plant.rig import Rig
+from plant.simulation import simulate
 from validation.example_arms import paper_example
 from validation.paper.settings import DT_S
 

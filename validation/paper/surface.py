@@ -28,7 +28,7 @@ from ident.one_input import identify
 from ident.search.direct import minimise
 from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.pole_search import PoleSearch
-from plant import prbs
+from plant.excitation import prbs
 from validation.paper.machines import EXAMPLE_SAMPLES, SNR_DB, SimulationExample
 from validation.paper.settings import DT_S, N_PAIRS, N_REAL, PaperSettings
 from workflow.engine.randomness import stage_rng

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationInfo
 
-from plant import Rig, parse_effect
+from plant.effects import parse_effect
 from plant.presets import paper_link
+from plant.rig import Rig
 from workflow.config.settings import resolve
 from workflow.engine import documents
 from workflow.engine.errors import naming, shortened

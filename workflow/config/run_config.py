@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field, model_validator
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.basis.options import IdentOptions
-from plant import ExperimentPlan
+from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.config.excitations import Excitation, Multisine
 from workflow.config.rig_settings import EffectTable, RigChoice

@@ -26,7 +26,9 @@ from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
 from diagnosis.machine.case import Case
-from plant import Effect, Rig, SampledArm
+from plant.effects import Effect
+from plant.rig import Rig
+from plant.simulation import SampledArm
 from workflow.diagnose.linear_machine import sampled_linear_machine
 from workflow.engine import codec
 from workflow.tasks.loop_sensitivity import plan_sensitivity, rms_of, settling_samples

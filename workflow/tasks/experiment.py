@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from plant import ExperimentPlan, Rig, crest_factor, linear_arm
+from plant.excitation import crest_factor
+from plant.experiment_plan import ExperimentPlan
+from plant.modal import linear_arm
+from plant.rig import Rig
 from workflow.config.rig_settings import PRESETS, read_rig
 from workflow.engine.errors import InputError
 
@@ -111,7 +114,9 @@ def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
     """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
     rig, gain = limits.rig, limits.gain_rad_per_Vs
     if rig is not None:
-        from plant import simulate  # takes a second to load: limits that are refused do not need it
+        from plant.simulation import (
+            simulate,  # takes a second to load: limits that are refused do not need it
+        )
 
         return lambda voltage: simulate(rig, voltage, dt_s=limits.dt_s).hub_angle_true_rad
     if gain is not None:

@@ -19,9 +19,10 @@ from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
-from plant import EFFECTS, Rig, parse_effect
-from plant import simulate as simulate_arm
+from plant.effects import EFFECTS, parse_effect
 from plant.machine import Machine
+from plant.rig import Rig
+from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw

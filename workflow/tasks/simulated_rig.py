@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.data.record import Record
-from plant import Rig, SampledArm, parse_effect, simulate
+from plant.effects import parse_effect
+from plant.rig import Rig
+from plant.simulation import SampledArm, simulate
 from workflow.config.rig_settings import PRESETS, read_rig
 from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedRecord, SimulatedSource
 from workflow.engine.randomness import stage_rng

@@ -13,8 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ident.checks.plausible_modes import LARGEST_DAMPING
-from plant import parse_effect
-from plant.effects import make_machine
+from plant.effects import make_machine, parse_effect
 from plant.modal import default_n_modes, equations_of_motion
 from workflow.config.run_config import SimulatedSource
 from workflow.config.settings import Section, check
