@@ -7,7 +7,7 @@ from types import MappingProxyType
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_voltage
-from plant.effects.search_space import Candidate, Scales, geometric, log_axis
+from plant.effects.search_space import Sought
 from plant.machine import Machine
 
 
@@ -19,16 +19,12 @@ class InputDelay(Effect):
     words = "a delay of the command"
     group = "actuator"
     adds_to = "sampling.transport_delay_s"
+    sought = Sought((2e-4, 100), (0.04, 30, 14), "dt_s")
 
     delay_s: NotNegative = Field(le=60.0, description="delay of the voltage; every sample of it is stored")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, delay_s=machine.voltage.delay_s + self.delay_s)
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        dt = scales.dt_s
-        return (cls._size(log_axis("delay_s", 2e-4 * dt, 100 * dt), geometric(0.04 * dt, 30 * dt, 14)),)
 
 
 @register
@@ -54,16 +50,12 @@ class ActuatorDeadZone(Effect):
     words = "a dead zone of the actuator"
     group = "actuator"
     dependence = "continuous"
+    sought = Sought((1e-5, 1), (1e-3, 0.5, 12), "voltage_V", 1e-4)
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, dead_zone_V=machine.voltage.dead_zone_V + self.width_V)
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        V = scales.voltage_V
-        return (cls._size(log_axis("width_V", 1e-5 * V, V, 1e-4), geometric(1e-3 * V, 0.5 * V, 12)),)
 
 
 @register
@@ -75,17 +67,12 @@ class ActuatorSaturation(Effect):
     group = "actuator"
     neutral = MappingProxyType({"limit_V": 1e6})
     dependence = "continuous"
+    sought = Sought((0.05, 1), (0.1, 0.99, 24), "voltage_V", 1e-4, grows=False)
 
     limit_V: Positive = Field(description="largest voltage the driver delivers")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, limit_V=min(machine.voltage.limit_V, self.limit_V))
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        V = scales.voltage_V
-        axis = log_axis("limit_V", 0.05 * V, V, 1e-4)
-        return (cls._size(axis, geometric(0.1 * V, 0.99 * V, 24), grows=False),)
 
 
 @register
@@ -95,14 +82,9 @@ class ActuatorLag(Effect):
     id = "actuator_lag"
     words = "a lag of the actuator"
     group = "actuator"
+    sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, lag_s=self.time_constant_s)
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        dt = scales.dt_s
-        axis = log_axis("time_constant_s", 2e-4 * dt, 200 * dt)
-        return (cls._size(axis, geometric(0.02 * dt, 40 * dt, 10)),)

@@ -18,6 +18,7 @@ from plant.effects.search_space import (
     EffectKind,
     Harmonic,
     Scales,
+    Sought,
     log_axis,
 )
 from plant.machine import Machine, SmoothTorque
@@ -59,6 +60,7 @@ class Effect(BaseModel, ABC):
     adds_to : str or None. Key of the stated value that it adds to.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     absolute_angle : bool. It depends on the true hub angle: where an encoder has its zero matters.
+    sought : Sought or None. Where to look for its only parameter; others have `candidates` of their own.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -76,6 +78,7 @@ class Effect(BaseModel, ABC):
     adds_to: ClassVar[str | None] = None
     contains: ClassVar[str | None] = None
     absolute_angle: ClassVar[bool] = False
+    sought: ClassVar[Sought | None] = None
 
     @abstractmethod
     def modify(self, machine: Machine) -> Machine:
@@ -84,7 +87,10 @@ class Effect(BaseModel, ABC):
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
         """Where to look for the effect; none for one that no fit can find."""
-        return ()
+        if cls.sought is None:
+            return ()
+        (parameter,) = cls.model_fields
+        return (cls._size(*cls.sought.at(parameter, scales), grows=cls.sought.grows),)
 
     @classmethod
     def from_search(cls, values: Mapping[str, float], sign: int) -> Self:

@@ -21,7 +21,7 @@ from plant.effects.base import (
     with_parameters,
     with_torque,
 )
-from plant.effects.search_space import PHASE, Axis, Candidate, Scales, geometric, log_axis
+from plant.effects.search_space import PHASE, Axis, Candidate, Scales, Sought, geometric, log_axis
 from plant.machine import CUBIC, SINE, Disturbance, DryFriction, Machine, SmoothTorque, TorsionSpring
 from plant.modal import static_moment_kg_m
 from plant.rig import Rig
@@ -42,18 +42,13 @@ class CoulombFriction(Effect):
     group = "joint"
     friction = True
     dependence = "continuous"
+    sought = Sought((1e-5, 1), (3e-4, 0.6, 14), "torque_Nm", 1e-3)
 
     torque_Nm: float = Field(ge=0, le=_LARGEST_LEVEL_NM, description="friction level Tc")
 
     def modify(self, machine: Machine) -> Machine:
         friction = DryFriction(self.torque_Nm, self.torque_Nm, 1.0)
         return with_joint(machine, friction=(*machine.joint.friction, friction))
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        tau = scales.torque_Nm
-        axis = log_axis("torque_Nm", 1e-5 * tau, tau, 1e-3)
-        return (cls._size(axis, geometric(3e-4 * tau, 0.6 * tau, 14)),)
 
 
 @register
@@ -327,12 +322,9 @@ class Backlash(Effect):
     group = "joint"
     neutral = None  # without a gap the contact is still elastic
     dependence = "non-smooth"
+    sought = Sought((1e-5, 0.5), (3e-4, 0.2, 30), step=5e-3)
 
     gap_rad: Positive = Field(description="total gap")
 
     def modify(self, machine: Machine) -> Machine:
         return with_joint(machine, backlash_gap_rad=self.gap_rad)
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        return (cls._size(log_axis("gap_rad", 1e-5, 0.5, 5e-3), geometric(3e-4, 0.2, 30)),)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_parameters
-from plant.effects.search_space import Candidate, Scales, geometric, log_axis
+from plant.effects.search_space import Sought
 from plant.machine import Machine
 
 
@@ -19,16 +19,12 @@ class TipPayload(Effect):
     words = "an additional mass at the tip"
     group = "link"
     adds_to = "payload.mass_kg"
+    sought = Sought((1e-6, 5), (1e-4, 1.5, 14), "link_mass_kg")
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
 
     def modify(self, machine: Machine) -> Machine:
         return with_parameters(machine, {"payload.mass_kg": machine.rig.payload.mass_kg + self.mass_kg})
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        m = scales.link_mass_kg
-        return (cls._size(log_axis("mass_kg", 1e-6 * m, 5 * m), geometric(1e-4 * m, 1.5 * m, 14)),)
 
 
 @register
@@ -69,12 +65,9 @@ class Gravity(Effect):
     group = "link"
     environment = True
     absolute_angle = True
+    sought = Sought((1e-4, 20), (1e-3, 10, 12))
 
     acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
 
     def modify(self, machine: Machine) -> Machine:
         return replace(machine, gravity_m_s2=machine.gravity_m_s2 + self.acceleration_m_s2)
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        return (cls._size(log_axis("acceleration_m_s2", 1e-4, 20.0), geometric(1e-3, 10.0, 12)),)

@@ -208,3 +208,26 @@ class Scales:
     def tolerance(self, key: str | None) -> float:
         """Relative standard deviation of a stated value, 0 where it is exact."""
         return 0.0 if key is None else self.rig.tolerances.get(key, 0.0)
+
+
+@dataclass(frozen=True)
+class Sought:
+    """Where to look for a single size, larger where the effect is (unless not `grows`).
+
+    ends: of its range, starts: (first, last, count), both in the `Scales` called unit, or as they are. step:
+    see `Axis`.
+    """
+
+    ends: tuple[float, float]
+    starts: tuple[float, float, int]
+    unit: Literal["dt_s", "voltage_V", "torque_Nm", "link_mass_kg"] | None = None
+    step: float = 1e-5
+    grows: bool = True
+
+    def at(self, parameter: str, scales: Scales) -> tuple[Axis, list[float]]:
+        """Axis of the parameter, and values to start from."""
+        one = 1.0 if self.unit is None else getattr(scales, self.unit)
+        (low, high), (first, last, count) = self.ends, self.starts
+        return log_axis(parameter, low * one, high * one, self.step), geometric(
+            first * one, last * one, count
+        )

@@ -8,7 +8,7 @@ from typing import Self
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_sensor
-from plant.effects.search_space import Candidate, Scales, geometric, log_axis
+from plant.effects.search_space import Candidate, Scales, Sought, geometric, log_axis
 from plant.machine import Machine
 
 
@@ -73,14 +73,9 @@ class SensorLag(Effect):
     id = "sensor_lag"
     words = "a lag of the tip sensor"
     group = "sensor"
+    sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")
 
     def modify(self, machine: Machine) -> Machine:
         return with_sensor(machine, lag_s=self.time_constant_s)
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        dt = scales.dt_s
-        axis = log_axis("time_constant_s", 2e-4 * dt, 200 * dt)
-        return (cls._size(axis, geometric(0.02 * dt, 40 * dt, 10)),)
