@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.harness import Print, main, reading, timed
+from benchmarks.offset_disc import offset_disc_radius
 from benchmarks.p2_plants import Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
-from ident.uncertainty import FrequencyUncertainty, offset_disc_radius
+from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.embedding import classical, tangent
 from ident.uncertainty.nominal import nominal_near
 from tests.ident.benchmark_plants import DT_S, Truth

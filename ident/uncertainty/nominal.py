@@ -22,8 +22,8 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
     Coefficients (and the direct term, where the posterior has one) minimise the sum over omega (F,)
     of e^T P^-1 e, e the error of (Re, Im) and P the posterior covariance. Integrators and delay are the
     posterior's. Take the posterior's own poles for the closest model, half of them for a low order; then
-    `posterior.at(omega).normalised_distance(...)` tells how far the nominal is off, and `offset_disc_radius`
-    what to add. Raises ValueError when omega has too few frequencies for the coefficients.
+    `posterior.at(omega).normalised_distance(...)` tells how far the nominal is off. Raises ValueError when
+    omega has too few frequencies for the coefficients.
     """
     uncertainty = posterior.at(omega_rad_s)
     direct = posterior.has_feedthrough

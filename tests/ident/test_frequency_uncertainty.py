@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ncx2
 
-from ident.data.ellipses import offset_disc_radius
+from benchmarks.offset_disc import offset_disc_radius
 from ident.data.frf_records import FrfRepeats
 from ident.uncertainty import FrequencyUncertainty
 
