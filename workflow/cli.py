@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="flexlink",
     help="From a flexible-link arm and its logs to a robust controller with a certificate.",
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # markup would swallow every [unit], [section] and [default] in the help
     epilog="Exit codes: 0 done; 1 internal error; 2 something given is wrong (one line says what and where); "
@@ -95,10 +95,11 @@ def run(
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config)
-    from workflow.commands.run import run_from_files
     from workflow.console import TerminalProgress
 
     with TerminalProgress(quiet=quiet) as progress:
+        from workflow.commands.run import run_from_files  # a word comes first: it takes its time to load
+
         summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
     _show(summary, as_json)
     _leave(summary)
@@ -389,10 +390,11 @@ def design(
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
     need(*source, specification)
-    from workflow.commands.design import design_controller
     from workflow.console import TerminalProgress
 
     with TerminalProgress(quiet=quiet) as progress:
+        from workflow.commands.design import design_controller
+
         summary = design_controller(source, specification, out=out, seed=seed, progress=progress)
     _show(summary, as_json)
     _leave(summary)
@@ -427,9 +429,10 @@ def study(
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
     need(config)
     from workflow.console import TerminalProgress
-    from workflow.study.run import run_study
 
     with TerminalProgress(quiet=quiet) as progress:
+        from workflow.study.run import run_study
+
         summary = run_study(
             config, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
         )
@@ -479,9 +482,10 @@ def diagnose(
     if len(case) == 1:
         read_case_file(case[0])  # before what diagnoses is loaded, which takes seconds
     from workflow.console import TerminalProgress
-    from workflow.diagnose.command import diagnose_cases
 
     with TerminalProgress(quiet=quiet) as progress:
+        from workflow.diagnose.command import diagnose_cases
+
         found = diagnose_cases(
             case,
             out,

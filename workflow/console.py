@@ -6,12 +6,13 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 from rich.table import Column, Table
 
 from workflow.engine import progress
@@ -21,29 +22,31 @@ if TYPE_CHECKING:
     from workflow.tasks.summary import RunSummary
 
 
-LINE_EVERY_S = 10.0
+FIRST_LINE_S, LINE_EVERY_S = 0.4, 10.0
+COMPILING_S = 20.0  # all kernels that one command needs, the first time
+# So much work as expected is taken for granted before the speed of this machine counts.
+_PRIOR_S = 10.0
 
 
 class TerminalProgress(progress.Progress):
-    """Progress with remaining time on standard error: a bar, or, where that is no terminal, a line every ten
-    seconds; nothing with `quiet`. Use as a context manager."""
+    """Progress with remaining time on standard error: a bar, or, where that is no terminal, a line at once
+    and every ten seconds; nothing with `quiet`. Use as a context manager."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         console = Console(stderr=True)
-        self._lines = not quiet and not console.is_terminal
-        self._doing, self._share, self._began_s = "", 0.0, time.monotonic()
-        self._over = threading.Event()
+        self._quiet, self._lines = quiet, not quiet and not console.is_terminal
+        self._began_s, self._compiled_s, self._worked_s = time.monotonic(), 0.0, 0.0
+        self._over, self._watching = threading.Event(), ExitStack()
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
             BarColumn(bar_width=30),
-            TextColumn("{task.percentage:>3.0f} %"),
-            TimeRemainingColumn(compact=True),
+            TextColumn("{task.percentage:>3.0f} %{task.fields[left]}"),
             console=console,
             transient=True,
             disable=quiet or not console.is_terminal,
         )
-        self._task: TaskID | None = None
+        self._doing, self._task = "starting", self._bar.add_task("starting", total=1.0, left="")
         self._expected: dict[str, float] = {}
         self._done_s = 0.0
 
@@ -57,35 +60,76 @@ class TerminalProgress(progress.Progress):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._over.set()
+        self._watching.close()
         self._bar.stop()
 
     def _tell(self) -> None:
-        while not self._over.wait(LINE_EVERY_S):
-            spent_s = time.monotonic() - self._began_s
-            line = f"flexlink: {spent_s:.0f} s: {printable(self._doing) or 'starting'}"
-            if self._share > 0.02:  # less says nothing about the whole
-                left_s = spent_s * (1 - self._share) / self._share
-                line += f" ({100 * self._share:.0f} %, about {left_s:.0f} s left)"
-            print(line, file=sys.stderr, flush=True)  # noqa: T201
+        pause_s = FIRST_LINE_S
+        while not self._over.wait(pause_s):
+            spent_s, pause_s = time.monotonic() - self._began_s, LINE_EVERY_S
+            self._say(f"{spent_s:.0f} s: {printable(self._doing)}{self._ahead()}")
+
+    def _say(self, line: str) -> None:
+        if self._lines:
+            print(f"flexlink: {line}", file=sys.stderr, flush=True)  # noqa: T201
+        elif not self._quiet:
+            self._bar.console.print(f"  {line}", highlight=False)
+
+    def _ahead(self) -> str:
+        """Share done and time left. What compiled is no sign of slowness, but more of it is to come."""
+        total_s = sum(self._expected.values())
+        if not total_s or self._worked_s < 0.02 * total_s:  # less says nothing about the whole
+            return ""
+        spent_s = time.monotonic() - self._began_s - self._compiled_s
+        slowness = (spent_s + _PRIOR_S) / (self._worked_s + _PRIOR_S)
+        left_s = (total_s - self._worked_s) * slowness
+        if self._compiled_s:
+            left_s += max(COMPILING_S - self._compiled_s, 0.0)
+        return f" ({100 * self._worked_s / total_s:.0f} %, about {left_s:.0f} s left)"
+
+    def _watch_compiler(self) -> None:
+        """Compiling is told when it begins, and its time kept apart."""
+        from numba.core import event
+
+        class Watch(event.Listener):
+            depth, began_s = 0, 0.0
+
+            def on_start(watch, event: object) -> None:  # noqa: N805
+                if watch.depth == 0:
+                    watch.began_s = time.monotonic()
+                    if not self._compiled_s:
+                        self._say(f"compiling, once after installing (about {COMPILING_S:.0f} s in all)")
+                watch.depth += 1
+
+            def on_end(watch, event: object) -> None:  # noqa: N805
+                watch.depth -= 1
+                if watch.depth == 0:
+                    self._compiled_s += time.monotonic() - watch.began_s
+
+        self._watching.enter_context(event.install_listener("numba:compile", Watch()))
 
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
         self._expected = dict(stages)
-        self._task = self._bar.add_task("", total=sum(self._expected.values()) or 1.0)
+        self._bar.update(self._task, total=sum(self._expected.values()) or 1.0)
+        self._watch_compiler()
 
     def start(self, stage: str) -> None:
         self.update(stage, 0.0)
 
     def update(self, stage: str, fraction: float, message: str = "") -> None:
-        if self._task is not None:
-            done = self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0)
-            total = sum(self._expected.values()) or 1.0
-            self._doing, self._share = f"{stage}: {message}" if message else stage, done / total
-            self._bar.update(self._task, completed=done, total=total, description=escape(self._doing))
+        self._worked_s = self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0)
+        self._doing = f"{stage}: {message}" if message else stage
+        ahead = self._ahead().partition(", ")[2].rstrip(")")
+        self._bar.update(
+            self._task, completed=self._worked_s, description=escape(self._doing), left=f"  {ahead}"
+        )
 
     def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
         if taken_up:
             self._expected[stage] = 0.0  # it says nothing about the speed of this run
+            self._bar.update(self._task, total=sum(self._expected.values()) or 1.0)
         self._done_s += self._expected.get(stage, 0.0)
+        self._worked_s = self._done_s
         if not self._bar.disable:
             words = "taken up from the earlier run" if taken_up else f"{seconds:.1f} s"
             self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)

@@ -14,8 +14,8 @@ _SECONDS = 150
 _REFUSED, _NO_LIBRARY = 2, 3
 
 
-def read_in_child(kind: str, library: str, content: bytes) -> bytes:
-    """What `child_reader` makes of the bytes of a file of this kind (HDF5, parquet or xlsx).
+def read_in_child(kind: str, library: str, content: bytes, extra: str = "logs") -> bytes:
+    """What `child_reader` makes of the bytes of a file of this kind (HDF5, parquet, xlsx, MCAP, bag, db3).
 
     Raises ValueError, beginning with ':': damaged, too large, too slow, or the library is not installed.
     """
@@ -38,7 +38,7 @@ def read_in_child(kind: str, library: str, content: bytes) -> bytes:
     said = shown(done.stderr.decode("utf-8", "replace"))
     if done.returncode == _NO_LIBRARY:
         raise ValueError(
-            f": {kind} files need {library}: pip install 'flexlink[logs]' (or pip install {library})"
+            f": {kind} files need {library}: pip install 'flexlink[{extra}]' (or pip install {library})"
         )
     raise ValueError(
         f": {said if done.returncode == _REFUSED and said else f'not a {kind} file, or a damaged one'}"

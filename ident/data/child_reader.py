@@ -1,4 +1,5 @@
-"""Run as a script, alone: the columns of an HDF5, parquet or xlsx file, from standard input to output.
+"""Run as a script, alone: the columns of an HDF5, parquet, xlsx or MCAP file or of a ROS bag, from
+standard input to output.
 
 The libraries that read these formats are compiled, and a file can be made to end their process or to fill
 the memory. Here that process is not ours, and has limits of memory and time. Out come an npz archive (arrays
@@ -10,13 +11,17 @@ import io
 import json
 import resource
 import sys
+import tempfile
 import zipfile
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 LARGEST_BYTES = 2**30
 CPU_SECONDS = 120
 _MEMORY_BYTES = 8 * LARGEST_BYTES
 _NUMBERS = "fiub"
+_LONGEST_FIELD = 256  # longer ones are pictures and point clouds
 
 
 class RefusedError(ValueError):
@@ -90,6 +95,88 @@ def parquet_columns(content: bytes) -> Columns:
     return found
 
 
+def _messages(content: bytes, kind: str) -> Iterator[tuple[str, int, Any]]:
+    """Topic, time of recording [ns] and message, in its order; those nobody can read left out."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    if kind != "mcap":
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / f"bag.{kind}"
+            file.write_bytes(content)
+            usual = get_typestore(Stores.ROS2_HUMBLE)  # bags before Iron say nothing of their types
+            with AnyReader([file], default_typestore=usual) as bag:
+                for connection, at_ns, data in bag.messages():
+                    yield connection.topic, at_ns, bag.deserialize(data, connection.msgtype)
+        return
+    from mcap.reader import make_reader
+
+    types, known = get_typestore(Stores.EMPTY), set()
+    for schema, channel, message in make_reader(io.BytesIO(content)).iter_messages():
+        encoding = channel.message_encoding
+        if encoding == "json":
+            yield channel.topic, message.log_time, json.loads(message.data)
+        elif schema is not None and encoding in ("cdr", "ros1"):
+            package, _, name = schema.name.rpartition("/")
+            whole = f"{package.removesuffix('/msg')}/msg/{name}"
+            if schema.id not in known:
+                known.add(schema.id)
+                text, idl = schema.data.decode(), schema.encoding == "ros2idl"
+                types.register(get_types_from_idl(text) if idl else get_types_from_msg(text, whole))
+            deserialize = types.deserialize_cdr if encoding == "cdr" else types.deserialize_ros1
+            yield channel.topic, message.log_time, deserialize(message.data, whole)
+
+
+def _fields(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Numbers and short vectors in a message by their names; times in nanoseconds."""
+    import numpy as np
+
+    parts = getattr(value, "__dataclass_fields__", value if isinstance(value, dict) else None)
+    if parts is not None:
+        inner = {key: value[key] if isinstance(value, dict) else getattr(value, key) for key in parts}
+        inner = {key: item for key, item in inner.items() if not key.startswith("__")}
+        if {"sec", "nanosec"} <= inner.keys():
+            yield f"{name}_ns", int(inner["sec"]) * 10**9 + int(inner["nanosec"])
+            return
+        for key, item in inner.items():
+            yield from _fields(f"{name}.{key}", item)
+    elif not isinstance(value, str):
+        numbers = np.asarray(value)
+        if numbers.dtype.kind in _NUMBERS and numbers.ndim < 2 and 0 < numbers.size <= _LONGEST_FIELD:
+            yield name, numbers
+        elif isinstance(value, list) and numbers.ndim == 1 and numbers.size <= _LONGEST_FIELD:
+            for k, item in enumerate(value):
+                yield from _fields(f"{name}[{k}]", item)
+
+
+def bag_columns(content: bytes, kind: str) -> Columns:
+    """topic.field, one row per message; topic.time is the header's stamp, or where there is none the time of
+    recording, which stands under the topic and a tab."""
+    import numpy as np
+
+    rows: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    for topic, at_ns, message in _messages(content, kind):
+        name = topic.lstrip("/")
+        rows.setdefault(name, []).append((at_ns, dict(_fields(name, message))))
+    if not rows:
+        raise RefusedError("no messages that can be read; expected CDR, ROS 1 or JSON, and numbers in them")
+    begin_ns = min(found[0][0] for found in rows.values())
+    columns: Columns = {}
+    for topic, found in rows.items():
+        recorded_s = np.array([1e-9 * (at_ns - begin_ns) for at_ns, _ in found])
+        columns[f"{topic}\t"] = recorded_s, ""
+        table = {
+            name: np.asarray([fields[name] for _, fields in found])
+            for name, first in found[0][1].items()
+            if all(name in fields and np.shape(fields[name]) == np.shape(first) for _, fields in found)
+        }
+        stamp_ns = table.pop(f"{topic}.header.stamp_ns", np.zeros(1))
+        stamped = stamp_ns.size > 1 and bool(np.all(np.diff(stamp_ns) > 0))
+        columns[f"{topic}.time"] = (1e-9 * (stamp_ns - stamp_ns[0]) if stamped else recorded_s), "s"
+        columns |= {name: (values, "") for name, values in table.items() if ".header." not in name}
+    return columns
+
+
 def sheet_text(content: bytes) -> str:
     """The first sheet that has two rows and more, as text with tabs."""
     import openpyxl
@@ -130,7 +217,7 @@ def _archive(columns: Columns) -> bytes:
 
 
 def main(kind: str) -> int:
-    """kind: hdf5, parquet or xlsx."""
+    """kind: hdf5, parquet, xlsx, mcap, bag (ROS 1) or db3 (ROS 2)."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
@@ -138,8 +225,10 @@ def main(kind: str) -> int:
     try:
         if kind == "xlsx":
             found = sheet_text(content).encode("utf-8", "replace")
-        else:
+        elif kind in ("hdf5", "parquet"):
             found = _archive(hdf5_columns(content) if kind == "hdf5" else parquet_columns(content))
+        else:
+            found = _archive(bag_columns(content, kind))
     except ImportError as error:
         sys.stderr.write(error.name or str(error))
         return 3

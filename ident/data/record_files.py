@@ -7,6 +7,7 @@ import io
 import json
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -109,8 +110,21 @@ def _read_xlsx(file: Path, content: bytes) -> Table:
     return Table(file, columns, layout.first, layout, layout.units)
 
 
-def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
-    arrays = npz_arrays(read_in_child(kind, library, content))
+@reads(".mcap", ".bag", ".db3")
+def _read_bag(file: Path, content: bytes) -> Table:
+    """MCAP, ROS 1 and ROS 2 bags: topic.field; signals of several topics hold their last message."""
+    kind = file.name.lower().removesuffix(".gz").rpartition(".")[2]
+    table = _read_columns(file, content, kind, "mcap and rosbags", "robotics")
+    recorded = {name[:-1]: table.raw[name] for name in table.names if name.endswith("\t")}
+    raw = {name: values for name, values in table.raw.items() if not name.endswith("\t")}
+    # A topic's name may be the beginning of another's: the longest that fits comes last.
+    topics = sorted(recorded, key=len)
+    clocks = {name: recorded[topic] for topic in topics for name in raw if name.startswith(f"{topic}.")}
+    return replace(table, raw=raw, clocks=clocks)
+
+
+def _read_columns(file: Path, content: bytes, kind: str, library: str, extra: str = "logs") -> Table:
+    arrays = npz_arrays(read_in_child(kind, library, content, extra))
     about = json.loads(arrays.pop("about").tobytes())
     columns = {name: arrays[str(k)] for k, (name, _) in enumerate(about)}
     return Table(file, columns, units={name: unit for name, unit in about if unit})

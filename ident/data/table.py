@@ -39,6 +39,7 @@ class Table:
     first_line: int | None = None
     layout: Layout | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    clocks: Mapping[str, RealArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {}
@@ -58,7 +59,8 @@ class Table:
         return self.units.get(name, "") or written_unit(name)
 
     def columns(self, wanted: Sequence[str]) -> dict[str, RealArray]:
-        """The wanted columns as equally long finite vectors; dates and clock times in seconds.
+        """The wanted columns as equally long finite vectors; dates and clock times in seconds. With clocks,
+        on the rows of the first: the others hold what came last, and rows before all have come are left out.
 
         Raises ValueError if one is missing (lists those there are), not numeric, not finite or of another
         length.
@@ -67,10 +69,21 @@ class Table:
             if name not in self.raw:
                 raise ValueError(f"{self.path}: no column '{shown(name)}'; the file has {self._listed(name)}")
         found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
+        if self.clocks:
+            found = self._held(found)
         sizes = {name: column.size for name, column in found.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(f"{self.path}: columns must be equally long; got {shown(str(sizes), 160)}")
         return found
+
+    def _held(self, found: Mapping[str, RealArray]) -> dict[str, RealArray]:
+        clocks = [self.clocks[name] for name in found]
+        rows = clocks[0] >= max(clock[0] for clock in clocks)
+        came = [np.searchsorted(clock, clocks[0][rows], side="right") - 1 for clock in clocks]
+        return {
+            name: values[rows] if clock is clocks[0] else values[last]
+            for (name, values), clock, last in zip(found.items(), clocks, came, strict=True)
+        }
 
     def _listed(self, wanted: str = "") -> str:
         # Of a matrix that was asked for by its own name, its columns.

@@ -7,19 +7,25 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
+import mcap.writer
 import numpy as np
 import openpyxl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores, get_typestore
 
 from ident.data.record import Record
 
@@ -118,6 +124,56 @@ def hdf5(matlab=False, **datasets) -> bytes:
     return mark + buffer.getvalue()[len(mark) :]
 
 
+def bag(kind: str, delay_s: float = 0.0) -> Callable[[], bytes]:
+    """Joint states at 100 Hz, and voltages sent `delay_s` before every third, as a recorder writes them."""
+
+    def write() -> bytes:
+        store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+        types = store.types
+        state, number = types["sensor_msgs/msg/JointState"], types["std_msgs/msg/Float64"]
+        stamp, head = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+        with TemporaryDirectory() as folder:
+            path, ros1 = Path(folder) / "run.bag", kind == "bag"
+            plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+            with (
+                rosbag1.Writer(path)
+                if ros1
+                else rosbag2.Writer(path, version=9, storage_plugin=plugin) as out
+            ):
+                states = out.add_connection("/arm/joint_states", state.__msgtype__, typestore=store)
+                voltages = out.add_connection("/voltage", number.__msgtype__, typestore=store)
+                write = store.serialize_ros1 if ros1 else store.serialize_cdr
+                for k in K:
+                    at_ns = 1_700_000_000_000_000_000 + round(1e9 * T_S[k])
+                    if k % 3 == 0:
+                        sent_ns = at_ns - round(1e9 * delay_s)
+                        out.write(voltages, sent_ns, write(number(U[k]), number.__msgtype__))
+                    when = stamp(sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+                    header = head(k, when, "") if ros1 else head(when, "")
+                    angle, none = np.array([1.0, Y[k]]), np.zeros(0)
+                    message = state(header, ["fixed", "hub"], angle, none, none)
+                    # What comes over the network comes late, by up to 4 ms.
+                    out.write(states, at_ns + int(1e6 * (k % 5)), write(message, state.__msgtype__))
+            return (path if ros1 else next(path.glob(f"*.{kind}"))).read_bytes()
+
+    return write
+
+
+def mcap_of(encoding="json", schema="jsonschema") -> bytes:
+    stream = io.BytesIO()
+    writer = mcap.writer.Writer(stream)
+    writer.start()
+    about = writer.register_schema("Arm", schema, b"{}")
+    topic = writer.register_channel("/arm", encoding, about)
+    for t, u, y in zip(T_S, U, Y, strict=True):
+        at_ns = round(1e9 * t)
+        data = json.dumps({"drive": {"u_V": u}, "pose": [y, 0.0], "note": "ok"}).encode()
+        writer.add_message(topic, at_ns, data, at_ns)
+    writer.finish()
+    return stream.getvalue()
+
+
+STATES = ("arm/joint_states.time", "voltage.data", "arm/joint_states.position[1]")
 PREAMBLE = ("Logger 3000;v1.2", "Operator;M. Huber", "Sample rate;100", "")
 LOST = np.delete(K, [20])
 JITTER = 1e-3 * np.random.default_rng(4).uniform(-0.5, 0.5, N)
@@ -277,6 +333,16 @@ LOGS = {
         ("log.t_s", "log.uy[0]", "log.uy[1]"),
         units=("", ""),
     ),
+    "MCAP of ROS 2, two topics": Log("a.mcap", bag("mcap", 1e-4), STATES, dt_error_s=1e-9, units=("", "")),
+    "ROS 2 bag": Log("a.db3", bag("db3", 1e-4), STATES, dt_error_s=1e-9, units=("", "")),
+    "ROS 1 bag": Log("a.bag", bag("bag", 1e-4), STATES, dt_error_s=1e-9, units=("", "")),
+    "MCAP of JSON": Log("a.mcap", mcap_of(), ("arm.time", "arm.drive.u_V", "arm.pose[0]"), units=("V",)),
+    "MCAP nobody can read": Log(
+        "a.mcap", mcap_of("protobuf", "protobuf"), refused=("no messages that can be read; expected CDR",)
+    ),
+    "a cut ROS 1 bag": Log(
+        "a.bag", lambda: bag("bag")()[:3000], refused=("a.bag: not a bag file, or a damaged one",)
+    ),
     "a spreadsheet that is none": Log(
         "a.xlsx", text(), refused=("a.xlsx: not a xlsx file, or a damaged one",)
     ),
@@ -319,4 +385,4 @@ def test_forty_logs(name, tmp_path: Path):
 
 
 def test_there_are_forty_and_more():
-    assert len(LOGS) == 47
+    assert len(LOGS) == 53

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -369,6 +370,59 @@ def test_help_keeps_what_stands_in_brackets(flexlink, command, words):
     shown = " ".join(flexlink(command, "--help").out.split())
     for word in words:
         assert word in shown
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["identify"], ["diagnose"], ["report"], ["blind"]])
+def test_short_help_is_the_long_one(flexlink, command):
+    short = flexlink(*command, "-h")
+    assert short.code == 0
+    assert short.out == flexlink(*command, "--help").out
+    assert "-h, --help" in short.out
+
+
+@pytest.mark.parametrize(
+    ("shell", "typed", "offered"),
+    [
+        ("bash", "flexlink di", {"diagnose"}),
+        ("bash", "flexlink pa", {"paper"}),  # a command from outside
+        ("bash", "flexlink identify --omega-", {"--omega-min", "--omega-max"}),
+        ("zsh", "flexlink study --sch", {"--scheduler"}),
+        ("fish", "flexlink re", {"report"}),
+    ],
+)
+def test_a_shell_completes_commands_and_options(shell, typed, offered):
+    env = {"_FLEXLINK_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": typed}
+    env |= {
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(typed.count(" ")),
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
+    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | env,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert set(re.findall(r"(?:--)?[a-z-]+(?=\n|\t|\"|$)", done.stdout)) >= offered, done.stdout + done.stderr
+
+
+def test_completion_is_installed_for_the_shell_that_runs(tmp_path):
+    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import main; sys.exit(main())"
+    home = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--install-completion", "bash"],
+        env=os.environ | home,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "bash completion installed" in done.stdout
+    script = next((tmp_path / ".bash_completions").iterdir())
+    assert "_FLEXLINK_COMPLETE=complete_bash" in script.read_text()
 
 
 def test_same_log_twice_is_refused(refused, tmp_path):

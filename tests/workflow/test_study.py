@@ -94,6 +94,14 @@ def test_points_open_with_the_usual_tools(small_study, tmp_path, flexlink):
     answer = flexlink("report", point, "--json")
     assert answer.code == 0, answer.err
     assert (point / "report.html").is_file()
+    for row in rows_of(out):
+        by_number = out / "points" / row["number"]
+        assert by_number.exists() == (row["state"] != "failed"), row
+        assert by_number.resolve().name == row["name"]
+    assert (
+        RunDirectory.open(out / "points" / "1").config_document()
+        == RunDirectory.open(point).config_document()
+    )
 
 
 def test_points_of_one_design_share_controller_and_plant(small_study):

@@ -4,6 +4,7 @@
     study.json           base with every default filled in, its input files; a resumed study is held to them
     plants/<key>/        run directories with records, model and ellipses, shared by points
     points/<name>/       one run directory per point, without a page (`flexlink report` writes it)
+    points/<number>      a link to it, by its number in the table
     table.csv .json      one row per point; nothing in them depends on when or where a point was computed
     study.html, pareto.svg
 
@@ -14,7 +15,7 @@ match what they would be made from now, so a killed study goes on where it stood
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, first_difference
 from workflow.engine.store import Store
-from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Point
+from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Combination, Point
 from workflow.study.task import Done
 from workflow.tasks.pipeline import stage_input_hash
 from workflow.tasks.results import RunResults
@@ -125,6 +126,16 @@ class StudyDirectory(Store):
         _write(run, point, self.plant_files(point), done)
         certified = summarise(RunResults(run), point.config).certified
         run.record_status("complete" if certified else "complete, not certified")
+
+    def link_numbers(self, points: Iterable[Combination]) -> None:
+        """Every point that is there under its number as well; numbers of an earlier call are gone."""
+        for entry in self.points_path.iterdir():
+            if entry.is_symlink() and entry.name.isdigit():
+                entry.unlink()
+        for point in points:
+            link = self.points_path / str(point.number)
+            if (self.points_path / point.name).is_dir() and not link.exists():  # a copied study has folders
+                link.symlink_to(point.name, target_is_directory=True)
 
     def plant_files(self, point: Point) -> dict[str, bytes]:
         """The stage files of the plant that a point shares, by file name."""

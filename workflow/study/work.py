@@ -209,6 +209,7 @@ def _write_up(
     view = StudyView(title, study, text, where, rows, _units(directory, rows))
     storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, view.fronts))
     storage.write_text(directory.path / "table.json", codec.plain_text(view.document))
+    directory.link_numbers(rows)
     page = render_page("study.html.j2", title=title, study=view)
     for name, picture in page.pictures.items():
         storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)

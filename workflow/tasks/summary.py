@@ -140,7 +140,10 @@ def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
 def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[str, Any]:
     """The model of a channel and its ellipses together."""
     ellipses = uncertainty_numbers(spread)
-    return {**model_numbers(found), **{key: ellipses[key] for key in ("bands", "tests", "repeat_scatter")}}
+    return {
+        **model_numbers(found),
+        **{key: ellipses[key] for key in ("bands", "intervals", "tests", "repeat_scatter")},
+    }
 
 
 def design_numbers(design: DesignResult) -> dict[str, Any]:

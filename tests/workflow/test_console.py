@@ -1,0 +1,68 @@
+"""What a terminal is told of a computation that takes long, and when."""
+
+from __future__ import annotations
+
+import re
+import time
+
+import numba
+import pytest
+
+from workflow import console
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that goes when it is told to."""
+    now = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_the_first_word_comes_at_once(capfd):
+    with console.TerminalProgress() as told:
+        told.update("reading", 0.0)
+        time.sleep(console.FIRST_LINE_S + 0.2)
+    assert re.fullmatch(r"flexlink: \d s: reading\n", capfd.readouterr().err)
+    with console.TerminalProgress(quiet=True):
+        time.sleep(console.FIRST_LINE_S + 0.2)
+    assert capfd.readouterr().err == ""
+
+
+def test_time_left_follows_the_speed_of_the_machine(clock):
+    told = console.TerminalProgress(quiet=True)
+    told.plan([("first", 20.0), ("second", 80.0)])
+    clock[0] = 1.0
+    told.update("first", 0.05)
+    assert told._ahead() == ""  # too little is done to say anything
+    for share in (0.5, 1.0):
+        clock[0] = 3 * 20.0 * share  # three times slower than expected
+        told.update("first", share)
+    assert told._ahead() == f" (20 %, about {80 * (60 + 10) / (20 + 10):.0f} s left)"
+    told.finish("first", 60.0, taken_up=False)
+    clock[0] = 260.0
+    told.update("second", 0.9)
+    left_s = float(told._ahead().split("about ")[1].split()[0])
+    assert left_s == pytest.approx(8.0 * (260 + 10) / (92 + 10), abs=0.5)  # of 24, so fast it learns
+    told.finish("second", 0.0, taken_up=True)
+    assert told._ahead() == " (100 %, about 0 s left)"
+
+
+def test_compiling_is_told_once_and_is_no_sign_of_slowness(capfd):
+
+    @numba.njit
+    def double(x):
+        return 2 * x
+
+    with console.TerminalProgress() as told:
+        told.plan([("all", 100.0)])
+        double(1)
+        double(1.0)
+    double(1j)  # nobody is told any more
+    err = [line for line in capfd.readouterr().err.splitlines() if " s: " not in line]
+    assert err == ["flexlink: compiling, once after installing (about 20 s in all)"]
+    assert 0 < told._compiled_s < 20
+    # 30 s of which all were spent compiling, nearly nothing done: not 1000 s, but what was expected.
+    told._compiled_s, told._began_s = 30.0, time.monotonic() - 30.5
+    told.update("all", 0.03)
+    assert 60 < float(told._ahead().split("about ")[1].split()[0]) < 100
