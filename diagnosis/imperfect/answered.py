@@ -25,9 +25,12 @@ from diagnosis.imperfect import verdict as judging
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent
 from diagnosis.imperfect.search import Explanation, Progress, Search
+from diagnosis.machine.case import Case
+from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.next_experiment.discrimination import CompetingHypothesis, fitted_hypothesis
 
-_DRAWS = 1000
+_DRAWS, _MOST_COMPETING = 1000, 3
 # Small effects stay in the repaired model from this share of the model error on.
 _LEAST_KEPT = 0.3
 
@@ -78,6 +81,39 @@ def beside_imperfections(
         residuals_after=after,
         simulations=search.simulations,
         shares=shares_of(search, found, accepted, rng),
+        competing=_competing(case, search, found) if isinstance(case, Case) else (),
+    )
+
+
+def _competing(case: Case, search: Search, found: judging.Verdict) -> tuple[CompetingHypothesis, ...]:
+    """Sets whose effects that matter contradict each other, for the experiment that parts them.
+
+    One standard deviation is what the likelihood counts as one: the energies that do not interest, over as
+    many independent values as its bands have. Neglected: that they grow with the motion.
+    """
+    records, kept = search.records, dict[tuple[str, ...], Descent]()
+    for one in found.judged:
+        key = tuple(sorted(part.name for part in one.parts if part.matters >= 0.5))
+        if key and not any(set(key) <= set(other) or set(other) <= set(key) for other in kept):
+            kept[key] = one.explanation.end
+    by_output = (
+        part.reshape(-1, case.noise.size).sum(axis=0)
+        for part in (records.levels.floor, records.levels.counted)
+    )
+    floor, counted = by_output
+    level = dict(zip(case.outputs, np.sqrt(judging.TEMPER * floor / counted), strict=True))
+    noise = np.array([level.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
+    return tuple(
+        fitted_hypothesis(
+            case,
+            end.candidates,
+            end.deviations,
+            end.coordinates,
+            end.precision(records) / judging.TEMPER,
+            found.probabilities.sets.get(key, 0.0),
+            noise,
+        )
+        for key, end in list(kept.items())[:_MOST_COMPETING]
     )
 
 

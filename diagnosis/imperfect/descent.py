@@ -69,6 +69,12 @@ class Descent:
             self.left if e is None else e,
         )
 
+    def precision(self, records: Records) -> Real:
+        """(P + A, P + A) of deviations and coordinates, whatever the starts and zeros are."""
+        H, n = self.equations(records).hessian, self.jacobian.shape[1]
+        rest = np.linalg.pinv(H[n:, n:], hermitian=True)
+        return np.asarray(H[:n, :n] - H[:n, n:] @ rest @ H[n:, :n])
+
 
 @dataclass(frozen=True, eq=False)
 class Normal:

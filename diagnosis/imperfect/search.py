@@ -24,6 +24,8 @@ Progress = Callable[[float, str], None]
 _ALONE, _BESIDE_POINTS = 2, 4
 _PARENTS, _TRIED = (3, 1), (6, 4)
 _FINISHED = 6
+# Sets of several whose simple effects are also continued as those that contain them.
+_CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
 _HELD_OUT_STEPS = 5
@@ -94,13 +96,22 @@ class Search:
         nominal = descend(self.records, (), np.zeros(P), np.zeros(0), self.records.at_rest(), iterations=12)
         self.add(nominal)
         self._alone()
-        self._containing()
+        self._containing(self._likeliest(lambda e: len(e.names) == 1))
         for count in range(2, weighing.most_effects + 1):
             likeliest = max(self.found, key=lambda e: e.evidence)
             if count > 3 and np.max(likeliest.shares) <= weighing.model_error:
                 break
             self._together(count)
+        self._containing(self._likeliest(lambda e: len(e.names) > 1)[:_CONTINUED])
         self._look_alikes()
+
+    def _likeliest(self, among: Callable[[Explanation], bool]) -> list[Explanation]:
+        """The best explanation by each set of effects, the likeliest first."""
+        best: dict[tuple[str, ...], Explanation] = {}
+        for explanation in sorted(self.found, key=lambda e: -e.evidence):
+            if among(explanation):
+                best.setdefault(explanation.key, explanation)
+        return list(best.values())
 
     def _late(self, what: str) -> bool:
         if time.monotonic() < self.deadline_s:
@@ -152,30 +163,36 @@ class Search:
             iterations=9,
         )
 
-    def _containing(self) -> None:
-        """Effects that contain a simpler one (Stribeck friction Coulomb's), from where that has ended."""
+    def _containing(self, pool: Sequence[Explanation]) -> None:
+        """Effects that contain a simpler one (Stribeck friction Coulomb's), from where sets of it ended."""
         for candidate in self.case.machine.candidates(self.case.experiments):
-            simple = [e for e in self.found if e.names == (candidate.kind.contains,)]
-            if candidate.kind.contains is None or not simple or self._late(candidate.effect):
-                continue
-            inner = max(simple, key=lambda e: e.evidence).end
-            size = inner.coordinates[0]
-            ends = [
-                descend(
-                    self.records,
-                    (candidate,),
-                    inner.deviations,
-                    np.array([size, *further]),
-                    inner.start,
-                    nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
-                    columns=inner.columns,
-                    iterations=6,
-                )
-                for further in sorted({x[1:] for x in candidate.starts})[::2]
+            simple = candidate.kind.contains
+            known = [points[0] for other, points in self.points if other.effect == candidate.effect]
+            starts = [point.coordinates[1:] for point in known] or sorted({x[1:] for x in candidate.starts})[
+                ::2
             ]
-            best = min(ends, key=lambda end: end.loss)
-            self.points.append((candidate, [_point(best)]))
-            self.add(best)
+            for inner in [e.end for e in pool if simple in e.names]:
+                if self._late(candidate.effect):
+                    return
+                k = inner.names.index(str(simple))
+                first = sum(len(c.axes) for c in inner.candidates[: k + 1])
+                ends = [
+                    descend(
+                        self.records,
+                        (*inner.candidates[:k], candidate, *inner.candidates[k + 1 :]),
+                        inner.deviations,
+                        np.concatenate([inner.coordinates[:first], further, inner.coordinates[first:]]),
+                        inner.start,
+                        nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
+                        columns=inner.columns,
+                        iterations=6,
+                    )
+                    for further in starts
+                ]
+                best = min(ends, key=lambda end: end.loss)
+                if len(best.names) == 1:
+                    self.points.append((candidate, [_point(best)]))
+                self.add(best)
 
     def _together(self, count: int) -> None:
         pool = sorted((e for e in self.found if len(e.names) == count - 1), key=lambda e: -e.evidence)

@@ -140,28 +140,59 @@ def _judged(
     *,
     fit: bool,
 ) -> Judged:
-    parts = []
-    for k, name in enumerate(explanation.names):
-        key = tuple(sorted(n for n in explanation.names if n != name))
-        rest = search.without(explanation, k) if fit and key else best.get(key, search.base)
-        carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
-        share = float(np.sqrt(np.prod(np.max(carried, axis=1))))
-        matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
-        off = _tolerances_off(search, explanation, k)
-        if off is not None:
-            # A stated value in itself: what it changes may be imitated by the others within their tolerances.
-            preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
-            matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
-        parts.append(Part(name, share, matters))
+    parts, reduced = dict[str, Part](), explanation
+    while reduced.names:
+        rests = {
+            name: search.without(reduced, k)
+            if fit and len(reduced.names) > 1
+            else best.get(_less(reduced, name))
+            for k, name in enumerate(reduced.names)
+        }
+        within = [
+            _part(search, reduced, name, rest or search.base, model_error, listed)
+            for name, rest in rests.items()
+        ]
+        least = min(within, key=lambda part: (part.matters, part.share))
+        smaller = rests[least.name]
+        if least.matters >= 0.5 or len(within) == 1 or smaller is None:
+            parts |= {part.name: part for part in within}
+            break
+        # Two effects that can replace each other would both seem to carry nothing: the lesser goes first.
+        parts[least.name], reduced = least, smaller
     at_edge = any(
-        c.at_edge(explanation.end.coordinates_of(k)) and parts[k].matters > 0.5
+        c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
     complete = 0.0 if at_edge else _enough(explanation, model_error)
-    for part in parts:
+    for part in parts.values():
         complete *= 1.0 if part.name in listed else 1 - part.matters
-    within = tuple(part for part in parts if part.name in listed)
-    return Judged(explanation, within, score_of(explanation, listed, model_error), complete)
+    named = tuple(parts[name] for name in explanation.names if name in listed)
+    return Judged(explanation, named, score_of(explanation, listed, model_error), complete)
+
+
+def _less(explanation: Explanation, name: str) -> tuple[str, ...]:
+    """Key of the set without this effect."""
+    return tuple(sorted(n for n in explanation.names if n != name))
+
+
+def _part(
+    search: Search,
+    explanation: Explanation,
+    name: str,
+    rest: Explanation,
+    model_error: float,
+    listed: Sequence[str],
+) -> Part:
+    """What an effect carries within a set; rest: the set without it."""
+    carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
+    share = float(np.sqrt(np.prod(np.max(carried, axis=1))))
+    matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
+    off = _tolerances_off(search, explanation, explanation.names.index(name))
+    if off is not None:
+        # A stated value in itself: what it changes may be imitated by the others within their tolerances.
+        preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
+        matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
+    return Part(name, share, matters)
 
 
 def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float | None:

@@ -23,8 +23,10 @@ from diagnosis.evidence.hypotheses import Hypothesis, best_of_sets
 from diagnosis.fit.fit import Fit, box, effects_at, quotients
 from diagnosis.fit.nominal import NominalParameters
 from diagnosis.machine.case import Case
+from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
 from plant.effects import Effect
+from plant.effects.search_space import Candidate
 from plant.rig import Rig
 from plant.simulation import simulate
 
@@ -50,6 +52,8 @@ class CompetingHypothesis:
     precision : (P, P). What is known about the free parameters: the Gauss-Newton Hessian of the fit to the
         records, prior included.
     name : str. In sentences; by default the names of the effects.
+    noise : (2,). Standard deviations of hub angle and tip position; by default those of the rig's sensors.
+        Infinite where nobody measures.
     """
 
     probability: float
@@ -58,11 +62,14 @@ class CompetingHypothesis:
     directions: Callable[[Real], Real] = _nothing_free
     precision: Real = field(default_factory=lambda: np.zeros((0, 0)))
     name: str = ""
+    noise: Real = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1 + 1e-9:  # a sum of shares may round above one
             raise ValueError(f"a hypothesis' probability lies between 0 and 1; got {self.probability}")
         object.__setattr__(self, "effects", tuple(self.effects))
+        if not self.noise.size:
+            object.__setattr__(self, "noise", FlexibleArm(self.rig).noise)
         if not self.name:
             names = " with ".join(type(effect).id for effect in self.effects)
             object.__setattr__(self, "name", names or "no effect")
@@ -94,35 +101,50 @@ def competing_hypotheses(
 
 def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
     """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
-    nominal = NominalParameters(case.machine)
+    x = np.concatenate([np.zeros(0), *fit.coordinates])
+    return fitted_hypothesis(case, fit.candidates, fit.deviations, x, fit.hessian, probability, case.noise)
+
+
+def fitted_hypothesis(
+    case: Case,
+    candidates: Sequence[Candidate],
+    deviations: Real,
+    coordinates: Real,
+    precision: Real,
+    probability: float,
+    noise: Real,
+) -> CompetingHypothesis:
+    """The same of deviations (P,) and coordinates (A,) of the candidates, which `precision` (P + A, P + A)
+    belongs to; noise (2,): as in `CompetingHypothesis`."""
+    nominal, fitted = NominalParameters(case.machine), effects_at(candidates, coordinates)
 
     def outputs(deviations: Real, effects: Sequence[Effect], voltage: Real) -> Real:
         rig = nominal.at(deviations).description
-        return np.asarray((simulate(rig, voltage, effects).output / case.noise).ravel())
+        return np.asarray((simulate(rig, voltage, effects).output / noise).ravel())
 
     def directions(voltage: Real) -> Real:
         # Contacts say little about a small change of a nominal parameter and cost most of the time.
-        calm = tuple(e for e in fit.effects if type(e).dependence != "non-smooth")
-        start = outputs(fit.deviations, calm, voltage)
+        calm = tuple(e for e in fitted if type(e).dependence != "non-smooth")
+        start = outputs(deviations, calm, voltage)
         by_d = quotients(
             lambda d: outputs(d, calm, voltage),
-            fit.deviations,
+            deviations,
             start,
             np.full(nominal.count, _DEVIATION_STEP),
         )
-        if len(calm) < len(fit.effects):
-            start = outputs(fit.deviations, fit.effects, voltage)
+        if len(calm) < len(fitted):
+            start = outputs(deviations, fitted, voltage)
         by_x = quotients(
-            lambda x: outputs(fit.deviations, effects_at(fit.candidates, x), voltage),
-            np.concatenate([np.zeros(0), *fit.coordinates]),
+            lambda x: outputs(deviations, effects_at(candidates, x), voltage),
+            coordinates,
             start,
-            np.array([axis.step for candidate in fit.candidates for axis in candidate.axes]),
-            box(fit.candidates)[1],
+            np.array([axis.step for candidate in candidates for axis in candidate.axes]),
+            box(candidates)[1],
         )
         return np.hstack([by_d, by_x])
 
-    rig = nominal.at(fit.deviations).description
-    return CompetingHypothesis(probability, rig, fit.effects, directions, fit.hessian)
+    rig = nominal.at(deviations).description
+    return CompetingHypothesis(probability, rig, fitted, directions, precision, noise=noise)
 
 
 def distances(

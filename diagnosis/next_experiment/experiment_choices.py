@@ -39,17 +39,21 @@ class Limits:
     def of_records(cls, case: Case) -> Limits:
         """What the machine has already done: the largest voltage, hub angle and deflection of the records.
 
-        The deflection is the measured one less three deviations of its noise.
+        Beside a model error, where zeros and starts are unknown, from the start and about the mean. The
+        deflection is the measured one less three deviations of its noise; without a tip position it has no
+        limit.
         """
         reach = case.rig.hub.radius_m + case.rig.link.length_m
-        noise = float(np.hypot(case.noise[1], reach * case.noise[0]))
-        angle = max(float(np.max(np.abs(x.output[:, 0]))) for x in case.experiments)
-        bend = max(float(np.max(np.abs(x.output[:, 1] - reach * x.output[:, 0]))) for x in case.experiments)
-        return cls(
-            max(float(np.max(np.abs(x.voltage_V))) for x in case.experiments),
-            angle,
-            max(bend - 3 * noise, noise),
-        )
+        hubs = [x.output[:, 0] - (x.output[0, 0] if case.model_error > 0 else 0.0) for x in case.experiments]
+        voltage = max(float(np.max(np.abs(x.voltage_V))) for x in case.experiments)
+        angle = max(float(np.max(np.abs(hub))) for hub in hubs)
+        if "tip_m" not in case.outputs:
+            return cls(voltage, angle)
+        tip = case.outputs.index("tip_m")
+        noise = float(np.hypot(case.noise[tip], reach * case.noise[0]))
+        bends = [x.output[:, tip] - reach * x.output[:, 0] for x in case.experiments]
+        bends = [bend - np.mean(bend) if case.model_error > 0 else bend for bend in bends]
+        return cls(voltage, angle, max(max(float(np.max(np.abs(bend))) for bend in bends) - 3 * noise, noise))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 
-from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.next_experiment.discrimination import CompetingHypothesis, distances
 from diagnosis.next_experiment.experiment_choices import (
@@ -163,7 +162,7 @@ def _check(competing: Sequence[CompetingHypothesis]) -> None:
     for hypothesis in competing:
         if hypothesis.rig.sampling != first.sampling or hypothesis.rig.sensors != first.sensors:
             raise ValueError("all hypotheses need the same sampling period and sensor noise")
-    if not (first.sensors.hub_angle_noise_rad > 0 and first.sensors.tip_noise_m > 0):
+    if not np.all(competing[0].noise > 0):
         raise ValueError("sensors need a noise level above zero to tell hypotheses apart by")
 
 
@@ -184,8 +183,7 @@ class _Prospect:
         self, excitation: Excitation, outputs: Sequence[Real], competing: Sequence[CompetingHypothesis]
     ) -> None:
         self.excitation = excitation
-        noise = FlexibleArm(competing[0].rig).noise
-        self._whitened = [np.asarray(y / noise).ravel() for y in outputs]
+        self._whitened = [np.asarray(y / competing[0].noise).ravel() for y in outputs]
         self.hub = _range([y[:, 0] for y in outputs])
         self.deflection = _range(_deflections(competing, outputs))
         self.score: float | None = None

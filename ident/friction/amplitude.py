@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import expm, logm
 from scipy.optimize import brentq
 from scipy.special import ive
@@ -49,6 +50,8 @@ _CHANGE_OF_LEVEL = 0.02
 _SAME = 1e-3
 # Largest multiple of the scatter between amplitudes that ellipses are made of.
 _MOST = 3.0
+# What the number of draws leaves open of a share of them.
+_OF_DRAWS = 0.01
 # Every so many draws are counted when the ellipses are made large enough.
 _THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
@@ -134,7 +137,8 @@ def at_amplitudes(
     """Posterior of the best linear approximation, and poles of a model of it.
 
     Over a range of amplitudes, the centre lies halfway between its ends, and the ellipses are as large as it
-    takes to hold the response with probability `level`, averaged over the amplitudes of the range.
+    takes to hold the response with probability `level` in every half decade, averaged over the amplitudes of
+    the range: where the amplitudes matter, they may not lean on frequencies where they do not.
     """
     friction, arm = behind.friction, behind.friction.arm
     spaced = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
@@ -163,11 +167,22 @@ def at_amplitudes(
 
     share = 0.0
     if len(centres) > 1:
-        flat = responses[..., np.isin(omega, spaced)].reshape(-1, spaced.size)
+        half_decade = int(0.5 * spaced.size / np.log10(spaced[-1] / spaced[0]))
+
+        def inside(share: float, these: ComplexArray) -> RealArray:
+            """Share of responses (A, K, F) within the ellipses, in every window of half a decade."""
+            ellipses, flat = posterior(share).at(spaced, level), these.reshape(-1, spaced.size)[::_THINNED]
+            held = np.mean([ellipses.contains(one) for one in flat], axis=0)
+            return np.asarray(sliding_window_view(held, half_decade).mean(axis=1))
+
+        drawn = responses[..., np.isin(omega, spaced)]
+        together = drawn - drawn.mean(axis=1, keepdims=True) + posterior(0.0).at(spaced, level).centre
+        # Not more than one amplitude alone has: no scatter between them makes up for heavy tails of each.
+        wanted = np.minimum(level, inside(0.0, together)) - _OF_DRAWS
+        wanted[inside(_MOST, drawn) < wanted] = 0.0
 
         def missing(share: float) -> float:
-            ellipses = posterior(share).at(spaced, level)
-            return level - float(np.mean([ellipses.contains(one) for one in flat[::_THINNED]]))
+            return float(np.max(wanted - inside(share, drawn)))
 
         # Where the amplitudes differ by less than is known of each, nothing has to be added.
         if missing(0.0) > 0:

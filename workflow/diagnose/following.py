@@ -9,7 +9,6 @@ import numpy as np
 
 from diagnosis.answer import Diagnosis
 from diagnosis.machine.case import Case
-from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
@@ -51,7 +50,7 @@ class Following:
         first, second = (
             simulate(one.rig, self.proposal.voltage_V, one.effects).output for one in self.competing[:2]
         )
-        return np.asarray((first - second) / FlexibleArm(self.competing[0].rig).noise)
+        return np.asarray((first - second) / self.competing[0].noise)
 
 
 def following(found: Diagnosis) -> Following:
@@ -59,9 +58,9 @@ def following(found: Diagnosis) -> Following:
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
     if found.verdict == "unknown" and not imitated & set(found.ambiguous_with):
         return Following("confirm" if found.unlisted else "repeat_worst")
-    if not isinstance(found.case, Case) or found.case.model_error > 0 or "tip_m" not in found.case.outputs:
-        return Following("look" if found.ambiguous_with else "none")
     competing = _left(found)
+    if not isinstance(found.case, Case) or (found.case.model_error > 0 and len(competing) < 2):
+        return Following("look" if found.ambiguous_with else "none")
     if len(competing) < 2:
         return Following("repeat_all" if "unknown" in found.ambiguous_with else "none")
     longest = max(e.voltage_V.size for e in found.case.experiments)
