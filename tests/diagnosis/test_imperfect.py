@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from diagnosis import Case, Experiment, diagnose
 from diagnosis.imperfect.carried import shares_of
+from diagnosis.imperfect.descent import Descent
 from diagnosis.imperfect.levels import Levels, coefficients
-from diagnosis.imperfect.records import Records, Start
-from diagnosis.imperfect.search import Search
+from diagnosis.imperfect.records import Records, Start, StartColumns
+from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.verdict import judged
 from plant.effects import parse_effect
 from plant.presets import paper_link
@@ -160,6 +162,36 @@ def test_a_stated_value_far_off_is_named_though_the_others_could_imitate_it():
     (effect,) = [e for e in found.effects if e.name == "hub_inertia"]
     low, high = effect.intervals["ratio"]
     assert low < 1.5 < high
+
+
+def test_of_two_effects_that_can_replace_each_other_one_is_named():
+    # Each alone explains most of what both explain together, so that neither is missed while the other stays.
+    rng = np.random.default_rng(9)
+    roles = {"a": "estimation", "b": "held_out"}
+    records = [_experiment(name, role, _moving(rng), np.ones(400)) for name, role in roles.items()]
+    case = Case("walk", RIG, tuple(records), 0.05)
+    candidates = {c.effect: c for c in case.machine.candidates(case.experiments)}
+    nothing = np.zeros(0)
+
+    def fitted(gain, left, *names):
+        chosen = tuple(candidates[name] for name in names)
+        x = np.concatenate([nothing, *(c.starts[0] for c in chosen)])
+        start, columns = (
+            Start(np.zeros((1, 0)), nothing),
+            StartColumns(np.zeros((0, 0)), (), np.zeros((0, 0))),
+        )
+        end = Descent(chosen, nothing, x, start, nothing, np.zeros((0, 0)), columns, -gain, 0.0, True)
+        return Explanation(end, gain, 0.0, 0.0, (), (), np.full((2, 2), left))
+
+    base = fitted(0.0, 0.3)
+    friction, zone = fitted(400.0, 0.05, "coulomb_friction"), fitted(390.0, 0.06, "actuator_dead_zone")
+    both = fitted(460.0, 0.03, "coulomb_friction", "actuator_dead_zone")
+    search = SimpleNamespace(
+        found=[base, friction, zone, both], base=base, case=case, without=lambda whole, k: (zone, friction)[k]
+    )
+    found = judged(search, case.machine.weighing.listed)
+    assert found.judged[0].explanation is both
+    assert found.accepted == ("coulomb_friction",)
 
 
 def test_gain_and_zeros_of_a_strain_gauge_and_a_tachometer():
