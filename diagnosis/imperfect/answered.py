@@ -112,6 +112,7 @@ def _competing(case: Case, search: Search, found: judging.Verdict) -> tuple[Comp
             end.precision(records) / judging.TEMPER,
             found.probabilities.sets.get(key, 0.0),
             noise,
+            key,
         )
         for key, end in list(kept.items())[:_MOST_COMPETING]
     )

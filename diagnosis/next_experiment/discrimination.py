@@ -51,7 +51,8 @@ class CompetingHypothesis:
         tip sample by sample, by the hypothesis' free parameters; by default there are none.
     precision : (P, P). What is known about the free parameters: the Gauss-Newton Hessian of the fit to the
         records, prior included.
-    name : str. In sentences; by default the names of the effects.
+    causes : tuple of str. Effects that it names; by default all of them.
+    name : str. In sentences; by default the causes.
     noise : (2,). Standard deviations of hub angle and tip position; by default those of the rig's sensors.
         Infinite where nobody measures.
     """
@@ -61,6 +62,7 @@ class CompetingHypothesis:
     effects: tuple[Effect, ...] = ()
     directions: Callable[[Real], Real] = _nothing_free
     precision: Real = field(default_factory=lambda: np.zeros((0, 0)))
+    causes: tuple[str, ...] = ()
     name: str = ""
     noise: Real = field(default_factory=lambda: np.zeros(0))
 
@@ -70,9 +72,10 @@ class CompetingHypothesis:
         object.__setattr__(self, "effects", tuple(self.effects))
         if not self.noise.size:
             object.__setattr__(self, "noise", FlexibleArm(self.rig).noise)
+        if not self.causes:
+            object.__setattr__(self, "causes", tuple(type(effect).id for effect in self.effects))
         if not self.name:
-            names = " with ".join(type(effect).id for effect in self.effects)
-            object.__setattr__(self, "name", names or "no effect")
+            object.__setattr__(self, "name", " with ".join(self.causes) or "no effect")
 
 
 def competing_hypotheses(
@@ -113,9 +116,10 @@ def fitted_hypothesis(
     precision: Real,
     probability: float,
     noise: Real,
+    causes: tuple[str, ...] = (),
 ) -> CompetingHypothesis:
     """The same of deviations (P,) and coordinates (A,) of the candidates, which `precision` (P + A, P + A)
-    belongs to; noise (2,): as in `CompetingHypothesis`."""
+    belongs to; noise (2,), causes: as in `CompetingHypothesis`."""
     nominal, fitted = NominalParameters(case.machine), effects_at(candidates, coordinates)
 
     def outputs(deviations: Real, effects: Sequence[Effect], voltage: Real) -> Real:
@@ -144,7 +148,7 @@ def fitted_hypothesis(
         return np.hstack([by_d, by_x])
 
     rig = nominal.at(deviations).description
-    return CompetingHypothesis(probability, rig, fitted, directions, precision, noise=noise)
+    return CompetingHypothesis(probability, rig, fitted, directions, precision, causes, noise=noise)
 
 
 def distances(

@@ -158,11 +158,11 @@ def next_experiment(
 def _check(competing: Sequence[CompetingHypothesis]) -> None:
     if len(competing) < 2:
         raise ValueError(f"an experiment separates at least two hypotheses; got {len(competing)}")
-    first = competing[0].rig
-    for hypothesis in competing:
-        if hypothesis.rig.sampling != first.sampling or hypothesis.rig.sensors != first.sensors:
+    first = competing[0]
+    for one in competing:
+        if one.rig.sampling.dt_s != first.rig.sampling.dt_s or not np.array_equal(one.noise, first.noise):
             raise ValueError("all hypotheses need the same sampling period and sensor noise")
-    if not np.all(competing[0].noise > 0):
+    if not np.all(first.noise > 0):
         raise ValueError("sensors need a noise level above zero to tell hypotheses apart by")
 
 

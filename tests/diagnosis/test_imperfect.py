@@ -10,7 +10,7 @@ import pytest
 
 from diagnosis import Case, Experiment, diagnose
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent
+from diagnosis.imperfect.descent import Descent, descend
 from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
@@ -227,3 +227,12 @@ def test_gain_and_zeros_of_a_strain_gauge_and_a_tachometer():
     assert shares is not None
     assert shares.horizon_closed > 0.95
     assert found.gap_closed > 0.95
+
+
+def test_precision_of_parameters_whatever_the_starts_are():
+    case = _case(np.random.default_rng(10))
+    records = Records(case, case.estimation)
+    end = descend(records, (), np.zeros(0), np.zeros(0), records.at_rest(), iterations=2)
+    shared = replace(end, jacobian=np.column_stack([end.columns.zeros, end.left]))
+    whole = np.linalg.inv(shared.equations(records).hessian)
+    np.testing.assert_allclose(np.linalg.inv(shared.precision(records)), whole[:2, :2], rtol=1e-5)

@@ -45,12 +45,14 @@ class Following:
         )
 
     def differences(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """(T, 2) what the first hypothesis predicts minus what the second does, in noise deviations."""
+        """(T, Y) what the first hypothesis predicts minus what the second does, in noise deviations; outputs
+        that are measured, the hub angle first."""
         assert self.proposal is not None
+        noise = self.competing[0].noise
         first, second = (
             simulate(one.rig, self.proposal.voltage_V, one.effects).output for one in self.competing[:2]
         )
-        return np.asarray((first - second) / self.competing[0].noise)
+        return np.asarray(((first - second) / noise)[:, np.isfinite(noise)])
 
 
 def following(found: Diagnosis) -> Following:
@@ -71,9 +73,9 @@ def following(found: Diagnosis) -> Following:
 def _left(found: Diagnosis) -> tuple[CompetingHypothesis, ...]:
     """Hypotheses by name; a second one only where it is thinkable at all or fits as well."""
     return tuple(
-        replace(one, name=listing([in_words(effect.id) for effect in one.effects] or [in_words("none")]))
+        replace(one, name=listing([in_words(cause) for cause in one.causes] or [in_words("none")]))
         for k, one in enumerate(found.competing)
         if k == 0
         or one.probability >= _THINKABLE
-        or any(effect.id in found.ambiguous_with for effect in one.effects)
+        or any(cause in found.ambiguous_with for cause in one.causes)
     )

@@ -15,7 +15,7 @@ from workflow.figures.registry import drawing
 
 @drawing("gap_next")
 def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequence[str]) -> Figure:
-    """Voltage, and difference (T, 2) of the two likeliest answers in noise deviations, hub before tip."""
+    """Voltage, and difference (T, Y) of the two likeliest answers in noise deviations, hub before tip."""
     time_s = np.arange(proposal.voltage_V.size, dtype=np.float64) * proposal.dt_s
     figure, (above, below) = style.panels(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
     above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
