@@ -35,7 +35,7 @@ _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
 # A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
 _WORSE, _WORSE_BY = 1.15, 0.2
 # What an effect that contains a simpler one has to gain over it.
-_CONTAINING = 2.0
+_CONTAINING = 1.0
 # Logarithm of how much less probable a cause beyond the list is that looks like an effect.
 _UNLISTED = 0.55
 # Sets this far behind in score take no part.
