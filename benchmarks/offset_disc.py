@@ -1,4 +1,4 @@
-"""The disc around a low-order nominal model that holds the truth at a level: what ellipses are compared with."""
+"""The disc around a low-order nominal model that holds the truth at a level: ellipses are compared with it."""
 
 from __future__ import annotations
 
