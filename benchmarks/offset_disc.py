@@ -1,4 +1,4 @@
-"""The disc around a low-order nominal model that holds the truth at a level: ellipses are compared with it."""
+"""The disc around a low-order nominal model that holds the truth at a level, to compare ellipses with."""
 
 from __future__ import annotations
 
