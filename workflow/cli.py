@@ -39,6 +39,7 @@ from workflow.engine.errors import (
 from workflow.engine.threads import one_thread
 
 if TYPE_CHECKING:
+    from control_design.controllers.c_code import Dialect
     from workflow.tasks.summary import RunSummary
 
 app = typer.Typer(
@@ -61,6 +62,12 @@ Resume = Annotated[
 ]
 Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
+CPrefix = Annotated[
+    str, typer.Option("--c-prefix", help="What names in the C code begin with: PREFIX_step, PREFIX_state.")
+]
+CFloat = Annotated[
+    bool, typer.Option("--c-float", help="C code in float instead of double; fixed point is left out.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -90,6 +97,8 @@ def run(
     ] = None,
     resume: Resume = False,
     replace: Replace = False,
+    c_prefix: CPrefix = "controller",
+    c_float: CFloat = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -100,7 +109,14 @@ def run(
     with TerminalProgress(quiet=quiet) as progress:
         from workflow.commands.run import run_from_files  # a word comes first: it takes its time to load
 
-        summary = run_from_files(config, out, resume=resume, replace=replace, progress=progress)
+        summary = run_from_files(
+            config,
+            out,
+            resume=resume,
+            replace=replace,
+            dialect=_dialect(c_prefix, c_float),
+            progress=progress,
+        )
     _show(summary, as_json)
     _leave(summary)
 
@@ -385,6 +401,8 @@ def design(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
+    c_prefix: CPrefix = "controller",
+    c_float: CFloat = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -395,7 +413,14 @@ def design(
     with TerminalProgress(quiet=quiet) as progress:
         from workflow.commands.design import design_controller
 
-        summary = design_controller(source, specification, out=out, seed=seed, progress=progress)
+        summary = design_controller(
+            source,
+            specification,
+            out=out,
+            seed=seed,
+            dialect=_dialect(c_prefix, c_float),
+            progress=progress,
+        )
     _show(summary, as_json)
     _leave(summary)
 
@@ -505,6 +530,14 @@ def diagnose(
         _complain(line, found.exit_code)
     if found.exit_code != EXIT_OK:
         raise typer.Exit(found.exit_code)
+
+
+def _dialect(prefix: str, single: bool) -> Dialect:
+    from control_design.controllers.c_code import Dialect
+    from workflow.engine.errors import naming
+
+    with naming("--c-prefix"):
+        return Dialect(prefix, "float" if single else "double")
 
 
 def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:

@@ -113,6 +113,30 @@ def test_single_precision_agrees_to_its_own_rounding(tmp_path):
 
 
 @needs_compiler
+@pytest.mark.parametrize("number", ["double", "float"])
+@pytest.mark.parametrize("limits", [{}, {"input_limit": 0.5}, {"rate_limit": 15.0}])
+def test_limits_and_anti_windup_are_there_where_they_are_given(tmp_path, number, limits):
+    controller = _controller(3, **limits)
+    text = c_source(controller, "arm", number)
+    for words in (" M[3]", "int limited", "M[i] * (command - wanted)"):
+        assert (words in text) == bool(limits)
+    assert ("INPUT_LIMIT" in text) == ("input_limit" in limits)
+    assert ("state->last" in text) == ("LARGEST_CHANGE" in text) == ("rate_limit" in limits)
+    assert ("double" in text) == (number == "double")
+    step, reset = _compiled(controller, tmp_path, number)
+    reset()
+    expected = _closed_loop(controller.stepper().step)
+    # Rounding of 24 bits, which the loop carries on for a few hundred samples.
+    tolerance = (1e-12 if number == "double" else 1e-3) * np.max(np.abs(expected))
+    np.testing.assert_allclose(_closed_loop(step), expected, rtol=0, atol=tolerance)
+
+
+def test_a_type_that_is_none_of_c_is_refused():
+    with pytest.raises(ValueError, match="'double' or 'float'; got 'int16_t'"):
+        c_source(_controller(1), number="int16_t")
+
+
+@needs_compiler
 def test_header_and_source_belong_together(tmp_path):
     controller = _controller(2, name="a */ tricky name \n")
     (tmp_path / "arm.h").write_text(c_header(controller, "arm"))

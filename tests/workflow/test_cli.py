@@ -310,6 +310,12 @@ def test_design_writes_what_the_ending_asks_for(flexlink, fast_run, tmp_path):
     same = Controller.from_json((tmp_path / "controller.json").read_text())
     assert np.array_equal(Controller.load_mat(tmp_path / "controller.mat").A, same.A)
     assert f"{float(same.C[0, 0])!r}" in (tmp_path / "controller.c").read_text()
+    own = tmp_path / "hub.c"
+    flexlink("design", fast_run[0], "--out", own, "--c-prefix", "hub", "--c-float", "--json").document()
+    assert "float hub_step(hub_state *state, float error" in own.with_suffix(".h").read_text()
+    assert "double" not in own.read_text()
+    wrong = flexlink("design", fast_run[0], "--out", own, "--c-prefix", "7")
+    assert (wrong.code, wrong.err) == (2, "flexlink: --c-prefix: prefix must be a C identifier; got '7'\n")
     refused = flexlink("design", fast_run[0], "--out", tmp_path / "controller.txt")
     assert refused.code == 2
     assert ".json, .mat, .c" in refused.err

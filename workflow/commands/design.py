@@ -11,6 +11,7 @@ from workflow.engine.errors import InputError, need
 from workflow.engine.progress import Progress
 
 if TYPE_CHECKING:
+    from control_design.controllers.c_code import Dialect
     from workflow.tasks.summary import RunSummary
 
 
@@ -20,14 +21,16 @@ def design_controller(
     *,
     out: Path | None = None,
     seed: int = 2006,
+    dialect: Dialect | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
 
     Without a design file the source must be a run directory, whose own specification is taken. With `out` the
     controller is written, by its ending as JSON, MAT file or C source, and beside it a reference filter if
-    there is one; a controller that is not certified carries that in its name. A specification that no
-    controller can meet is a result (not certified, the reason in `verdict`), as in a run. Raises InputError.
+    there is one (`dialect` says how C is written); a controller that is not certified carries that in its
+    name. A specification that no controller can meet is a result (not certified, the reason in `verdict`), as
+    in a run. Raises InputError.
     """
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(path) for path in sources]
     if not paths:
@@ -38,5 +41,11 @@ def design_controller(
     from workflow.commands.designed import designed
 
     return designed(
-        paths, file, name=str(specification_path or paths[0]), out=out, seed=seed, progress=progress
+        paths,
+        file,
+        name=str(specification_path or paths[0]),
+        out=out,
+        seed=seed,
+        dialect=dialect,
+        progress=progress,
     )

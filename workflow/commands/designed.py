@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from control_design.controllers.c_code import Dialect
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from workflow.config.design_file import DesignFile
@@ -71,6 +72,7 @@ def designed(
     name: str,
     out: Path | None,
     seed: int,
+    dialect: Dialect | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """`design_controller` with the design file that was read; name: what to call it in a complaint."""
@@ -98,7 +100,9 @@ def designed(
     if out is not None and synthesis is not None and certificate is not None:
         found = done.reference_filter.filter
         known = "; ".join(dict.fromkeys(source.certified_for for source in sources_found))
-        files = write_controller(out, synthesis.controller, found, certified=certified, about=known)
+        files = write_controller(
+            out, synthesis.controller, found, certified=certified, about=known, dialect=dialect
+        )
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None

@@ -11,6 +11,7 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
 
 if TYPE_CHECKING:
+    from control_design.controllers.c_code import Dialect
     from workflow.tasks.summary import RunSummary
 
 
@@ -20,12 +21,14 @@ def run_from_files(
     *,
     resume: bool = False,
     replace: bool = False,
+    dialect: Dialect | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Load a configuration and run it; see `run_pipeline`.
 
     Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
-    without `out` a new directory below runs/ is made. Raises InputError.
+    without `out` a new directory below runs/ is made. `dialect` says how controller.c is written. Raises
+    InputError.
     """
     if (resume or replace) and out is None:
         raise InputError(
@@ -53,6 +56,7 @@ def run_from_files(
         page=REPORT,
         resume=resume,
         replace=replace,
+        dialect=dialect,
         progress=progress,
     )
 

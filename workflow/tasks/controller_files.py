@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from control_design.controllers.c_code import c_header, c_source
+from control_design.controllers.c_code import Dialect, c_header, c_source
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from workflow.engine import codec, storage
@@ -21,9 +22,11 @@ RUN_FILES = ("controller.json", "controller.c", "controller.h")
 """What a run leaves in its directory; those of a reference filter are named after them (`filter_file`)."""
 
 
-def _noted(code: str) -> bytes:
+def _noted(code: Callable[..., str], found: ReferenceFilter, dialect: Dialect) -> bytes:
     """The C code of a reference filter behind a note on how it is called."""
-    return f"{render_text('reference_filter_note.h.j2').rstrip()}\n{code}".encode("ascii")
+    names = dialect.beside("reference_filter")
+    note = render_text("reference_filter_note.h.j2", prefix=names.prefix).rstrip()
+    return f"{note}\n{code(_as_law(found), names.prefix, names.number)}".encode("ascii")
 
 
 def _mat(controller: Controller) -> bytes:
@@ -52,17 +55,17 @@ def _as_law(found: ReferenceFilter) -> Controller:
     )
 
 
-_CONTROLLER: Mapping[str, Callable[[Controller], bytes]] = {
-    ".json": lambda controller: controller.to_json().encode(),
-    ".mat": _mat,
-    ".c": lambda controller: c_source(controller).encode("ascii"),
-    ".h": lambda controller: c_header(controller).encode("ascii"),
+_CONTROLLER: Mapping[str, Callable[[Controller, Dialect], bytes]] = {
+    ".json": lambda controller, _: controller.to_json().encode(),
+    ".mat": lambda controller, _: _mat(controller),
+    ".c": lambda controller, c: c_source(controller, c.prefix, c.number).encode("ascii"),
+    ".h": lambda controller, c: c_header(controller, c.prefix, c.number).encode("ascii"),
 }
-_FILTER: Mapping[str, Callable[[ReferenceFilter], bytes]] = {
-    ".json": lambda found: found.to_json().encode(),
-    ".mat": _filter_mat,
-    ".c": lambda found: _noted(c_source(_as_law(found), "reference_filter")),
-    ".h": lambda found: _noted(c_header(_as_law(found), "reference_filter")),
+_FILTER: Mapping[str, Callable[[ReferenceFilter, Dialect], bytes]] = {
+    ".json": lambda found, _: found.to_json().encode(),
+    ".mat": lambda found, _: _filter_mat(found),
+    ".c": partial(_noted, c_source),
+    ".h": partial(_noted, c_header),
 }
 SUFFIXES = (".json", ".mat", ".c")
 
@@ -72,9 +75,9 @@ def filter_file(controller_file: Path) -> Path:
     return controller_file.with_name(f"{controller_file.stem}_reference_filter{controller_file.suffix}")
 
 
-def filter_bytes(found: ReferenceFilter, suffix: str) -> bytes:
+def filter_bytes(found: ReferenceFilter, suffix: str, dialect: Dialect = Dialect()) -> bytes:  # noqa: B008
     """The file's content, by the ending."""
-    return _FILTER[suffix.lower()](found)
+    return _FILTER[suffix.lower()](found, dialect)
 
 
 def targets(out: Path) -> list[Path]:
@@ -91,16 +94,20 @@ def write_controller(
     *,
     certified: bool,
     about: str = "",
+    dialect: Dialect | None = None,
 ) -> list[Path]:
     """Write the `targets` of `out` where their content is not there already; the files there are now.
 
-    about: what it is certified for.
+    about: what it is certified for; dialect: of the C code.
     """
+    c = dialect or Dialect()
     known = f", certified for {about}" if about else ""
     law = replace(controller, name=controller.name + (known if certified else " (NOT CERTIFIED)"))
-    content = {path: _CONTROLLER[path.suffix.lower()](law) for path in targets(out)}
+    content = {path: _CONTROLLER[path.suffix.lower()](law, c) for path in targets(out)}
     if reference_filter is not None:
-        content |= {filter_file(path): filter_bytes(reference_filter, path.suffix) for path in targets(out)}
+        content |= {
+            filter_file(path): filter_bytes(reference_filter, path.suffix, c) for path in targets(out)
+        }
     for path, data in content.items():
         if not path.is_file() or path.read_bytes() != data:
             storage.write_bytes(path, data)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from control_design.controllers.c_code import Dialect
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
@@ -31,14 +32,15 @@ def run_pipeline(
     resume: bool = False,
     replace: bool = False,
     page: Stage | None = None,
+    dialect: Dialect | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
     `config_text` is kept as config.toml (the file as the user wrote it; `called` in complaints); `resume`
     takes up a run that is there, `replace` starts it afresh; `page` is the stage that comes last and writes
-    the page. A result that is not certified is no error: the page is written all the same and
-    `RunSummary.certified` says so.
+    the page; `dialect` says how controller.c is written. A result that is not certified is no error: the page
+    is written all the same and `RunSummary.certified` says so.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -74,7 +76,7 @@ def run_pipeline(
             for stage in stages:
                 before = (ready, ready_s) if stage is first else None
                 _perform(stage, config, results, progress, inputs, before)
-            _keep_controller(results, config)
+            _keep_controller(results, config, dialect)
             summary = summarise(results, config)
         except KeyboardInterrupt:
             run.record_status("interrupted")
@@ -155,7 +157,7 @@ def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs:
     )
 
 
-def _keep_controller(results: RunResults, config: RunConfig) -> None:
+def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect | None) -> None:
     """controller.json, .c and .h in the run directory; none of an earlier design stay."""
     design, certify = results.design, results.certify
     written: list[Path] = []
@@ -164,7 +166,7 @@ def _keep_controller(results: RunResults, config: RunConfig) -> None:
         law = second.law(design.synthesis.controller)
         about = certified_for(results, config)
         written = write_controller(
-            results.run.path, law, second.filter, certified=certify.certified, about=about
+            results.run.path, law, second.filter, certified=certify.certified, about=about, dialect=dialect
         )
     for name in CONTROLLER_FILES:
         if results.run.path / name not in written:
