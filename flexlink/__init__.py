@@ -13,7 +13,8 @@ Controllers `UncertainPlant`, `Specification`, `RationalWeight`, `synthesise`, `
             `Certificate`, `Controller`, `simulate_loop`, `step_metrics`, `c_source`
 Machines    `Rig`, `paper_link`, `effect`, `simulate`, `SampledArm`, `prbs`, `multisine`
 Causes      `Case`, `Experiment`, `diagnose`, `Diagnosis`
-Pictures    `plot`
+Pictures    `plot`, `bode`, `compare`
+Tables      `table`
 
 `LoopRun`, `Simulation` and `SynthesisResult` are what `simulate_loop`, `simulate` and `synthesise` return.
 """
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from flexlink.machines import *
     from flexlink.models import *
     from flexlink.pictures import *
+    from flexlink.tables import *
 
 _MODULES = {
     "models": (
@@ -50,7 +52,10 @@ _MODULES = {
         "Case", "Diagnosis", "Experiment", "diagnose",
     ),
     "pictures": (
-        "plot",
+        "bode", "compare", "plot",
+    ),
+    "tables": (
+        "table",
     ),
 }  # fmt: skip
 _WHERE = {name: module for module, names in _MODULES.items() for name in names}

@@ -17,6 +17,8 @@ __all__ = ["Case", "Diagnosis", "Experiment", "diagnose"]
 class Diagnosis(Shown, answer.Diagnosis):
     """What `diagnose` found, see there: `flexlink.Diagnosis` is `diagnosis.Diagnosis` that shows itself."""
 
+    table_in_notebook = True
+
 
 def diagnose(case: Any, **more: Any) -> Diagnosis:
     """Which effect explains the gap between a rig and its records; arguments as `diagnosis.diagnose`.

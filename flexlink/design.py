@@ -90,6 +90,7 @@ class SynthesisResult(Shown, synthesis_result.SynthesisResult):
 class Certificate(Shown, certificate.Certificate):
     """What `certify` checked, and on what."""
 
+    table_in_notebook = True
     controller: Controller | None = None
     uncertain_plants: tuple[plant_set.UncertainPlant, ...] = ()
     specification: Specification = field(default_factory=Specification)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,8 +12,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ValidationError
 
 from flexlink.shown import Shown, dressed
-from ident.basis import posterior
-from ident.basis.model import GobfModel
+from ident.basis import model, posterior
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -20,6 +20,7 @@ from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record as PlainRecord
 from ident.data.signal_filter import band_limited
+from ident.data.table import Table
 from ident.frequency_fit import identify_frf
 from ident.identification import Identification as Identified
 from ident.one_input import identify as identify_records
@@ -114,6 +115,56 @@ class Record(Shown, PlainRecord):
             **more,
         )
 
+    @classmethod
+    def from_table(
+        cls,
+        table: Any,
+        input: str,  # noqa: A002 (as in the command line)
+        output: str,
+        *,
+        time: str | None = None,
+        **more: Any,
+    ) -> Record:
+        """Columns of a `pandas.DataFrame`, checked like those of a file.
+
+        time: a column of numbers (its unit as in its name, else seconds) or of instants; without it the index
+        is taken where it is one of times, else dt_s has to be given. The other arguments as `from_file`.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> log = pd.DataFrame({"t_ms": [0, 5, 10, 15], "u_V": [1.0, 1, 0, 0], "hub_rad": [0, 0.1, 0.2, 0.2]})
+        >>> flexlink.Record.from_table(log, "u_V", "hub_rad", time="t_ms")
+        Record 'table': 4 samples, every 0.005 s, 0.02 s in all
+          u_V -> hub_rad
+          time column 't_ms' in ms
+        >>> log.index = pd.date_range("2024-03-01", periods=4, freq="5ms")
+        >>> flexlink.Record.from_table(log, "u_V", "hub_rad").dt_s
+        0.005
+        """
+        columns = {str(name): table[name].to_numpy() for name in table.columns}
+        if time is None and "dt_s" not in more:
+            columns["index"], time = table.index.to_numpy(), "index"
+            if columns["index"].dtype.kind not in "mM":
+                raise ValueError("give time, the name of a column, or dt_s: the table's index holds no times")
+        return cls.from_file(Table(Path("table"), columns), [input], [output], time=time, **more)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GobfModel(Shown, model.GobfModel):
+    """Poles and coefficients of a model on generalised orthonormal basis functions, as
+    `ident.basis.model.GobfModel`, that shows itself.
+
+    Examples
+    --------
+    >>> poles = flexlink.Poles.from_continuous(omega_rad_s=[20.0], zeta=[0.05], dt_s=0.01)
+    >>> flexlink.GobfModel(poles, [0.1, 0.2], dt_s=0.01)
+    GobfModel of order 2, u -> y, dt = 0.01 s
+      mode at 20 rad/s (3.18 Hz), damping ratio 0.05
+    """
+
+    table_in_notebook = True
+
 
 def _either(short: str, first: Any, long: str, second: Any) -> Any:
     if (first is None) == (second is None):
@@ -155,6 +206,7 @@ class Identification(Shown, Identified):
     array([20.])
     """
 
+    table_in_notebook = True
     records: tuple[PlainRecord, ...] = ()
 
     def to_control(self) -> Any:
@@ -179,7 +231,7 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
         """The model on the identified poles that is nearest to the centre in units of the ellipses."""
         nyquist = np.pi / self.dt_s
         omega = np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
-        return nominal_near(self, self.nominal_poles, omega)
+        return dressed(GobfModel, nominal_near(self, self.nominal_poles, omega))
 
     def at_modes(self) -> list[tuple[float, float]]:
         """(frequency [rad/s], major semi-axis of the 95 % ellipse / gain) at every mode of the model."""
@@ -211,7 +263,8 @@ def identify(
     """
     chosen = _options(IdentOptions, options, settings)
     used = (records,) if isinstance(records, PlainRecord) else tuple(records)
-    return dressed(Identification, identify_records(used, chosen), records=used)
+    found = identify_records(used, chosen)
+    return dressed(Identification, found, model=dressed(GobfModel, found.model), records=used)
 
 
 def uncertainty(

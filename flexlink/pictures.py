@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import singledispatch
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
-from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.plant_set import UncertainPlant, frequency_response
 from control_design.specification import Specification
 from diagnosis.answer import Diagnosis
 from flexlink.design import Certificate, LoopRun, SynthesisResult
@@ -23,7 +24,7 @@ from ident.uncertainty import ResponsePosterior
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot"]
+__all__ = ["bode", "compare", "plot"]
 
 
 @singledispatch
@@ -40,6 +41,68 @@ def plot(result: object) -> Figure:
     ['time, all records [s]', 'time in this record [s]']
     """
     raise TypeError(f"there is no picture of a {type(result).__name__}")
+
+
+def bode(result: Any) -> Figure:
+    """Gain, phase and size of the ellipses of one response: an identification, a model, an uncertainty, a
+    measured response, an uncertain plant, a controller, or a discrete SISO system of python-control.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> [axes.get_ylabel() for axes in flexlink.bode(found).axes[:3]]
+    ['gain [as logged]', 'phase [deg]', 'ellipse / gain [%]']
+    """
+    model = getattr(result, "model", result)
+    return _bode(as_response(result), getattr(model, "input_name", "u"), getattr(model, "output_name", "y"))
+
+
+def compare(*results: Any, names: Sequence[str] = ()) -> Figure:
+    """Several responses on one plot, each as for `bode`; ellipses as bands where there are any.
+
+    names: of the curves, in the same order. Raises ValueError for another number of names, TypeError for
+    what has no response.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> rough = flexlink.identify(example_record(), n_pairs=0, n_real=2)
+    >>> figure = flexlink.compare(found, rough, names=["one mode", "two lags"])
+    >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    ['one mode', 'two lags']
+    """
+    from workflow.figures.bode import draw_comparison
+
+    chosen = list(names) or [f"{k + 1}: {type(result).__name__}" for k, result in enumerate(results)]
+    if not results or len(chosen) != len(results):
+        raise ValueError(f"expected a name for each response; got {len(results)} and {len(chosen)} names")
+    return draw_comparison(dict(zip(chosen, map(as_response, results), strict=True)))
+
+
+def as_response(result: Any) -> FrequencyUncertainty:
+    """The response of a result over three decades up to its Nyquist frequency, or where it was measured, with
+    its ellipses; without size where it is taken as exact."""
+    found = getattr(result, "model", result)
+    if isinstance(found, FrequencyUncertainty):
+        return found
+    if isinstance(found, UncertainPlant):
+        if isinstance(found.uncertainty, (FrequencyUncertainty, ResponsePosterior)):
+            return as_response(found.uncertainty)
+        found = found.nominal
+    dt_s = getattr(found, "dt_s", getattr(found, "dt", None))
+    if not isinstance(dt_s, float) or not dt_s > 0:
+        raise TypeError(f"a {type(result).__name__} has no response in discrete time")
+    omega = _grid(dt_s)
+    if isinstance(found, ResponsePosterior):
+        return found.at(omega)
+    if isinstance(found, GobfModel):
+        centre = found.frequency_response(omega)
+    elif hasattr(found, "to_control") or hasattr(found, "A"):
+        system = found.to_control() if hasattr(found, "to_control") else found
+        centre = frequency_response(system, omega)
+    else:
+        raise TypeError(f"a {type(result).__name__} has no response")
+    return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), dt_s)
 
 
 @plot.register(Record)
@@ -71,17 +134,12 @@ def _poles(found: Identification) -> Figure:
 
 @plot.register(GobfModel)
 def _model(model: GobfModel) -> Figure:
-    omega = _grid(model.dt_s)
-    exact = FrequencyUncertainty(
-        omega, model.frequency_response(omega), np.zeros((omega.size, 2, 2)), model.dt_s
-    )
-    return _bode(exact, model.input_name, model.output_name)
+    return bode(model)
 
 
 @plot.register(ResponsePosterior)
 def _response(uncertainty: ResponsePosterior) -> Figure:
-    response = uncertainty.at(_grid(uncertainty.dt_s))
-    return _bode(response, uncertainty.input_name, uncertainty.output_name)
+    return bode(uncertainty)
 
 
 @plot.register(FrequencyUncertainty)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import html
 from dataclasses import fields
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 T = TypeVar("T")
@@ -16,12 +17,17 @@ T = TypeVar("T")
 class Shown:
     """Put before the class of a result: the sentences are the macro of the same name in results.j2."""
 
+    table_in_notebook: ClassVar[bool] = False  # where it is short, and says more than the sentences
+
     def __repr__(self) -> str:
         return "\n".join(_lines(self))
 
     def _repr_html_(self) -> str:
         first, *others = (html.escape(line.strip()) for line in _lines(self))
-        return f"<p>{'<br>'.join([f'<b>{first}</b>', *others])}</p>"
+        said = f"<p>{'<br>'.join([f'<b>{first}</b>', *others])}</p>"
+        if not self.table_in_notebook:
+            return said
+        return said + self.table().to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)
 
     def plot(self) -> Figure:
         """The picture one wants of it (matplotlib is imported now); see `flexlink.plot`."""
@@ -29,10 +35,16 @@ class Shown:
 
         return plot(self)
 
+    def table(self) -> pd.DataFrame:
+        """The result as a tidy table; see `flexlink.table`."""
+        from flexlink import table
+
+        return table(self)
+
 
 def dressed(kind: type[T], value: Any, **more: Any) -> T:
     """A numerical result as the class of the front door that shows itself; the fields are the same."""
-    return kind(**{field.name: getattr(value, field.name) for field in fields(value)}, **more)
+    return kind(**{field.name: getattr(value, field.name) for field in fields(value)} | more)
 
 
 def _lines(result: object) -> list[str]:

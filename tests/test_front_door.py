@@ -54,7 +54,15 @@ GIVEN = {
 
 @pytest.mark.parametrize(
     "module",
-    ["__init__", "models", "design", "machines", "pictures", pytest.param("causes", marks=pytest.mark.slow)],
+    [
+        "__init__",
+        "models",
+        "design",
+        "machines",
+        "pictures",
+        "tables",
+        pytest.param("causes", marks=pytest.mark.slow),
+    ],
 )
 def test_examples_run(module):
     found = import_module("flexlink" if module == "__init__" else f"flexlink.{module}")
@@ -96,17 +104,56 @@ def test_results_show_draw_and_convert():
     certificate = flexlink.certify(given, plant, asked)
     run = flexlink.simulate_loop(given, plant, [1.0] * 100)
     machine = flexlink.simulate(flexlink.paper_link(), record.input[:100, 0])
-    for result in (record, found, spread, certificate, run, machine):
+    for result in (record, found, found.model, spread, certificate, run, machine):
         assert "object at" not in repr(result)
         assert result._repr_html_().startswith("<p><b>")
         assert isinstance(result.plot(), Figure)
+        assert len(result.table()) > 0
+    assert "mode" in found._repr_html_().partition("<table")[2]
+    assert certificate.items[0].requirement in certificate._repr_html_().partition("<table")[2]
     assert "Certified" in repr(certificate)
     assert isinstance(flexlink.plot(found.model), Figure)
     np.testing.assert_allclose(found.to_control().poles(), found.model.to_control().poles())
     assert spread.to_control().dt == record.dt_s
     assert type(record.slice(0, 10)) is flexlink.Record
-    with pytest.raises(TypeError, match="no picture of a int"):
-        flexlink.plot(1)
+    for call in (flexlink.plot, flexlink.bode, flexlink.table):
+        with pytest.raises(TypeError, match="int"):
+            call(1)
+
+
+def test_tables_say_what_the_results_say():
+    record, plant = example_record(), example_plant()
+    found = flexlink.identify(record, n_pairs=1, n_real=0)
+    row = found.table().iloc[0]
+    assert row["omega_rad_s"] == found.model.poles.omega_rad_s(0.01)[0] == 2 * np.pi * row["frequency_Hz"]
+    spread = flexlink.uncertainty(found)
+    rows = spread.table()
+    assert (rows["gain_low"] <= rows["gain"]).all()
+    assert (rows["gain"] <= rows["gain_high"]).all()
+    again = flexlink.Record.from_table(record.table(), "u", "y", time="time_s")
+    np.testing.assert_array_equal(again.output, record.output)
+    with pytest.raises(ValueError, match="index holds no times"):
+        flexlink.Record.from_table(record.table(), "u", "y")
+    with pytest.raises(ValueError, match="no column 'v'"):
+        flexlink.Record.from_table(record.table(), "v", "y", time="time_s")
+    result = flexlink.synthesise(plant, example_specification(), flexlink.SynthesisOptions(starts=1))
+    assert result.table().columns.to_list() == ["plant", "weight", "omega_rad_s", "value"]
+
+
+def test_responses_of_any_origin_on_one_plot():
+    record, plant = example_record(), example_plant()
+    found = flexlink.identify(record, n_pairs=1, n_real=0)
+    measured = flexlink.empirical_frf([record])
+    system = found.to_control()
+    figure = flexlink.compare(found, flexlink.uncertainty(found), measured, plant, system)
+    lines = figure.axes[0].get_lines()
+    # The system of python-control is the identified model.
+    np.testing.assert_allclose(lines[4].get_ydata(), lines[0].get_ydata(), rtol=1e-6)
+    np.testing.assert_array_equal(lines[2].get_xdata(), measured.omega_rad_s)
+    with pytest.raises(ValueError, match="a name for each response; got 2 and 1 names"):
+        flexlink.compare(found, plant, names=["one"])
+    with pytest.raises(TypeError, match="discrete time"):
+        flexlink.bode(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy as np
 from ident.data.arrays import RealArray, readonly_real
 from ident.data.finding import Finding
 from ident.data.record_files import read_table
+from ident.data.table import Table
 from ident.data.time_grid import Repair, TimeGrid
 from ident.data.units import TimeColumn
 
@@ -175,7 +176,7 @@ class Record:
     @classmethod
     def from_file(
         cls,
-        path: str | PathLike[str],
+        path: str | PathLike[str] | Table,
         inputs: Sequence[str],
         outputs: Sequence[str],
         *,
@@ -189,7 +190,7 @@ class Record:
         units: Mapping[str, str] | None = None,
         repair: bool = False,
     ) -> Self:
-        """Read columns of a CSV, npz or MATLAB file; readers and checks: `ident.data.record_files`.
+        """Read columns of a log file, or of a table that is there; readers: `ident.data.record_files`.
 
         The sampling time comes from the column `time`, from dt_s, or from both if they agree. The unit of
         the time stamps is time_unit, else the one in the column's name ('t_ms', 'Zeit [ms]'), else seconds;
@@ -198,7 +199,7 @@ class Record:
         repair: stamps that jitter, and single missing rows, are put on a uniform grid (`TimeGrid`), not
         refused. Raises ValueError in one line naming file and place.
         """
-        table = read_table(path)
+        table = path if isinstance(path, Table) else read_table(path)
         for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
             if isinstance(names, str):
                 raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,29 @@ def draw_bode(
         size.set_ylim(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max())))
     size.set(xlabel="frequency [rad/s]", ylabel="ellipse / gain [%]")
     gain.set_xlim(omega[0], omega[-1])
+    style.hertz_axis(gain)
+    return figure
+
+
+@style.finished
+def draw_comparison(responses: Mapping[str, FrequencyUncertainty]) -> Figure:
+    """Gain and phase of several responses by name, with bands where they have ellipses."""
+    figure, (gain, phase) = style.panels(6.0, 2, 1, sharex=True, height_ratios=[1.4, 1.0])
+    colours = (style.MODEL, style.ACHIEVED, style.PREDICTED, style.LIMIT, style.HIGHLIGHT, style.MEASURED)
+    lines = ("-", (0, (5, 2)), (0, (1, 1.5)))
+    for k, (name, response) in enumerate(responses.items()):
+        band, colour = response_band(response), colours[k % len(colours)]
+        drawn: dict[str, Any] = {"color": colour, "lw": 1.4, "ls": lines[k // len(colours) % len(lines)]}
+        gain.plot(band.omega_rad_s, band.gain, **drawn, label=style.plain(name, 40))
+        phase.plot(band.omega_rad_s, band.phase_deg, **drawn)
+        if np.any(response.covariance):
+            filled: dict[str, Any] = {"color": colour, "alpha": 0.25, "lw": 0}
+            floor = _gain_floor(band.gain, np.empty(0))
+            gain.fill_between(band.omega_rad_s, np.maximum(band.gain_low, floor), band.gain_high, **filled)
+            phase.fill_between(band.omega_rad_s, band.phase_low_deg, band.phase_high_deg, **filled)
+    gain.set(xscale="log", yscale="log", ylabel="gain [as logged]", title="Responses compared")
+    phase.set(ylabel="phase [deg]", xlabel="frequency [rad/s]")
+    gain.legend()
     style.hertz_axis(gain)
     return figure
 

@@ -1,0 +1,112 @@
+"""Results as tidy tables (pandas): one row per pole, frequency, requirement, effect or sample."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+
+import numpy as np
+import pandas as pd
+
+from diagnosis.answer import Diagnosis
+from flexlink.design import Certificate, LoopRun, SynthesisResult
+from flexlink.machines import Simulation
+from flexlink.pictures import as_response
+from ident.basis.model import GobfModel
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.record import Record
+from ident.identification import Identification
+from ident.uncertainty import ResponsePosterior
+from workflow.figures.bands import response_band
+
+__all__ = ["table"]
+
+
+@singledispatch
+def table(result: object) -> pd.DataFrame:
+    """A result as a `pandas.DataFrame`, units in the names of the columns; also `result.table()`.
+
+    Record, simulation, closed loop: a row per sample. Model, identification: a row per mode or real pole.
+    Uncertainty, measured response: a row per frequency, gain and phase with the ends of their ellipses.
+    Certificate: a row per requirement. Synthesis: a row per frequency that limits it. Diagnosis: a row per
+    effect and parameter with its 95 % interval. Raises TypeError for anything else.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> flexlink.table(found)[["kind", "omega_rad_s", "zeta"]].round(3)
+       kind  omega_rad_s  zeta
+    0  mode         20.0  0.05
+    >>> found.records[0].table().columns.to_list()
+    ['time_s', 'u', 'y']
+    """
+    raise TypeError(f"there is no table of a {type(result).__name__}")
+
+
+@table.register(Record)
+def _record(record: Record) -> pd.DataFrame:
+    columns = {"time_s": record.dt_s * np.arange(record.n_samples)}
+    for names, signals in (
+        (record.input_names, record.input),
+        (record.output_names, record.output),
+        (record.reference_names, record.reference),
+    ):
+        if signals is not None:
+            columns |= dict(zip(names, signals.T, strict=True))
+    return pd.DataFrame(columns)
+
+
+@table.register(Simulation)
+def _simulation(simulation: Simulation) -> pd.DataFrame:
+    return pd.DataFrame(vars(simulation))
+
+
+@table.register(LoopRun)
+def _run(run: LoopRun) -> pd.DataFrame:
+    names = ("time_s", "reference", "measured", "command", "limited")
+    return pd.DataFrame({name: getattr(run, name) for name in names})
+
+
+@table.register(GobfModel)
+def _model(model: GobfModel) -> pd.DataFrame:
+    """zeta and omega of a pair are those of the continuous pole that samples to it; a real pole has the rate
+    at which it decays."""
+    poles, dt_s = model.poles, model.dt_s
+    omega = poles.omega_rad_s(dt_s)
+    modes = pd.DataFrame({"kind": "mode", "omega_rad_s": omega, "zeta": poles.zeta()})
+    decays = pd.DataFrame({"kind": "real pole", "decay_per_s": poles.decay_per_s(dt_s)})
+    rows = pd.concat([part for part in (modes, decays) if len(part)] or [modes], ignore_index=True)
+    rows = rows.reindex(columns=["kind", "omega_rad_s", "frequency_Hz", "zeta", "decay_per_s"])
+    return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
+
+
+@table.register(Identification)
+def _identification(found: Identification) -> pd.DataFrame:
+    return _model(found.model)
+
+
+@table.register(ResponsePosterior)
+@table.register(FrequencyUncertainty)
+def _response(found: ResponsePosterior | FrequencyUncertainty) -> pd.DataFrame:
+    return pd.DataFrame(vars(response_band(as_response(found))))
+
+
+@table.register(Certificate)
+def _certificate(certificate: Certificate) -> pd.DataFrame:
+    return pd.DataFrame([vars(item) for item in certificate.items])
+
+
+@table.register(SynthesisResult)
+def _synthesis(result: SynthesisResult) -> pd.DataFrame:
+    return pd.DataFrame([vars(point) for point in result.blocking])
+
+
+@table.register(Diagnosis)
+def _diagnosis(found: Diagnosis) -> pd.DataFrame:
+    rows = []
+    for effect in found.effects:
+        about = {"effect": effect.name, "probability": effect.probability, "presence": effect.presence}
+        for name, value in effect.parameters.items() or [(None, np.nan)]:
+            low, high = effect.intervals.get(str(name), (np.nan, np.nan))
+            sized = {"parameter": name, "value": value, "low": low, "high": high}
+            rows.append({**about, **sized, "gap_after": effect.gap_after})
+    return pd.DataFrame(rows)
