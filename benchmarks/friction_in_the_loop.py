@@ -34,8 +34,13 @@ from ident.friction import fit_friction
 from plant import SampledArm, parse_effect
 from plant.machine import DryFriction
 from workflow.config.run_config import SimulatedSource, built_in_config
-from workflow.tasks.friction_check import TOLERANCE_PERCENT
-from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, predicted_peak
+from workflow.tasks.friction_loop import (
+    TOLERANCE_PERCENT,
+    FrictionLoop,
+    drawn,
+    friction_feedforward,
+    predicted_peak,
+)
 from workflow.tasks.loop_sensitivity import SensitivityPlan, plan_sensitivity, rms_of, settling_samples
 from workflow.tasks.simulated_rig import EncodedArm, rig_of, simulate_record
 

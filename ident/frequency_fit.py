@@ -12,7 +12,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.checks.plausible_modes import pairs_outside
+from ident.checks.plausible_modes import pairs_outside, pole_warnings
 from ident.data.arrays import RealArray, lock
 from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -21,7 +21,6 @@ from ident.fit.refinement import pole_system
 from ident.one_input import in_order
 from ident.search.order_selection import OrderSelection, OrderStep
 from ident.search.pole_search import PoleSearch
-from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import SearchTrace
 from ident.uncertainty.embedding import embed_response
 

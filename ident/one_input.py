@@ -17,7 +17,7 @@ from ident.basis.poles import Poles
 from ident.checks.input_checks import advice, refuse_unusable
 from ident.checks.integrators_prior import integrators_test
 from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
-from ident.checks.plausible_modes import implausible_pairs
+from ident.checks.plausible_modes import implausible_pairs, pole_warnings
 from ident.checks.prior_tests import (
     best_under_relative_degree,
     delay_test,
@@ -37,7 +37,6 @@ from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import Fitted, PoleSearch
-from ident.search.pole_warnings import pole_warnings
 from ident.search.search_trace import PolishedMinimum, SearchTrace
 
 # Initial states that raise the residual of a fit from rest by this factor may have led its search astray.

@@ -15,6 +15,7 @@ import numpy as np
 from ident.basis.miso_model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.checks.input_checks import few_samples, least_independence, refuse_unusable
+from ident.checks.plausible_modes import pole_warnings
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
@@ -23,7 +24,6 @@ from ident.identification import MisoIdentification
 from ident.one_input import description, fitted_on_all, least_order, searched
 from ident.search.order_selection import Progress, silent
 from ident.search.pole_search import Fitted
-from ident.search.pole_warnings import pole_warnings
 
 # Where a combination of the inputs has less of the power the channels are told apart badly.
 _ALIKE_INPUT = 1e-2

@@ -34,9 +34,15 @@ from tests.workflow.report_examples import (
 )
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.engine.errors import InputError
-from workflow.tasks.achievable_performance import bracket_numbers, find_bracket
 from workflow.tasks.controller_files import filter_bytes, filter_file
-from workflow.tasks.design import certify_asked, find_design, joint_numbers, undrawable
+from workflow.tasks.design import (
+    bracket_numbers,
+    certify_asked,
+    find_bracket,
+    find_design,
+    joint_numbers,
+    undrawable,
+)
 from workflow.tasks.reference_filter import find_filter, model_answer
 from workflow.tasks.results import (
     AchievablePerformance,

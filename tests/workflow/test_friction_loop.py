@@ -15,8 +15,7 @@ from ident.friction import FrictionFit, FrictionLaw, fit_friction
 from ident.friction.arm import SteppedArm
 from plant import SampledArm, parse_effect
 from plant.presets import paper_link
-from workflow.tasks.friction_check import holds_from
-from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, interval_of
+from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, holds_from, interval_of
 
 DT_S = 0.005
 POLES = Poles(np.array([0.97]), np.array([0.93 + 0.24j]))

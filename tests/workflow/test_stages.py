@@ -23,7 +23,6 @@ from workflow.config.settings import check
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.amplitude_cost import find_amplitude_cost
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
@@ -31,7 +30,7 @@ from workflow.tasks.records import make_records, read_record, with_common_sampli
 from workflow.tasks.results import IdentifiedPlant, RunRecord, RunResults, UncertaintyResult
 from workflow.tasks.simulated_rig import EncodedArm, rig_of
 from workflow.tasks.stage import StageInput
-from workflow.tasks.stages import STAGES, design_filter
+from workflow.tasks.stages import STAGES, design_filter, find_amplitude_cost
 from workflow.tasks.uncertainty import posterior_of
 from workflow.text.templates import said
 

@@ -70,7 +70,7 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     that was identified, at the larger of two sizes.
     """
     # Here: a study that is refused needs the names of the columns only.
-    from workflow.tasks.achievable_performance import bracket_numbers
+    from workflow.tasks.design import bracket_numbers
 
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
     gamma, certify = results.design.gamma, results.certify

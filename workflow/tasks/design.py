@@ -1,7 +1,9 @@
-"""The design, its certificate, and for how many whole responses of the posterior the worst case holds."""
+"""The design, its certificate, for how many whole responses of the posterior the worst case holds, and what a
+controller of any order could reach."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -11,16 +13,28 @@ from scipy.stats import binomtest
 from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import ResponseDraws, joint_coverage
 from control_design.controllers.controller import Controller
+from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.uncertainty import ResponsePosterior
-from workflow.config.design_options import CertificateOptions
+from workflow.config.design_options import AchievableOptions, CertificateOptions
 from workflow.engine import codec
-from workflow.tasks.results import CertifyResult, DesignResult, SampledResponses
+from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, SampledResponses
 from workflow.text.templates import said
+
+# Requirements that the bracket does not know: a bracket of other values of these is the same.
+UNKNOWN_TO_BRACKET = (
+    "controller_order",
+    "structure",
+    "controller_damping",
+    "delay_margin_s",
+    "mode_damping",
+    "input_limit",
+    "rate_limit",
+)
 
 
 def find_design(
@@ -132,3 +146,41 @@ def joint_numbers(found: SampledResponses) -> dict[str, Any]:
         "stable_interval": [stable.low, stable.high],
         "reason": None,
     }
+
+
+def find_bracket(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: AchievableOptions,
+    progress: Callable[[float, str], None] | None = None,
+) -> AchievablePerformance:
+    """The bracket, or why there is none."""
+    if not options.compute:
+        return AchievablePerformance(reason="not asked for (compute = false)")
+    try:
+        bracket = youla_bracket(plants, specification, options, progress=progress)
+    except SpecificationError as impossible:
+        return AchievablePerformance(reason=str(impossible))
+    except (ValueError, ArithmeticError) as unfit:
+        return AchievablePerformance(reason=f"the parametrisation does not take this plant: {unfit}")
+    return AchievablePerformance(bracket)
+
+
+def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[str, Any]:
+    """Numbers for JSON and tables: what any order reaches, the floor, how far gamma is above in percent."""
+    bracket = found.bracket
+    if bracket is None:
+        return {"reached": None, "floor": None, "above_percent": None, "reason": found.reason}
+    reached, floor = _finite(bracket.ellipse), _finite(bracket.floor)
+    known = gamma is not None and math.isfinite(gamma) and reached is not None
+    return {
+        "reached": reached,
+        "floor": floor,
+        "above_percent": 100.0 * (gamma / reached - 1.0) if known and gamma and reached else None,
+        "reason": None,
+        "bracket": codec.plain(bracket),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -8,8 +8,7 @@ from typing import Any
 
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
-from workflow.tasks.achievable_performance import bracket_numbers
-from workflow.tasks.design import joint_numbers
+from workflow.tasks.design import bracket_numbers, joint_numbers
 from workflow.tasks.results import (
     AchievablePerformance,
     AmplitudeCost,
