@@ -77,6 +77,7 @@ class Search:
         self.records = Records(self.case, self.case.estimation)
         self.held_out = Records(self.case, self.case.held_out)
         self.points: list[tuple[Candidate, list[Point]]] = []
+        self._asked: set[tuple[object, ...]] = set()
 
     @property
     def base(self) -> Explanation:
@@ -245,12 +246,27 @@ class Search:
                 candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
                 self.add(descend(self.records, candidates, end.deviations, x, end.start))
 
+    def simpler(self, explanation: Explanation) -> None:
+        """The same with effects in place of those that contain them, where nobody has fitted that yet."""
+        end = explanation.end
+        for k, containing in enumerate(end.candidates):
+            for candidate in [c for c, _ in self.points if c.effect == containing.kind.contains]:
+                candidates = (*end.candidates[:k], candidate, *end.candidates[k + 1 :])
+                key = tuple(sorted(c.effect for c in candidates))
+                first = sum(len(c.axes) for c in end.candidates[:k]) + len(candidate.axes)
+                x = np.delete(
+                    end.coordinates, slice(first, first + len(containing.axes) - len(candidate.axes))
+                )
+                if not any(e.key == key for e in self.found):
+                    self.add(descend(self.records, candidates, end.deviations, x, end.start))
+
     def without(self, explanation: Explanation, k: int) -> Explanation:
         """The best explanation by the same effects but the k-th."""
         end = explanation.end
         rest = tuple(c for j, c in enumerate(end.candidates) if j != k)
         key = tuple(sorted(c.effect for c in rest))
-        if rest:
+        if rest and (asked := (*explanation.names, explanation.evidence, k)) not in self._asked:
+            self._asked.add(asked)
             x = np.concatenate([end.coordinates_of(j) for j in range(len(end.candidates)) if j != k])
             self.add(descend(self.records, rest, end.deviations, x, end.start))
         return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)

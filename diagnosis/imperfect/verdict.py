@@ -35,11 +35,11 @@ _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
 # A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
 _WORSE, _WORSE_BY = 1.15, 0.2
 # What an effect that contains a simpler one has to gain over it.
-_CONTAINING = 1.0
+_CONTAINING = 2.0
 # Logarithm of how much less probable a cause beyond the list is that looks like an effect.
 _UNLISTED = 0.55
 # Sets this far behind in score take no part.
-_BEHIND, _MOST_SETS = 8.0, 8
+_BEHIND, _MOST_SETS, _PASSES = 8.0, 8, 3
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,29 @@ def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
 
 
 def judged(search: Search, listed: Sequence[str]) -> Verdict:
-    """The answer from everything that a search has fitted; fits the best set without each of its effects."""
+    """The answer from everything that a search has fitted; fits the best set without each of its effects, and
+    with simpler ones. What that finds is weighed with all others."""
+    for _ in range(_PASSES):
+        known = len(search.found)
+        sets = _weighed(search, listed)
+        for one in [sets[0].explanation, *search.found[known:]]:
+            search.simpler(one)
+        if len(search.found) == known:
+            break
+    probabilities = _probabilities(
+        sets, listed, _enough(search.base, search.case.machine.weighing.model_error)
+    )
+    answer = probabilities.answer
+    if answer in ("none", "unknown"):
+        return Verdict(probabilities, sets, answer, ())
+    found = max((key for key in probabilities.sets if answer in key), key=lambda key: probabilities.sets[key])
+    main = next(s for s in sets if set(found) <= {p.name for p in s.parts})
+    accepted = tuple(p.name for p in sorted(main.parts, key=lambda p: -p.share) if p.name in found)
+    return Verdict(probabilities, sets, answer, accepted)
+
+
+def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
+    """The sets that take part, best first."""
     model_error = search.case.machine.weighing.model_error
     best: dict[tuple[str, ...], Explanation] = {}
     for explanation in search.found:
@@ -112,15 +134,7 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
     ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
-    sets = tuple(_judged(search, e, best, model_error, listed, fit=k == 0) for k, e in enumerate(chosen))
-    probabilities = _probabilities(sets, listed, _enough(search.base, model_error))
-    answer = probabilities.answer
-    if answer in ("none", "unknown"):
-        return Verdict(probabilities, sets, answer, ())
-    found = max((key for key in probabilities.sets if answer in key), key=lambda key: probabilities.sets[key])
-    main = next(s for s in sets if set(found) <= {p.name for p in s.parts})
-    accepted = tuple(p.name for p in sorted(main.parts, key=lambda p: -p.share) if p.name in found)
-    return Verdict(probabilities, sets, answer, accepted)
+    return tuple(_judged(search, e, best, model_error, listed, fit=k == 0) for k, e in enumerate(chosen))
 
 
 def _contradicted(explanation: Explanation, others: Iterable[Explanation], model_error: float) -> bool:

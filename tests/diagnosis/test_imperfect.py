@@ -187,7 +187,11 @@ def test_of_two_effects_that_can_replace_each_other_one_is_named():
     friction, zone = fitted(400.0, 0.05, "coulomb_friction"), fitted(390.0, 0.06, "actuator_dead_zone")
     both = fitted(460.0, 0.03, "coulomb_friction", "actuator_dead_zone")
     search = SimpleNamespace(
-        found=[base, friction, zone, both], base=base, case=case, without=lambda whole, k: (zone, friction)[k]
+        found=[base, friction, zone, both],
+        base=base,
+        case=case,
+        without=lambda whole, k: (zone, friction)[k],
+        simpler=lambda explanation: None,
     )
     found = judged(search, case.machine.weighing.listed)
     assert found.judged[0].explanation is both
