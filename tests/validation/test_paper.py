@@ -84,7 +84,7 @@ def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
 def test_page_stands_alone_and_says_both_sides(results, pictures):
     rows, findings = rows_of(results), findings_of(results)
     page = page_html(results, pictures, findings, rows)
-    assert page.count("<img ") == 7
+    assert page.count("<figure>") == 7
     assert "--seed 7" in page
     assert page.count("The paper reports") == page.count("We find") == 7
     for item in REPORTED:

@@ -24,5 +24,6 @@ def fast_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are built but not rendered: what a page says does not depend on its pictures."""
-    empty = Picture("svg", b"<svg/>")
-    monkeypatch.setattr(rendering, "render", lambda figure: empty)
+    nothing = {"axes": [], "cuts": [], "legend": [], "width": 1, "height": 1}
+    empty = Picture("svg", b"<svg/>", nothing)
+    monkeypatch.setattr(rendering, "render", lambda figure, also: empty)

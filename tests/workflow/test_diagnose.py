@@ -120,10 +120,13 @@ def test_the_page_answers_in_order(files):
     assert places == sorted(places)
     assert "The gap comes from dry (Coulomb) friction" in html
     assert "torque 0.05 N m (95 %: 0.049 to 0.051)" in html
-    assert "<td>torque</td><td>0.05 N m</td><td>0.049 to 0.051</td>" in html
-    assert "<td>coulomb_friction</td>" not in html
+    cells = re.sub("<td[^>]*>", "<td>", html)
+    assert "<td>torque</td><td>0.05 N m</td><td>0.049 to 0.051</td>" in cells
+    assert "<td>coulomb_friction</td>" not in cells
     assert html.count("<figure>") >= 6
-    assert "nan" not in re.sub(r"<img[^>]*>", "", html).lower().replace("nan m", "")
+    assert "nan" not in re.sub(
+        r"<svg.*?</svg>|<script.*?</script>", "", html, flags=re.DOTALL
+    ).lower().replace("nan m", "")
 
 
 @pytest.mark.parametrize(

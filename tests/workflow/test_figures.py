@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import re
 import tempfile
@@ -10,6 +9,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import matplotlib as mpl
 import numpy as np
@@ -37,11 +37,13 @@ from workflow.figures.repeats import draw_repeat_scatter
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.subjects import RunView
 from workflow.report import rendering
+from workflow.report.inline import relative
 from workflow.tasks.experiment import Limits, plan_experiment
 from workflow.tasks.results import LoopCheck, LoopRuns, RunRecord, RunResults
 from workflow.tasks.summary import summarise
 
 OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))
+SVG = "{http://www.w3.org/2000/svg}"
 HOSTILE = "a_$very$_<b>long</b> name & 漢 of a column that goes on and on and on"
 
 
@@ -56,10 +58,12 @@ def pictures(name: str = "hub", unit: str = "V") -> Mapping[str, Figure]:
     )
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         run = RunResults(example.build_run(Path(folder) / "run", settings))
-        patch.setattr(rendering, "render", lambda figure: figure)
-        patch.setattr(rendering, "embedded", lambda *_: Markup("<img>"))
+        patch.setattr(rendering, "render", lambda figure, also: figure)
+        patch.setattr(rendering, "embedded", lambda name, *_: rendering.Drawn(name, Markup("<img>")))
         view = RunView(settings, run, "", run.run.manifest())
-        page = rendering.render_page("report.html.j2", title="", run=view, summary=summarise(run, settings))
+        page = rendering.render_page(
+            "report.html.j2", title="", run=view, study=False, summary=summarise(run, settings)
+        )
     asked = settings.specification
     curves = sensitivity_curves(example.plant(), example.controller(), asked, OMEGA, input_unit=unit)
     units = draw_sensitivities(curves, level=0.95)
@@ -174,14 +178,39 @@ def test_a_picture_too_large_for_svg_becomes_png(monkeypatch):
     assert picture == style.render(poles_figure())
 
 
-def test_a_picture_is_an_image_of_its_own_in_the_page():
-    svg = style.render(bode_figure("x --> <script>"))
-    text = rendering.embedded('a "label"', svg)
-    kind, content, label = re.fullmatch(
-        r'<img src="data:([^;]+);base64,([^"]+)" alt="([^"]+)">', text
-    ).groups()
-    assert (kind, label) == ("image/svg+xml", "a &#34;label&#34;")
-    assert base64.b64decode(content) == svg.content
+def test_a_picture_in_the_page_is_the_file_without_its_legend():
+    picture = style.render(bode_figure("x --> <script>"))
+    styles: dict[str, str] = {}
+    drawn = rendering.embedded("bode", 'a "label"', picture, 3, styles)
+    assert "<script>" not in drawn.image
+    page, file = ElementTree.fromstring(drawn.image), ElementTree.fromstring(picture.content)
+    assert page.get("aria-label") == 'a "label"'
+    words = ["".join(text.itertext()) for text in page.iter("text")]
+    entries = [entry for _, entry in drawn.legend]
+    assert "x --> <script>" in words
+    assert sorted(words + entries) == sorted("".join(text.itertext()) for text in file.iter(f"{SVG}text"))
+    # Every look of the file is a class of the page.
+    assert {name for part in page.iter() for name in part.get("class", "").split() if name[0] == "s"} <= set(
+        styles.values()
+    )
+
+
+def test_a_shortened_path_goes_where_the_long_one_went():
+    path = "M 10.04 20.018 \nL 11.06 19.993 \nL 200.5 -3.25 \nz\nM 5 5 \nQ 6.04 7.011 8 9 \nL 0 0 \n"
+    at, start = np.zeros(2), np.zeros(2)
+    absolute: list[np.ndarray] = []
+    for command, text in re.findall("([mlqz])([^mlqz]*)", relative(path)):
+        if command == "z":
+            at = start
+            continue
+        steps = np.array([float(step) for step in re.findall(r"-?\d*\.?\d+", text)]).reshape(-1, 2)
+        absolute += list(at + steps)
+        at = absolute[-1]
+        start = at if command == "m" else start
+    wanted = np.array([float(number) for number in re.findall(r"-?[\d.]+", path)]).reshape(-1, 2)
+    # Half of a tenth in x, half of a hundredth in y; errors of steps do not add up.
+    assert np.abs(np.array(absolute) - wanted).max(axis=0) == pytest.approx([0, 0], abs=0.0501)
+    assert np.abs(np.array(absolute) - wanted)[:, 1].max() <= 0.00501
 
 
 def test_hostile_text_is_drawn_as_it_is():

@@ -71,7 +71,7 @@ def test_page_says_in_words_what_the_numbers_say(identified):
         assert interval(known["damping"]) in page.text
     for test in numbers["uncertainty"]["tests"]:
         assert test["verdict"] in page.text
-    assert len(re.findall("<img", (logs / "page.html").read_text())) == 6
+    assert len(re.findall("<figure>", (logs / "page.html").read_text())) == 6
 
 
 def test_intervals_hold_the_truth(identified):

@@ -52,7 +52,7 @@ def test_table_and_page(log, flexlink, tmp_path):
         assert words in answer.out
     assert f"flexlink identify {log} --input u_V --output hub_rad --time t_ms" in answer.out
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert page.count("<img") == 1
+    assert page.count("<figure>") == 1
     assert "steps of 0.002 rad" in page
     document = flexlink("look", log, "--json").document()
     assert document["numbers"]["columns"]["hub_rad"]["step"] == pytest.approx(0.002, rel=1e-9)

@@ -47,7 +47,7 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path):
     for section in ("measured", "gap", "where", "which", "closure", "remains", "next", "unchecked"):
         assert f'<section id="{section}">' in page
     # Measured, gap, two of where, probabilities, partial answers, spectra.
-    assert page.count("<img ") == 7
+    assert page.count("<figure>") == 7
     words = " ".join(re.sub(r"<[^>]+>", " ", page).split())
     found = test.globs["found"]
     assert "a delay of the command" in words

@@ -340,9 +340,10 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
     page = render_page("study.html.j2", title="a study", study=view).html
     tables = re.findall(r"<thead>(.*?)</thead>\s*<tbody>(.*?)</tbody>", page, re.DOTALL)
     heads = [re.findall(r"<th[^>]*>(.*?)</th>", head) for head, _ in tables]
-    rows = [re.findall(r"<td>(.*?)</td>", body) for _, body in tables]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", body) for _, body in tables]
     assert heads[0] == ["point", "asked", "worst-case gamma", "gamma of any order", "state"]
-    assert rows[0] == ["1", "1", "0.9", "0.8", "does not come to rest"]
+    point = '<a href="points/a/">1</a>'
+    assert rows[0] == [point, "1", "0.9", "0.8", "does not come to rest"]
     assert heads[1] == ["point", "asked", "peak of S, predicted", "peak of S, measured", "come to rest"]
-    assert rows[1] == ["1", "1", "1.4", "1.42", "1 of 2"]
+    assert rows[1] == [point, "1", "1.4", "1.42", "1 of 2"]
     assert all('<tr class="no">' in body for _, body in tables)

@@ -126,11 +126,13 @@ def page_html(
     results: PaperResults, pictures: Mapping[int, Picture], findings: Findings, rows: Sequence[table.Row]
 ) -> str:
     """The self-contained page; everything drawn stands inside it."""
+    styles: dict[str, str] = {}
     return (
         environment(package="validation")
         .get_template("paper.html.j2")
         .render(
             contents=[],
+            styles=styles,
             results=results,
             found=findings,
             headlines=headlines_of(results, findings),
@@ -145,7 +147,13 @@ def page_html(
             level=TWO_SIGMA_LEVEL,
             recipe_evaluations=RECIPE_BUDGET * results.settings.evaluations,
             drawings={
-                item.number: embedded(f"Fig. {item.number}, redrawn: {item.title}", pictures[item.number])
+                item.number: embedded(
+                    f"figure-{item.number}",
+                    f"Fig. {item.number}, redrawn: {item.title}",
+                    pictures[item.number],
+                    item.number,
+                    styles,
+                )
                 for item in REPORTED
             },
             tables={figure: list(group) for figure, group in groupby(rows, key=lambda row: row.figure)},

@@ -99,7 +99,7 @@ def _frequency_arcs(axes: Axes, corner: float, dt_s: float) -> None:
     for omega in (step, 2 * step, 3 * step):
         z = np.exp((-zeta + 1j * np.sqrt(1 - zeta**2)) * omega * dt_s)
         axes.plot(z.real, z.imag, color="#b5b5b5", lw=0.7, ls=(0, (1, 2)))
-        _label(axes, z[int(0.78 * zeta.size)], f"{omega:.4g} rad/s", fontsize=8, color="#777777")
+        _label(axes, z[int(0.78 * zeta.size)], f"{omega:.4g} rad/s", fontsize=8, color="#666666")
 
 
 def _label(axes: Axes, z: complex, text: str, **look: Any) -> None:

@@ -44,7 +44,10 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
             shade = {"color": style.SHADE[item.role], "label": _WORDS[item.role], "alpha": 0.15, "lw": 0}
             left.axvspan(start, start + item.duration_s, **shade)
             signal, _ = _signal(item.record, kind, name)
-            left.plot(*outline(item.record.time_s + start, signal), **style.MEASURED_LINE | {"lw": 0.6})
+            left.plot(
+                *outline(item.record.time_s + start, signal, 1400 // len(shown)),
+                **style.MEASURED_LINE | {"lw": 0.6},
+            )
         signal, unit = _signal(first, kind, name)
         steps = {"drawstyle": "steps-post"} if kind == "input" else {}
         right.plot(first.time_s[zoom], signal[zoom], **style.MEASURED_LINE, **steps)

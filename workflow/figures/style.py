@@ -9,8 +9,8 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from functools import lru_cache, wraps
 from typing import Any, Literal, TypeVar, cast
 
@@ -18,10 +18,13 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from matplotlib.transforms import Bbox
+
+from workflow.figures.reading import marked
 
 MEASURED = "#6b6b6b"  # what sensors said
 MODEL = "#0072B2"  # identified model, open loop
@@ -74,7 +77,7 @@ _RC: Any = {
     "ytick.color": "#333333",
     "path.simplify": True,
     "path.simplify_threshold": 0.3,
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",  # text stays text: it is found, copied and read aloud
     "svg.hashsalt": "flexlink",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
@@ -89,10 +92,15 @@ _RC: Any = {
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendered figure: SVG text or PNG bytes."""
+    """A rendered figure: SVG text or PNG bytes.
+
+    plot: what `reading.marked` says of it; files: the same figure in further kinds.
+    """
 
     kind: Literal["svg", "png"]
     content: bytes
+    plot: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
 
 
 def house_style() -> contextlib._GeneratorContextManager[None]:
@@ -127,19 +135,31 @@ def small_multiples(
     return figure, places[:count]
 
 
-def render(figure: Figure) -> Picture:
-    """SVG, or PNG where the SVG would be larger than 400 kB. Equal figures give equal bytes."""
+def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
+    """SVG, or PNG where the SVG would be larger than 400 kB. Equal figures give equal bytes.
+
+    also: further kinds of file, pdf or png.
+    """
     with house_style():
         _settle(figure)
-        buffer = io.BytesIO()
+        plot = marked(figure)
+        text = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(buffer, format="svg", metadata=nothing, dpi=_PNG_DPI)
-        svg = _shorter(buffer.getvalue())
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(text, metadata=nothing)  # savefig would lay everything out once more
+        FigureCanvasAgg(figure)
+        svg = _shorter(text.getvalue().encode())
+        files = {kind: _saved(figure, kind) for kind in also}
         if len(svg) <= SVG_LIMIT_BYTES:
-            return Picture("svg", svg)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", metadata={"Software": None}, dpi=_PNG_DPI)
-        return Picture("png", buffer.getvalue())
+            return Picture("svg", svg, plot, files)
+        return Picture("png", files.pop("png", None) or _saved(figure, "png"), plot, files)
+
+
+def _saved(figure: Figure, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
+    figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
+    return buffer.getvalue()
 
 
 def _settle(figure: Figure) -> None:
@@ -147,15 +167,27 @@ def _settle(figure: Figure) -> None:
 
     The layout solver's last bits depend on where its objects lie in memory; clip paths are named after them.
     """
-    figure.draw_without_rendering()
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        # Minor ticks have no words and are shorter than the others, but would be measured twelve times.
+        # Drawing everything, as draw_without_rendering does, would take as long again.
+        every = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
+        minor = [(axis, axis.get_minor_locator()) for axis in every]
+        for axis in every:
+            axis.set_minor_locator(NullLocator())
+        engine.execute(figure)
+        for axis, locator in minor:
+            axis.set_minor_locator(locator)
     figure.set_layout_engine("none")
+    figure.align_ylabels()  # only now: the solver would ask every label of a column for every other one
     for axes in figure.axes:
         axes.set_position(Bbox(np.round(axes.get_position(original=True).get_points(), 5)))
 
 
 def _shorter(svg: bytes) -> bytes:
     """Coordinates of paths to a hundredth of a point: a third of the size goes, nothing a printer could
-    show."""
+    show. Where the font is not installed, others as wide stand in for it."""
+    svg = svg.replace(b"'DejaVu Sans'", b"'DejaVu Sans', Verdana, sans-serif")
     return re.sub(rb'\b(d|x|y)="[^"]*"', lambda match: re.sub(rb"(\.\d\d)\d+", rb"\1", match.group()), svg)
 
 
@@ -191,7 +223,6 @@ def ratio_unit(output_unit: str, input_unit: str) -> str:
 def finish(figure: Figure) -> None:
     """Last step of a figure: labels of log axes, and one legend below, where it hides nothing, every entry
     once."""
-    figure.align_ylabels()
     plain_log_labels(figure)
     handles: dict[str, Any] = {}
     for axes in figure.axes:

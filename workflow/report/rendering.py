@@ -7,6 +7,7 @@ A template sees the typed values it is given, the filters of `workflow.text.form
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from markupsafe import Markup
 
 from workflow.figures.registry import drawings
 from workflow.figures.style import Picture, render
+from workflow.report.inline import inline
 from workflow.text.templates import environment
 
 
@@ -31,18 +33,20 @@ def render_page(
     progress: Callable[[float, str], None] | None = None,
     *,
     filters: Iterable[tuple[str, Callable[..., Any]]] = (),
+    also: Iterable[str] = (),
     **values: Any,
 ) -> RenderedPage:
     """A page whose template extends base.html.j2. Equal values give equal bytes.
 
-    filters: (name, function) of this page, beside those of all.
+    filters: (name, function) of this page, beside those of all. also: see `render`.
 
     Pictures are drawn where the template asks for them; progress(share, picture) is told of each. How many
     are to come is not known, so the share only approaches 1.
     """
     pictures: dict[str, Picture] = {}
+    styles: dict[str, str] = {}
 
-    def draw(name: str, caption: str, file: str, *what: Any) -> Markup | None:
+    def draw(name: str, caption: str, file: str, *what: Any) -> Drawn | None:
         if progress is not None:
             progress(len(pictures) / (len(pictures) + 6), name)
         figure = drawings()[name](*what)
@@ -51,15 +55,28 @@ def render_page(
         stem = f"{name}-{file}" if file else name
         if stem in pictures:
             raise ValueError(f"the page has two pictures called {stem!r}: give one another `file`")
-        pictures[stem] = render(figure)
-        return embedded(Markup(caption).striptags(), pictures[stem])
+        pictures[stem] = render(figure, also)
+        return embedded(stem, Markup(caption).striptags(), pictures[stem], len(pictures), styles)
 
-    page = environment(*filters).get_template(template).render(draw=draw, contents=[], **values)
-    return RenderedPage(page.strip() + "\n", pictures)
+    page = environment(*filters).get_template(template)
+    html = page.render(draw=draw, contents=[], styles=styles, **values)
+    return RenderedPage(html.strip() + "\n", pictures)
 
 
-def embedded(label: str, picture: Picture) -> Markup:
-    """The picture inside the page, an image of its own; label: plain text, read in its place."""
-    kind = "svg+xml" if picture.kind == "svg" else "png"
-    content = base64.b64encode(picture.content).decode("ascii")
-    return Markup('<img src="data:image/{};base64,{}" alt="{}">').format(kind, content, label)
+@dataclass(frozen=True)
+class Drawn:
+    """What the macro `picture` puts: image, samples and words of the legend, JSON for the script."""
+
+    name: str
+    image: Markup
+    legend: list[tuple[Markup, str]] = field(default_factory=list)
+    plot: str = ""
+
+
+def embedded(name: str, label: str, picture: Picture, number: int, styles: dict[str, str]) -> Drawn:
+    """The picture inside the page; label: plain text, read in its place; styles: see `inline`."""
+    if picture.kind == "png":
+        content = base64.b64encode(picture.content).decode("ascii")
+        return Drawn(name, Markup('<img src="data:image/png;base64,{}" alt="{}">').format(content, label))
+    image, legend = inline(picture, label, number, styles)
+    return Drawn(name, image, legend, json.dumps(picture.plot, separators=(",", ":")))

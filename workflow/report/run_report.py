@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from workflow.config.run_config import RunConfig
@@ -14,26 +14,33 @@ from workflow.tasks.summary import summarise
 
 
 def write_report(
-    results: RunResults, config: RunConfig, progress: Callable[[float, str], None] | None = None
+    results: RunResults,
+    config: RunConfig,
+    progress: Callable[[float, str], None] | None = None,
+    also: Iterable[str] = (),
 ) -> Path:
     """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
 
-    Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
+    also: kinds of file beside SVG, pdf or png. Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
     Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
     """
     run = results.run
     text = run.path / "config.toml"
     view = RunView(config, results, documents.read_text(text) if text.is_file() else "", run.manifest())
     title = config.run.title or config.run.name
-    page = render_page("report.html.j2", progress, title=title, run=view, summary=summarise(results, config))
+    study = (run.path.parent.parent / "study.html").is_file()  # of which this run is a point
+    page = render_page(
+        "report.html.j2", progress, also=also, title=title, run=view, study=study, summary=summarise(results, config)
+    )
     run.figures_path.mkdir(exist_ok=True)
     written = set()
     for name, picture in page.pictures.items():
-        path = run.figures_path / f"{name}.{picture.kind}"
-        storage.write_bytes(path, picture.content)
-        written.add(path.name)
+        for kind, content in {picture.kind: picture.content, **picture.files}.items():
+            path = run.figures_path / f"{name}.{kind}"
+            storage.write_bytes(path, content)
+            written.add(path.name)
     for stale in sorted(run.figures_path.iterdir()):
-        if stale.suffix in (".svg", ".png") and stale.name not in written:
+        if stale.suffix in (".svg", ".png", ".pdf") and stale.name not in written:
             stale.unlink()
     storage.write_text(run.report_path, page.html)
     return run.report_path

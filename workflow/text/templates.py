@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -26,10 +27,22 @@ def environment(*own: tuple[str, Callable[..., Any]], package: str = "workflow")
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters.update(FILTERS, words=words)
+    made.filters.update(FILTERS, words=words, labelled=labelled)
     made.filters.update(own)
     made.tests.update(TESTS)
     return made
+
+
+def labelled(rows: Markup, head: Sequence[str]) -> Markup:
+    """Rows of a table whose cells carry the words of their column, for screens too narrow for columns."""
+
+    def of_row(row: re.Match[str]) -> str:
+        words = iter(Markup.escape(word) for word in head)
+        return re.sub(
+            "<td>", lambda _: f'<td data-head="{word}">' if (word := next(words, "")) else "<td>", row[0]
+        )
+
+    return Markup(re.sub("<tr.*?</tr>", of_row, rows, flags=re.DOTALL))
 
 
 def render_text(template: str, **values: Any) -> str:
