@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from tests.browser import PROGRAM, Browser, faults_of
 from tests.workflow.command import Answer, without_progress
 from workflow.cli import main
 
@@ -70,3 +71,22 @@ def refused(flexlink: Callable[..., Answer]) -> Callable[..., str]:
         return answer.err
 
     return call
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """One browser for all tests of a worker."""
+    if PROGRAM is None:
+        pytest.skip("chromium is not installed")
+    found = Browser()
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def faults_seen(request: pytest.FixtureRequest) -> Callable[[Path], list[str]]:
+    """What a reader would mind about a page; without a browser nothing (test_pages_in_a_browser.py skips)."""
+    if PROGRAM is None:
+        return lambda page: []
+    browser = request.getfixturevalue("browser")
+    return lambda page: faults_of(browser, page)

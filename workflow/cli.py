@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -426,12 +426,19 @@ def design(
 
 
 @app.command(short_help="Write report.html of a run anew.")
-def report(directory: Annotated[Path, typer.Argument(help="Run directory.")], as_json: Json = False) -> None:
+def report(
+    directory: Annotated[Path, typer.Argument(help="Run directory.")],
+    pictures: Annotated[
+        list[Literal["pdf", "png"]] | None,
+        typer.Option(help="Further kind of file for every picture in figures/, beside SVG; may be repeated."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Write report.html of a run directory anew and print its table."""
     from workflow.commands.run import rebuild_report
     from workflow.engine.run_directory import RunDirectory
 
-    summary = rebuild_report(RunDirectory.open(directory))
+    summary = rebuild_report(RunDirectory.open(directory), pictures or ())
     _show(summary, as_json)
 
 

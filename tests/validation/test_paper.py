@@ -81,10 +81,12 @@ def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
     assert not any(legend.overlaps(axes.get_window_extent(renderer)) for axes in shown)
 
 
-def test_page_stands_alone_and_says_both_sides(results, pictures):
+def test_page_stands_alone_and_says_both_sides(results, pictures, tmp_path, faults_seen):
     rows, findings = rows_of(results), findings_of(results)
     page = page_html(results, pictures, findings, rows)
     assert page.count("<figure>") == 7
+    (tmp_path / "paper.html").write_text(page)
+    assert faults_seen(tmp_path / "paper.html") == []
     assert "--seed 7" in page
     assert page.count("The paper reports") == page.count("We find") == 7
     for item in REPORTED:

@@ -114,8 +114,10 @@ def test_the_proposed_experiment_can_be_run(files, document, folder):
     assert np.max(np.abs(voltage)) <= max(np.max(np.abs(e.voltage_V)) for e in case.experiments) * (1 + 1e-9)
 
 
-def test_the_page_answers_in_order(files):
+def test_the_page_answers_in_order(files, tmp_path, faults_seen):
     html = files["arm.html"].decode()
+    (tmp_path / "arm.html").write_text(html)
+    assert faults_seen(tmp_path / "arm.html") == []
     places = [html.index(f"<h2>{question}</h2>") for question in QUESTIONS]
     assert places == sorted(places)
     assert "The gap comes from dry (Coulomb) friction" in html
@@ -249,7 +251,7 @@ def everything(out):
     }
 
 
-def test_several_cases_make_an_overview(cases, tmp_path, here):
+def test_several_cases_make_an_overview(cases, tmp_path, here, faults_seen):
     out = tmp_path / "out"
     found = diagnose_cases(cases, out, controller=False, engine=KnownAnswer((FRICTION,)))
     assert found.exit_code == 0
@@ -257,6 +259,7 @@ def test_several_cases_make_an_overview(cases, tmp_path, here):
     overview = (out / "index.html").read_text()
     assert '<a href="one.html">one</a>' in overview
     assert "2 cases: 2 with a named effect" in overview
+    assert faults_seen(out / "index.html") == []
     assert found.summary.report_path == str(out / "index.html")
 
 

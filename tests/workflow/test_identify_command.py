@@ -53,7 +53,7 @@ def identified(logs):
     return logs, identify_first(logs, **written).to_document()
 
 
-def test_page_says_in_words_what_the_numbers_say(identified):
+def test_page_says_in_words_what_the_numbers_say(identified, faults_seen):
     logs, document = identified
     page = Page((logs / "page.html").read_text(encoding="utf-8"))
     numbers = document["numbers"]
@@ -72,6 +72,7 @@ def test_page_says_in_words_what_the_numbers_say(identified):
     for test in numbers["uncertainty"]["tests"]:
         assert test["verdict"] in page.text
     assert len(re.findall("<figure>", (logs / "page.html").read_text())) == 6
+    assert faults_seen(logs / "page.html") == []
 
 
 def test_intervals_hold_the_truth(identified):

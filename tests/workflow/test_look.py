@@ -45,7 +45,7 @@ def test_numbers(log):
     assert (found.roles.input, found.roles.output, found.roles.time) == ("u_V", "hub_rad", "t_ms")
 
 
-def test_table_and_page(log, flexlink, tmp_path):
+def test_table_and_page(log, flexlink, tmp_path, faults_seen):
     answer: Answer = flexlink("look", log, "--out", tmp_path / "page.html")
     assert answer.code == 0, answer.err
     for words in ("3 rows missing", "milliseconds", "steps of 0.002 rad", "stands still", "clipped?", "▁"):
@@ -54,6 +54,7 @@ def test_table_and_page(log, flexlink, tmp_path):
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("<figure>") == 1
     assert "steps of 0.002 rad" in page
+    assert faults_seen(tmp_path / "page.html") == []
     document = flexlink("look", log, "--json").document()
     assert document["numbers"]["columns"]["hub_rad"]["step"] == pytest.approx(0.002, rel=1e-9)
 

@@ -36,7 +36,7 @@ def _motor():
     return {"levels": levels, "measured": measured}
 
 
-def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path):
+def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     given = {name: getattr(diagnosis, name) for name in diagnosis.__all__}
     given |= {"np": np, "lfilter": lfilter, "replace": replace, "DT_S": DT_S, "folder": tmp_path}
     given |= {"write_plant_page": write_plant_page, **_motor()}
@@ -48,6 +48,7 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path):
         assert f'<section id="{section}">' in page
     # Measured, gap, two of where, probabilities, partial answers, spectra.
     assert page.count("<figure>") == 7
+    assert faults_seen(tmp_path / "motor.html") == []
     words = " ".join(re.sub(r"<[^>]+>", " ", page).split())
     found = test.globs["found"]
     assert "a delay of the command" in words

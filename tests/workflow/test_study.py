@@ -144,9 +144,10 @@ def test_a_finished_study_is_taken_up_and_can_be_extended(small_study, tmp_path)
     assert {name: after[name] for name in before} == before
 
 
-def test_page_and_picture_are_there(small_study):
+def test_page_and_picture_are_there(small_study, faults_seen):
     out, _ = small_study
     page = (out / "study.html").read_text()
+    assert faults_seen(out / "study.html") == []
     assert "small" in page
     assert "Why not certified" in page
     assert "<figure>" in page

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,9 +64,12 @@ def run_from_files(
     )
 
 
-def rebuild_report(run: RunDirectory) -> RunSummary:
-    """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing."""
-    from workflow.report.stage import REPORT
+def rebuild_report(run: RunDirectory, also: Iterable[str] = ()) -> RunSummary:
+    """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing.
+
+    also: kinds of file for its pictures beside SVG, pdf or png.
+    """
+    from workflow.report.stage import REPORT, write_page
     from workflow.tasks.pipeline import rebuild_page
 
-    return rebuild_page(run, REPORT)
+    return rebuild_page(run, dataclasses.replace(REPORT, run=partial(write_page, also=also)))

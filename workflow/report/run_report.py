@@ -21,7 +21,8 @@ def write_report(
 ) -> Path:
     """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
 
-    also: kinds of file beside SVG, pdf or png. Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
+    also: kinds of file beside SVG, pdf or png.
+    Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
     Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
     """
     run = results.run
@@ -30,7 +31,13 @@ def write_report(
     title = config.run.title or config.run.name
     study = (run.path.parent.parent / "study.html").is_file()  # of which this run is a point
     page = render_page(
-        "report.html.j2", progress, also=also, title=title, run=view, study=study, summary=summarise(results, config)
+        "report.html.j2",
+        progress,
+        also=also,
+        title=title,
+        run=view,
+        study=study,
+        summary=summarise(results, config),
     )
     run.figures_path.mkdir(exist_ok=True)
     written = set()

@@ -159,7 +159,7 @@ class Browser:
         self._profile.cleanup()
 
 
-_READER = (Path(__file__).parent / "data" / "reader.js").read_text().partition("\n")[2]
+_READER = Path(__file__).with_name("reader.js").read_text().partition("\n")[2]
 
 
 def faults_of(browser: Browser, page: Path) -> list[str]:
