@@ -13,9 +13,10 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -68,6 +69,13 @@ CPrefix = Annotated[
 CFloat = Annotated[
     bool, typer.Option("--c-float", help="C code in float instead of double; fixed point is left out.")
 ]
+
+
+class PictureFile(StrEnum):
+    PDF = "pdf"
+    PNG = "png"
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -429,7 +437,7 @@ def design(
 def report(
     directory: Annotated[Path, typer.Argument(help="Run directory.")],
     pictures: Annotated[
-        list[Literal["pdf", "png"]] | None,
+        list[PictureFile] | None,
         typer.Option(help="Further kind of file for every picture in figures/, beside SVG; may be repeated."),
     ] = None,
     as_json: Json = False,
@@ -438,7 +446,7 @@ def report(
     from workflow.commands.run import rebuild_report
     from workflow.engine.run_directory import RunDirectory
 
-    summary = rebuild_report(RunDirectory.open(directory), pictures or ())
+    summary = rebuild_report(RunDirectory.open(directory), [kind.value for kind in pictures or ()])
     _show(summary, as_json)
 
 

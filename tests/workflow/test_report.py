@@ -85,7 +85,7 @@ def is_one_file(text: str) -> None:
     tags = Page(text).tags
     assert text.count("<script") == 1
     script = environment().get_template("page.js").render()
-    assert f"<script>\n{script}\n</script>" in text
+    assert f"<script>\n{script}</script>" in text
     for tag, attributes in tags:
         assert tag not in ("link", "iframe", "object", "embed", "base"), tag
         for name, value in attributes.items():

@@ -118,7 +118,7 @@ def draw_comparison(responses: Mapping[str, FrequencyUncertainty]) -> Figure:
     return figure
 
 
-def _thinned(omega_rad_s: Real, response: Complex, most: int = 450) -> tuple[Real, Complex]:
+def _thinned(omega_rad_s: Real, response: Complex, most: int = 300) -> tuple[Real, Complex]:
     """Points evenly spread on the log axis: the thousands of a long record hide each other."""
     if omega_rad_s.size <= most:
         return omega_rad_s, response

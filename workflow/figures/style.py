@@ -76,7 +76,7 @@ _RC: Any = {
     "xtick.color": "#333333",
     "ytick.color": "#333333",
     "path.simplify": True,
-    "path.simplify_threshold": 0.3,
+    "path.simplify_threshold": 0.05,  # values are read off these lines
     "svg.fonttype": "none",  # text stays text: it is found, copied and read aloud
     "svg.hashsalt": "flexlink",
     "figure.facecolor": "white",
@@ -152,7 +152,7 @@ def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
         files = {kind: _saved(figure, kind) for kind in also}
         if len(svg) <= SVG_LIMIT_BYTES:
             return Picture("svg", svg, plot, files)
-        return Picture("png", files.pop("png", None) or _saved(figure, "png"), plot, files)
+        return Picture("png", files.get("png") or _saved(figure, "png"), plot, files)
 
 
 def _saved(figure: Figure, kind: str) -> bytes:

@@ -63,9 +63,9 @@ def _clean(root: ET.Element, number: int, styles: dict[str, str], ids: dict[str,
             element.set("d", relative(element.attrib["d"]))
         if "transform" in element.attrib and re.match(r"rotate\(-?0 ", element.attrib["transform"]):
             del element.attrib["transform"]
-        for name in ("x", "y"):
+        for name, digits in (("x", 1), ("y", 2)):
             if name in element.attrib:
-                element.set(name, f"{float(element.attrib[name]):.2f}".rstrip("0").rstrip("."))
+                element.set(name, f"{float(element.attrib[name]):.{digits}f}".rstrip("0").rstrip("."))
     for element in root.iter():
         for name in ("href", "clip-path"):
             if match := re.search(r"#([\w-]+)", element.get(name, "")):
