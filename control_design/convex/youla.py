@@ -22,8 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from control_design.analysis.grids import Grids
-from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.analysis.worst_case import Grids, PlantData, worst_of
 from control_design.convex.convex_options import YoulaOptions
 from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
 from control_design.convex.youla_basis import (

@@ -12,10 +12,9 @@ from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Real
 from control_design.synthesis.descent import MinimaxDescent, natural_units
 from control_design.synthesis.problem import EXCHANGE_TOLERANCE
-from control_design.synthesis.search_tasks import Candidate, StartTask, Workshop
 from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import StartReport
-from control_design.synthesis.work_pool import WorkPool
+from control_design.synthesis.work_pool import Candidate, StartTask, WorkPool, Workshop
 
 Told = Callable[[float, str], None]
 

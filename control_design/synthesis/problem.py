@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from control_design.analysis.grids import Grids
 from control_design.analysis.stability import NominalLoop, winds
-from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.analysis.worst_case import Grids, PlantData, worst_of
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Ellipses, Real, scale_to_minus_one

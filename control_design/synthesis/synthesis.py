@@ -16,12 +16,11 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis.order_search import OrderResult, OrderSearch
 from control_design.synthesis.problem import Problem
-from control_design.synthesis.search_tasks import Candidate, Workshop
 from control_design.synthesis.shortfall import what_destabilises
 from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
-from control_design.synthesis.work_pool import WorkPool
+from control_design.synthesis.work_pool import Candidate, WorkPool, Workshop
 
 Progress = Callable[[float, str], None]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -175,7 +176,8 @@ def identify_records(
         about=about,
         spread=spread,
         careful=(
-            *_doubts([*measured, *logs_to_validate]),
+            # Time columns that look like another unit, and repaired ones, each said once.
+            *distinct([doubt for record in (*measured, *logs_to_validate) for doubt in record.doubts]),
             *amplitude_effects(measured),
             *found.warnings,
             *residual_advice(
@@ -183,7 +185,12 @@ def identify_records(
                 noise_order=spread.noise_order,
                 friction=friction is None and band_rad_s is None and opened is None,
             ),
-            *_beyond(found, options, band_rad_s),
+            # Pairs beside the band that was asked for: the search may go an octave further.
+            *(
+                pairs_outside(found.model.poles, options.fixed(), found.model.dt_s, band_rad_s)
+                if band_rad_s
+                else ()
+            ),
             *(opened.warnings(omega) if opened else ()),
         ),
         promised=promised,
@@ -202,30 +209,15 @@ def _posterior(
     if whiteness_test(found.residuals).passed:
         posterior = tangent(used, found.model, bounds)
         return posterior, residual_tests(posterior, used)
-    best: tuple[float, ResponsePosterior, Tests] | None = None
+    tried = []
     for order in _NOISE_ORDERS if noise_order is None else (noise_order,):
         coloured = bounds.model_copy(update={"coloured_noise": True, "max_ar_order": order})
         posterior = tangent(used, found.model, coloured)
         tests = residual_tests(posterior, used)
         whiteness, _ = tests
-        # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
-        if best is None or whiteness.probability > best[0]:
-            best = (whiteness.probability, posterior, tests)
+        tried.append((whiteness.probability, posterior, tests))
         if whiteness.passed:
             break
-    assert best is not None
-    return best[1], best[2]
-
-
-def _doubts(records: Sequence[Record]) -> list[Finding]:
-    """Time columns that look like another unit, and repaired ones, each said once."""
-    return list(distinct([doubt for record in records for doubt in record.doubts]))
-
-
-def _beyond(
-    found: Identification, options: IdentOptions, band_rad_s: tuple[float, float] | None
-) -> list[Finding]:
-    """Pairs beside the band that was asked for: the search may go an octave further."""
-    if band_rad_s is None:
-        return []
-    return pairs_outside(found.model.poles, options.fixed(), found.model.dt_s, band_rad_s)
+    # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
+    _, posterior, tests = max(tried, key=itemgetter(0))
+    return posterior, tests

@@ -44,10 +44,6 @@ class StageInput:
         return stage_rng(self.config.run.seed, *names)
 
 
-def _nothing(run: RunDirectory) -> tuple[Path, ...]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Stage:
     """One step of a run.
@@ -64,7 +60,7 @@ class Stage:
     expected_s: float
     uses: Mapping[str, Any]
     except_for: Mapping[str, Any] | None = None
-    also_writes: Callable[[RunDirectory], tuple[Path, ...]] = _nothing
+    also_writes: Callable[[RunDirectory], tuple[Path, ...]] = lambda run: ()
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Its share of the configuration, JSON-able."""
