@@ -9,12 +9,14 @@ OUT ?= runs/default
 # One thread per process: the linear algebra here is small, and two processes with two threads each fight over two cores.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
+export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help install run test test-all lint types check clean
+.PHONY: help install run test test-all lint types check docs clean
 
 help:
 	@echo "make run    install into .venv and run the default arm end to end (OUT=$(OUT))"
 	@echo "make test   everything that guards behaviour   make test-all   with the long Monte Carlo"
+	@echo "make docs   the documentation as a site, build/site/index.html, with a gallery of pages"
 	@echo "make check  what CI runs: tests, lint, types"
 
 # The run at the end fills the cache of compiled code: code compiled in the same process may round otherwise than code
@@ -49,6 +51,20 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 check: test-all lint types
+
+# Pages of the gallery are drawn once; make clean has them drawn again.
+docs: $(STAMP) build/gallery/.drawn
+	$(BIN)/python -m mkdocs build --strict -q
+
+build/gallery/.drawn: $(STAMP)
+	mkdir -p build/gallery
+	$(BIN)/flexlink simulate --out build/gallery/logs
+	$(BIN)/flexlink look build/gallery/logs/09_prbs.csv --out build/gallery/look.html
+	$(BIN)/flexlink identify build/gallery/logs/0*_V_rms_*.csv --validation build/gallery/logs/09_prbs.csv \
+		--output hub_angle_rad --integrators 1 --delay 1 --real 1 --pairs 2 --report build/gallery/identify.html
+	$(BIN)/flexlink run --out build/gallery/run --replace
+	$(BIN)/flexlink diagnose examples/gap_case --out build/gallery/diagnosis --replace
+	touch $@
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info

@@ -38,12 +38,12 @@ class ExperimentPlan(BaseModel):
     rms_V: tuple[float, ...] = Field(min_length=1, description="ladder of amplitudes")
     realisations: int = Field(4, ge=1, le=1000, description="records at each amplitude, phases independent")
     periods: int = Field(2, ge=1, le=1000, description="whole periods of a record, behind its lead-in")
-    period_samples: int = Field(ge=8, le=1_000_000)
+    period_samples: int = Field(ge=8, le=1_000_000, description="length of a period")
     lead_in_samples: int = Field(
         ge=0, le=1_000_000, description="from rest to steady state, before the whole periods"
     )
-    from_Hz: float = Field(gt=0)
-    to_Hz: float = Field(gt=0)
+    from_Hz: float = Field(gt=0, description="lowest frequency")
+    to_Hz: float = Field(gt=0, description="highest frequency")
     phase_draws: int = Field(50, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
     lines_seed: int = Field(0, ge=0, description="draws which odd lines are left out")
 

@@ -22,10 +22,10 @@ class _Table(Section):
 
 
 class Prbs(_Table):
-    kind: Literal["prbs"]
-    amplitude_V: float = Field(gt=0)
-    samples: int = Field(ge=2, le=1_000_000)
-    register_length: int = Field(11, ge=2, le=20)
+    kind: Literal["prbs"] = Field(description="pseudo-random binary sequence")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    register_length: int = Field(11, ge=2, le=20, description="period: 2^register_length - 1 changes")
     hold_samples: int = Field(1, ge=1, description="samples between possible changes of sign")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
@@ -33,13 +33,15 @@ class Prbs(_Table):
 
 
 class Multisine(_Table):
-    kind: Literal["multisine"]
-    rms_V: float = Field(gt=0)
-    period_samples: int = Field(ge=2, le=1_000_000)
-    periods: int = Field(1, ge=1, le=1000)
-    from_Hz: float = Field(gt=0)
-    to_Hz: float = Field(gt=0)
-    grid: Literal["full", "odd", "odd_random"] = "full"
+    kind: Literal["multisine"] = Field(description="sum of sines of random phase")
+    rms_V: float = Field(gt=0, description="root mean square")
+    period_samples: int = Field(ge=2, le=1_000_000, description="length of a period")
+    periods: int = Field(1, ge=1, le=1000, description="whole periods of the record")
+    from_Hz: float = Field(gt=0, description="lowest frequency")
+    to_Hz: float = Field(gt=0, description="highest frequency")
+    grid: Literal["full", "odd", "odd_random"] = Field(
+        "full", description="excited lines: all, odd ones, odd ones of which one in four is left out"
+    )
     phase_draws: int = Field(1, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
     lead_in_samples: int = Field(
         0, ge=0, le=1_000_000, description="of the same signal before the whole periods"
@@ -68,33 +70,33 @@ class Multisine(_Table):
 
 
 class LogChirp(_Table):
-    kind: Literal["log_chirp"]
-    amplitude_V: float = Field(gt=0)
-    samples: int = Field(ge=2, le=1_000_000)
-    from_Hz: float = Field(gt=0)
-    to_Hz: float = Field(gt=0)
+    kind: Literal["log_chirp"] = Field(description="sweep, as long in each octave")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    from_Hz: float = Field(gt=0, description="lowest frequency")
+    to_Hz: float = Field(gt=0, description="highest frequency")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
         return excitation.log_chirp(self.from_Hz, self.to_Hz, self.amplitude_V, self.samples, dt_s)
 
 
 class Doublet(_Table):
-    kind: Literal["doublet"]
-    amplitude_V: float = Field(gt=0)
-    samples: int = Field(ge=2, le=1_000_000)
-    start_s: float = Field(0.0, ge=0)
-    pulse_s: float = Field(gt=0)
+    kind: Literal["doublet"] = Field(description="a pulse and its negative")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    start_s: float = Field(0.0, ge=0, description="rest before")
+    pulse_s: float = Field(gt=0, description="length of each of the two pulses")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
         return excitation.doublet(self.amplitude_V, self.start_s, self.pulse_s, self.samples, dt_s)
 
 
 class BangBang(_Table):
-    kind: Literal["bang_bang"]
-    amplitude_V: float = Field(gt=0)
-    samples: int = Field(ge=2, le=1_000_000)
-    start_s: float = Field(0.0, ge=0)
-    slew_s: float = Field(gt=0)
+    kind: Literal["bang_bang"] = Field(description="full voltage one way, then the other")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    start_s: float = Field(0.0, ge=0, description="rest before")
+    slew_s: float = Field(gt=0, description="length of the move, half of it each way")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
         return excitation.bang_bang(self.amplitude_V, self.start_s, self.slew_s, self.samples, dt_s)

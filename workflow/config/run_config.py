@@ -28,6 +28,11 @@ Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
 
 
+RecordRole = Annotated[
+    Role, Field(description="estimation: fitted; validation: only simulated; repeat: scatter between runs")
+]
+
+
 class RunSection(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)] = Field(
         "run", description="names the default output directory; letters, digits, '_', '-' and '.'"
@@ -41,15 +46,15 @@ class RunSection(Section):
 class SimulatedRecord(Section):
     """One experiment on the simulated arm."""
 
-    name: Name
-    role: Role = "estimation"
+    name: Name = Field(description="name of the record")
+    role: RecordRole = "estimation"
     condition: str | None = Field(None, description="records with the same label are repeats of one another")
     remark: str = Field("", description="shown beside the record in the report")
     excitation: Excitation
 
 
 class SimulatedSource(Section):
-    kind: Literal["simulated"]
+    kind: Literal["simulated"] = Field(description="records come from the simulated arm")
     rig: RigChoice = Field("paper_link", description="preset 'paper_link', or the path of a rig TOML file")
     modes: int | None = Field(
         None, ge=1, le=20, description="flexible modes; default: all below Nyquist, at least 3"
@@ -109,13 +114,13 @@ class FileRecord(Section):
         description="csv or named arrays (npz, mat, ...); relative to this file; ${FLEXLINK_DATA} is expanded"
     )
     name: Name | None = Field(None, description="default: the file name without its ending")
-    role: Role = "estimation"
-    condition: str | None = None
-    remark: str = ""
+    role: RecordRole = "estimation"
+    condition: str | None = Field(None, description="records with the same label are repeats of one another")
+    remark: str = Field("", description="shown beside the record in the report")
     time: str | None = Field(None, description="name of the time column")
-    time_unit: TimeUnit | None = None
+    time_unit: TimeUnit | None = Field(None, description="its unit; default: as in its name, else s")
     dt_s: float | None = Field(None, gt=0, description="sampling period, where there is no time column")
-    references: tuple[str, ...] | None = None
+    references: tuple[str, ...] | None = Field(None, description="reference columns, closed loop")
     start_sample: int = Field(0, ge=0, description="first row used, counted from 0")
     stop_sample: int | None = Field(None, ge=1, description="row after the last one used")
     mirrored: bool = Field(
@@ -124,7 +129,7 @@ class FileRecord(Section):
 
 
 class FileSource(Section):
-    kind: Literal["files"]
+    kind: Literal["files"] = Field(description="records are log files")
     time: str | None = Field(None, description="name of the time column; give this or dt_s")
     time_unit: TimeUnit | None = Field(
         None, description="unit of the time column; default: as in its name ('t_ms', 'Zeit [ms]'), else s"
@@ -307,8 +312,8 @@ class ClosedLoopOptions(Section):
 class Notes(Section):
     """What is known and not known about the rig; shown in the report as written."""
 
-    known: tuple[str, ...] = ()
-    unknown: tuple[str, ...] = ()
+    known: tuple[str, ...] = Field((), description="sentences for the report")
+    unknown: tuple[str, ...] = Field((), description="sentences for the report: what limits its claims")
 
 
 class SimulationConfig(Section):

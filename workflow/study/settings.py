@@ -119,8 +119,8 @@ class Search(Section):
 class ParetoPlot(Section):
     """Two columns to plot against each other."""
 
-    x: Judged
-    y: Judged
+    x: Judged = Field(description="column of the table, across")
+    y: Judged = Field(description="column of the table, up")
 
     @model_validator(mode="after")
     def _two_columns(self) -> Self:

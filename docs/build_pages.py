@@ -1,0 +1,189 @@
+"""Pages of the site that are made from the code (a hook of mkdocs)."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+from mkdocs.structure.files import File, Files
+from pydantic import BaseModel
+
+ROOT = Path(__file__).resolve().parents[1]
+GALLERY = ROOT / "build" / "gallery"
+UNITS = {
+    "rad_s": "rad/s", "Nms": "N m s", "Nm": "N m", "kg_m2": "kg m²", "kg_m": "kg/m", "kg": "kg", "rad": "rad",
+    "deg": "deg", "Hz": "Hz", "dB": "dB", "percent": "%", "samples": "samples", "V": "V",
+    "m": "m", "s": "s",
+}  # fmt: skip
+SHOWN = {
+    "look.html": ("What a log holds", "flexlink look logs/09_prbs.csv --out look.html"),
+    "identify.html": (
+        "A model from logs",
+        "flexlink identify logs/0*_V_rms_*.csv --output hub_angle_rad --report identify.html",
+    ),
+    "run/report.html": ("From records to a certified controller", "flexlink run --out run"),
+    "diagnosis/gap_case.html": (
+        "Why simulation and machine disagree",
+        "flexlink diagnose examples/gap_case --out diagnosis",
+    ),
+}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Generated pages join those of docs/."""
+    made = {
+        "reference/configuration.md": configuration(),
+        "reference/command_line.md": command_line(),
+        "reference/python.md": python(),
+        "gallery.md": gallery(),
+    }
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
+    for name in SHOWN:
+        if (GALLERY / name).is_file():
+            files.append(File.generated(config, f"pages/{name}", content=(GALLERY / name).read_bytes()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Links to files of the repository, which are not on the site, become their names."""
+    return re.sub(r"\[[^\]]*\]\((?:\.\./)+((?:examples|benchmarks|tests)[^)]*)\)", r"`\1`", markdown)
+
+
+def unit_of(key: str, meaning: str) -> str:
+    """From the end of the name, else from brackets in the meaning."""
+    for ending, unit in UNITS.items():
+        if key == ending or key.endswith(f"_{ending}"):
+            return unit
+    found = re.search(r"\[([^\]]+)\]", meaning)
+    return found.group(1) if found else ""
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Settings that an annotation has inside."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from models_in(part)
+
+
+def sections(model: type[BaseModel], where: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    """Dotted place and model of every table of a configuration, this one first."""
+    yield where, model
+    for key, field in model.model_fields.items():
+        inner = list(models_in(field.annotation))
+        for part in inner:
+            kind = get_args(part.model_fields["kind"].annotation) if len(inner) > 1 else ()
+            place = f"{where}.{key}".lstrip(".")
+            yield from sections(part, f'{place}: kind = "{kind[0]}"' if kind else place)
+
+
+def keys(model: type[BaseModel]) -> Iterator[tuple[str, Any]]:
+    """Keys of a table that hold values, not tables."""
+    for key, field in model.model_fields.items():
+        if not list(models_in(field.annotation)):
+            yield field.alias or key, field
+
+
+def roots() -> dict[str, type[BaseModel]]:
+    """The files that are configured."""
+    from workflow.config.design_file import DesignFile
+    from workflow.config.run_config import RunConfig
+    from workflow.study.settings import StudyConfig
+
+    return {"A run": RunConfig, "A design file": DesignFile, "A study": StudyConfig}
+
+
+def configuration() -> str:
+    """Every key of a run configuration, of a design file and of a study: unit, default, meaning."""
+    parts = [
+        "# Configuration",
+        "Made from the models that check the files: an unknown key is refused by name. Bold keys have to be "
+        "there. Examples: `examples/*.toml`. Rig and case files: [cases](../case_files.md).",
+    ]
+    seen: set[type[BaseModel]] = set()
+    for title, root in roots().items():
+        parts.append(f"## {title}")
+        for place, model in sections(root):
+            rows = [row(key, field) for key, field in keys(model)]
+            if rows and model not in seen:
+                seen.add(model)
+                parts.append(f"### {place or 'top level'}\n\n{sentence(model)}")
+                parts.append("| key | unit | default | meaning |\n|---|---|---|---|\n" + "\n".join(rows))
+    return "\n\n".join(parts) + "\n"
+
+
+def sentence(model: type[BaseModel]) -> str:
+    """The first paragraph of a docstring of its own."""
+    text = inspect.cleandoc(model.__dict__.get("__doc__") or "")
+    return " ".join(text.partition("\n\n")[0].split())
+
+
+def row(key: str, field: Any) -> str:
+    """One line of a table."""
+    meaning = field.description or ""
+    if field.is_required():
+        name, default = f"**`{key}`**", ""
+    else:
+        value = field.get_default(call_default_factory=True)
+        name, default = f"`{key}`", "none" if value is None else f"`{value!r}`"
+    choices = [f"`{choice}`" for choice in get_args(field.annotation) if isinstance(choice, str)]
+    text = f"{meaning} ({', '.join(choices)})" if choices else meaning
+    return (
+        "| "
+        + " | ".join(cell.replace("|", "\\|") for cell in (name, unit_of(key, meaning), default, text))
+        + " |"
+    )
+
+
+def command_line() -> str:
+    """What `flexlink COMMAND -h` prints."""
+    from typer.main import get_command
+    from typer.testing import CliRunner
+
+    from workflow.cli import _plug_in, app
+
+    _plug_in(["-h"])
+    runner, parts = CliRunner(), ["# Command line"]
+    for name in ("", *get_command(app).commands):
+        shown = runner.invoke(app, [*name.split(), "--help"], prog_name="flexlink", terminal_width=100)
+        parts.append(f"## {f'flexlink {name}'.strip()}\n\n```text\n{shown.stdout.strip()}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def python() -> str:
+    """Every name of the front door with its docstring."""
+    import flexlink
+
+    parts = [
+        "# Python",
+        "What `import flexlink` offers. A walk through it: [flexlink from Python](../from_python.md).",
+    ]
+    for module, names in flexlink._MODULES.items():
+        parts.append(f"## {module}")
+        for name in sorted(names):
+            thing = getattr(flexlink, name)
+            try:
+                signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))
+            except (TypeError, ValueError):
+                signature = ""
+            text = inspect.cleandoc(thing.__doc__ or "")
+            parts.append(f"### {name}\n\n```python\n{name}{signature}\n```\n\n```text\n{text}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def gallery() -> str:
+    """Links to the pages that `make docs` has drawn, with the command of each."""
+    parts = [
+        "# Gallery",
+        "Pages as flexlink writes them, each one file, drawn for this site by the command under it.",
+    ]
+    for name, (title, command) in SHOWN.items():
+        if (GALLERY / name).is_file():
+            parts.append(f"## {title}\n\n[Open the page](pages/{name})\n\n    {command}")
+    if len(parts) == 2:
+        parts.append("No page has been drawn here: `make docs` does it.")
+    return "\n\n".join(parts) + "\n"

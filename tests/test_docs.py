@@ -1,0 +1,134 @@
+"""The documents: every snippet runs, every key has a meaning, the site needs no network."""
+
+from __future__ import annotations
+
+import doctest
+import glob
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.workflow.command import Answer
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+# Run by tests of their own.
+ELSEWHERE = {"from_python.md": "test_front_door.py", "own_plant.md": "workflow/test_plant_page.py"}
+CONSOLE = ["c_code.md", "which_data.md"]
+LONG = ["tutorials/engineer.md", "tutorials/student.md"]
+
+
+def pages() -> Any:
+    """The hook that makes pages of the site from the code."""
+    pytest.importorskip("mkdocs")
+    found = importlib.util.spec_from_file_location("build_pages", DOCS / "build_pages.py")
+    assert found is not None
+    assert found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+def run_page(path: Path, flexlink: Callable[..., Answer]) -> None:
+    """Blocks in order: one with a title is a file, one called console holds commands and what they print."""
+    done = 0
+    for kind, title, text in BLOCK.findall(path.read_text(encoding="utf-8")):
+        if title:
+            Path(title).write_text(text, encoding="utf-8")
+        elif kind == "console":
+            for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+                command, _, expected = part.partition("\n")
+                printed = run_command(command, flexlink)
+                assert doctest.OutputChecker().check_output(expected, printed, FLAGS), f"{command}\n{printed}"
+                done += 1
+    assert done
+
+
+def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
+    """As in a shell, but `flexlink` in this process, which saves seconds each."""
+    name, *arguments = shlex.split(command)
+    if name == "flexlink":
+        told = flexlink(*(found for word in arguments for found in (sorted(glob.glob(word)) or [word])))
+        assert told.code == 0, f"{command}\n{told.err}"
+        return told.out
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = command.replace("python ", f"{sys.executable} ", 1) if name == "python" else command
+    done = subprocess.run(command, shell=True, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, f"{command}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture
+def clean(tmp_path, monkeypatch):
+    """A directory with the examples and nothing else."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("/logs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", [*CONSOLE, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)])
+def test_commands_of_a_page_print_what_it_says(name, clean, flexlink):
+    if name == "c_code.md" and shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    run_page(DOCS / name, flexlink)
+
+
+def test_python_of_the_lecture_runs(clean):
+    result = doctest.testfile(str(DOCS / "tutorials/lecturer.md"), module_relative=False, optionflags=FLAGS)
+    assert (result.failed, result.attempted > 10) == (0, True)
+
+
+def test_no_snippet_is_left_out():
+    for page in DOCS.rglob("*.md"):
+        name, text = str(page.relative_to(DOCS)), page.read_text(encoding="utf-8")
+        assert ("```console" in text) == (name in [*CONSOLE, *LONG]), name
+        assert (">>> " in text) == (name in ELSEWHERE or name == "tutorials/lecturer.md"), name
+
+
+def test_every_key_of_a_configuration_has_a_meaning():
+    hook = pages()
+    found = [
+        (title, place, key, field.description)
+        for title, root in hook.roots().items()
+        for place, model in hook.sections(root)
+        for key, field in hook.keys(model)
+    ]
+    assert len(found) > 150
+    assert [entry for entry in found if not entry[3]] == []
+    text = hook.configuration()
+    assert "| `bandwidth_rad_s` | rad/s | none |" in text
+    assert "| **`amplitude_V`** | V |  | largest voltage |" in text
+
+
+def test_the_site_is_built_whole_and_asks_no_network(tmp_path):
+    pytest.importorskip("material")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "DISABLE_MKDOCS_2_WARNING": "true"}
+    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    made = {str(page.relative_to(tmp_path / "site")) for page in (tmp_path / "site").rglob("*.html")}
+    assert {
+        "index.html",
+        "tutorials/engineer.html",
+        "reference/python.html",
+        "reference/configuration.html",
+    } <= made
+    for page in (tmp_path / "site").rglob("*.html"):
+        if "pages" in page.parts:
+            continue  # drawn by flexlink, tested with it
+        text = page.read_text(encoding="utf-8")
+        fetched = re.findall(
+            r"<(?:script|img|link|iframe|source)\b[^>]*(?:src|href)=\"?(https?:[^\" >]+)", text
+        )
+        assert fetched == [], page.name
