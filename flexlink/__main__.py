@@ -2,7 +2,7 @@
 
 import sys
 
-from workflow.cli import main
+from workflow.__main__ import main
 
 if __name__ == "__main__":
     sys.exit(main())

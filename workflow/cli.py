@@ -13,6 +13,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
@@ -42,6 +43,8 @@ from workflow.engine.threads import one_thread
 if TYPE_CHECKING:
     from control_design.controllers.c_code import Dialect
     from workflow.tasks.summary import RunSummary
+
+_MANIFESTS = ("manifest.json", "study.json", "diagnose.json")  # of what can be continued
 
 app = typer.Typer(
     name="flexlink",
@@ -626,10 +629,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not arguments:
         arguments = ["--help"]
     try:
-        if argv is None:
-            interrupts.watch()
         _plug_in(arguments)
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
+        sys.stdout.flush()
         # typer turns Ctrl-C into a silent exit of this code.
         return _interrupted(arguments) if code == EXIT_INTERRUPTED else code
     except (KeyboardInterrupt, typer.Abort):
@@ -637,14 +639,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     except CommandInterruptedError as error:
         return _interrupted(arguments, error.out)
     except BrokenPipeError:
-        # Whoever read our output has left; there is nobody to tell, at the last flush neither.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _no_more_output()  # whoever read it has left; there is nobody to tell
         return EXIT_OK
     except Exception as error:
+        if isinstance(error, OSError) and error.filename is None:
+            _no_more_output()
         if debug:
             traceback.print_exc()
         message, code = _explain(error)
         return _complain(cut(one_line(message), LONGEST_LINE), code)
+
+
+def _no_more_output() -> None:
+    """Standard output goes nowhere, at the last flush neither."""
+    with suppress(OSError):  # no file at all
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _commands() -> dict[str, Callable[..., Any]]:
@@ -678,7 +687,7 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
             out = Path(again[given].partition("=")[2] or again[given + 1])
         elif out is not None:
             again += ["--out", str(out)]
-        if out is not None and out.is_dir():
+        if out is not None and any((out / name).is_file() for name in _MANIFESTS):
             hint = f"; {shlex.join(['flexlink', *again, '--resume'])} continues"
     return _complain(f"interrupted{hint}", interrupts.exit_code())
 
@@ -701,5 +710,6 @@ def _explain(error: Exception) -> tuple[str, int]:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"flexlink: {one_line(message)}", file=sys.stderr)  # noqa: T201
+    with suppress(OSError):  # the exit code says it all the same
+        print(f"flexlink: {one_line(message)}", file=sys.stderr)  # noqa: T201
     return code

@@ -16,6 +16,8 @@ from control_design.controllers.law import Law
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
+from ident.data.foreign_files import content_of
+from ident.data.mat_files import plain_variables
 
 if TYPE_CHECKING:
     import control
@@ -103,7 +105,7 @@ class Controller(Law):
 
     def save_mat(self, file: str | PathLike[str] | BinaryIO) -> None:
         """MATLAB 5 file (path or stream) with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
-        import scipy.io  # here and below: few use such files, and every command would wait for it
+        import scipy.io  # here: few use such files, and every command would wait for it
 
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         given = values.pop("feedforward")
@@ -114,14 +116,11 @@ class Controller(Law):
 
     @classmethod
     def load_mat(cls, path: str | PathLike[str]) -> Controller:
-        """Inverse of `save_mat`."""
-        import scipy.io
-
-        data = scipy.io.loadmat(Path(path), simplify_cells=True)
-        known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
-        unlimited = {key: None for key in ("input_limit", "rate_limit") if np.isinf(known.get(key, 0.0))}
+        """Inverse of `save_mat`. Raises ValueError: one line that begins with the file."""
+        known = plain_variables(content_of(Path(path)), path)
+        unlimited = {key: None for key in ("input_limit", "rate_limit") if known.get(key) == float("inf")}
         try:
-            return cls.from_dict({"format": cls.format_name(), **known, **unlimited})
+            return cls.from_dict({**known, **unlimited, "format": cls.format_name()})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

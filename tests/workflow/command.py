@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 FAST_ARM = Path(__file__).parent / "data" / "fast_arm.toml"
 
@@ -64,6 +66,16 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]
         assert time.monotonic() < deadline, "nothing happened"
         assert process.poll() is None, process.communicate()[1].decode()
         time.sleep(0.002)
+
+
+def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are built but not rendered: what a page says does not depend on its pictures."""
+    from workflow.figures.style import Picture
+    from workflow.report import rendering
+
+    nothing = {"axes": [], "cuts": [], "legend": [], "width": 1, "height": 1}
+    empty = Picture("svg", b"<svg/>", nothing)
+    monkeypatch.setattr(rendering, "render", lambda figure, also: empty)
 
 
 def kill(process: subprocess.Popen[bytes]) -> None:

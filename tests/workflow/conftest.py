@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflow.command import FAST_ARM
-from workflow.figures.style import Picture
-from workflow.report import rendering
+from tests.workflow.command import FAST_ARM, draw_nothing
 from workflow.tasks.summary import RunSummary
 
 
@@ -23,7 +21,4 @@ def fast_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are built but not rendered: what a page says does not depend on its pictures."""
-    nothing = {"axes": [], "cuts": [], "legend": [], "width": 1, "height": 1}
-    empty = Picture("svg", b"<svg/>", nothing)
-    monkeypatch.setattr(rendering, "render", lambda figure, also: empty)
+    draw_nothing(monkeypatch)

@@ -35,6 +35,12 @@ base = "{FAST_ARM}"
 "closed_loop.conditions" = false
 """
 
+TWO_POINTS = f"""{PLAIN}
+[[axes]]
+key = "specification.bandwidth_rad_s"
+values = [1.0, 1.5]
+"""
+
 
 def write_study(folder: Path, text: str = SMALL_STUDY) -> Path:
     """The study as a file in `folder`."""

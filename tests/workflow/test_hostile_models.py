@@ -15,7 +15,7 @@ from ident.basis.model_files import ModelFile
 from ident.basis.poles import Poles
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
 from ident.data import npz_files
-from tests.ident.mutations import mutated
+from tests.ident.mutations import Tally, mutated, tally
 from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError
@@ -54,13 +54,21 @@ def complaint(path) -> str | None:
     return None
 
 
-def fuzzed(name, tmp_path, count):
-    rng, path = np.random.default_rng(15), tmp_path / name
+def damaged(name, folder, count) -> Tally:
+    path = folder / name
     path.write_bytes(WHOLE[name])
     assert complaint(path) is None
-    for _ in range(count):
+
+    def attempt(rng):
         path.write_bytes(mutated(WHOLE[name], rng))
-        complaint(path)
+        said = complaint(path)
+        return said and said.replace(str(path), name)
+
+    return tally(attempt, count, 15)
+
+
+def fuzzed(name, tmp_path, count):
+    assert damaged(name, tmp_path, count).wrong == []
 
 
 @pytest.mark.parametrize("name", WHOLE)

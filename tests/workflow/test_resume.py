@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.interruptions import Found, chain, contents, random_stops
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
@@ -155,29 +156,14 @@ def test_resume_without_config_uses_the_one_in_the_directory(fast_run):
     assert run_from_files(None, fast_run[0], resume=True).numbers == fast_run[1].numbers
 
 
-@pytest.mark.parametrize(
-    ("appears", "pause_s"),
-    [
-        ("manifest.json", 0.0),
-        ("stages/identify.npz", 0.1),
-        ("stages/uncertainty.npz", 0.3),  # the optimiser
-        ("stages/design.npz", 0.1),
-        ("stages/reference_filter.json", 0.3),
-    ],
-)
-def test_interrupted_run_says_how_to_resume_and_ends_with_the_same_numbers(
-    reference, tmp_path, appears, pause_s
-):
-    out = tmp_path / "run"
-    process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
-    wait_until((out / appears).exists, process)
-    time.sleep(pause_s)
-    process.send_signal(signal.SIGINT)
-    error = finish(process, 130, seconds=60)
-    call = f"flexlink run --config {FAST_ARM} --out {out} --resume"
-    assert error == f"flexlink: interrupted; {call} continues\n"
-    finish(start_flexlink(*call.split()[1:]))
-    assert_same_run(reference, out)
+def test_stopped_again_and_again_it_ends_with_the_same_files(reference, tmp_path):
+    """Kills and interrupts at random moments, continued as the line says: benchmarks/interruptions.py makes
+    many, of studies and diagnoses too."""
+    found, kinds = Found(), (signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    stops = random_stops(np.random.default_rng(15), kinds, 6, whole_s=12.0)
+    chain(["run", "--config", str(FAST_ARM)], tmp_path / "run", contents(reference), stops, found)
+    assert found.bad == []
+    assert found.stops - found.past_the_end >= 4
 
 
 def test_a_run_leaves_its_controller(reference):

@@ -52,7 +52,7 @@ def test_a_place_that_takes_no_files_is_refused_before_the_work():
 
 def test_a_living_run_is_not_replaced(tmp_path):
     run = begin(tmp_path / "run")
-    with run.locked(), pytest.raises(InputError, match="another process"):
+    with run.locked(), pytest.raises(InputError, match="another process"), run.writing(replace=True):
         begin(tmp_path / "run", replace=True)
     assert run.manifest_path.is_file()
     begin(tmp_path / "run", replace=True)

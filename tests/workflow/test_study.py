@@ -394,7 +394,8 @@ def test_replacing_a_study_deletes_what_was_its_own_and_nothing_else(tmp_path):
     other = SimpleNamespace(**{**vars(base), "digests": {"records": "other"}})
     with pytest.raises(InputError, match=r"the base changed.*--replace"):
         StudyDirectory.begin(first.path, text="second", base=other, resume=True)
-    with first.locked(), pytest.raises(InputError, match="another process is writing this study"):
+    refusal = pytest.raises(InputError, match="another process is writing this study")
+    with first.locked(), refusal, first.writing(replace=True):
         StudyDirectory.begin(first.path, text="second", base=other, resume=False, replace=True)
     assert (first.points_path / "old").is_dir()
     second = StudyDirectory.begin(first.path, text="second", base=other, resume=False, replace=True)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from tests.workflow.command import ROOT, finish, start_flexlink, wait_until
-from tests.workflow.study_examples import assert_same_study, write_study
+from tests.workflow.study_examples import TWO_POINTS, assert_same_study, write_study
+from workflow.engine.cluster import DaskCluster
+from workflow.engine.errors import StageError
 from workflow.study.run import run_study
 
 
@@ -34,17 +40,21 @@ class Cluster:
             "scheduler", "--host", "127.0.0.1", "--port", self.address.rpartition(":")[2], "--no-dashboard"
         )
         self.workers: list[subprocess.Popen[bytes]] = []
+        wait_until(self._listens, self.scheduler)
 
-    def add_worker(self) -> None:
-        self.workers.append(
-            self._start("worker", self.address, "--no-nanny", "--nthreads", "1", "--no-dashboard")
-        )
+    def _listens(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", int(self.address.rpartition(":")[2]))) == 0
 
-    def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
+    def add_worker(self, code: Path = ROOT) -> None:
+        options = ("--no-nanny", "--nthreads", "1", "--no-dashboard")
+        self.workers.append(self._start("worker", self.address, *options, code=code))
+
+    def _start(self, *arguments: str, code: Path = ROOT) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             [sys.executable, "-m", "dask", *arguments],
             cwd=self._folder,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(code)},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -107,6 +117,76 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
     assert 1 <= done < 6
     run_study(study, tmp_path / "out", resume=True, jobs=2)
     assert finished_points(tmp_path / "out") == 6
+
+
+@dataclass(frozen=True)
+class Sleep:
+    """A task that takes so long."""
+
+    seconds: float
+
+    def run(self, report):
+        time.sleep(self.seconds)
+        return self.seconds
+
+
+@pytest.mark.parametrize(
+    ("who", "words"),
+    [("scheduler", "has not answered for 8 s"), ("worker", "no worker that answers for 8 s")],
+)
+def test_a_network_that_stalls(cluster, monkeypatch, who, words):
+    """A process that is stopped keeps its connections and says nothing, as behind a dead switch."""
+    for name, seconds in {"SILENT_S": 8, "WITHOUT_WORKERS_S": 8, "ANSWER_S": 2, "_ASK_S": 0.2}.items():
+        monkeypatch.setattr(f"workflow.engine.cluster.{name}", seconds)
+    cluster.add_worker()
+    with closing(DaskCluster(cluster.address)) as far:
+        found = far.run([Sleep(0.0), Sleep(300.0)])
+        assert next(found) == (0, 0.0)
+        stalled = cluster.scheduler if who == "scheduler" else cluster.workers[0]
+        stalled.send_signal(signal.SIGSTOP)
+        began_s = time.monotonic()
+        with pytest.raises(StageError, match=f"{words}; --resume continues the study"):
+            next(found)
+    assert time.monotonic() - began_s < 30
+
+
+@pytest.mark.slow
+def test_a_stalled_study_goes_on_elsewhere(cluster, tmp_path):
+    """With the times as they are: within a minute it says what is missing."""
+    cluster.add_worker()
+    study, call = far_study(tmp_path, cluster.address)
+    process = start_flexlink(*call)
+    wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
+    cluster.scheduler.send_signal(signal.SIGSTOP)
+    began_s = time.monotonic()
+    said = finish(process, 1, seconds=120)
+    assert time.monotonic() - began_s < 60
+    assert said == (
+        f"flexlink: the Dask scheduler at {cluster.address} has not answered for 40 s; "
+        "--resume continues the study\n"
+    )
+    run_study(study, tmp_path / "out", resume=True, jobs=2)
+    run_study(study, tmp_path / "near", jobs=2)
+    assert_same_study(tmp_path / "near", tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_another_version_on_the_worker(cluster, tmp_path, flexlink):
+    other = tmp_path / "other"
+    for room in ("plant", "ident", "control_design", "workflow", "flexlink"):
+        shutil.copytree(ROOT / room, other / room)
+    with open(other / "workflow/study/task.py", "a") as file:
+        file.write("# edited\n")
+    cluster.add_worker(other)
+    study = write_study(tmp_path, TWO_POINTS)
+    call = ("study", "--config", study, "--out", tmp_path / "out", "--scheduler", cluster.address)
+    answer = flexlink(*call)
+    assert answer.code == 1
+    assert "2 of 2 points failed" in answer.err
+    assert "the code of the worker is not that of the study" in answer.err
+    assert flexlink(*call[:5], "--resume").code == 0
+    assert flexlink(*call[:4], tmp_path / "near").code == 0
+    assert_same_study(tmp_path / "near", tmp_path / "out")
 
 
 def test_scheduler_without_workers(cluster, refused, tmp_path, monkeypatch):

@@ -106,12 +106,12 @@ def redraw_paper(
             "rows": [asdict(row) for row in rows],
         }
         page = page_html(results, pictures, findings, rows)
-        store.prepare(replace=True)
-        for number, picture in pictures.items():
-            storage.write_bytes(store.path / f"figure-{number}.{picture.kind}", picture.content)
-        storage.write_text(store.path / TABLE_CSV, table.csv_text(rows))
-        storage.write_text(store.path / TABLE_JSON, plain_text(document))
-        storage.write_text(store.manifest_path, page)
+        files = {f"figure-{number}.{one.kind}": one.content for number, one in pictures.items()}
+        files |= {TABLE_CSV: table.csv_text(rows).encode(), TABLE_JSON: plain_text(document).encode()}
+        files[store.manifest_name] = page.encode()
+        with store.writing(replace=True):
+            store.prepare(replace=True)
+            storage.write_together({store.path / name: content for name, content in files.items()})
     return _summary(store.path, document)
 
 

@@ -16,7 +16,7 @@ from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.tasks import truth
 from workflow.tasks.log_identification import LogIdentification, identify_records
-from workflow.tasks.model_files import MODEL_SUFFIXES, write_model
+from workflow.tasks.model_files import MODEL_SUFFIXES, model_bytes
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
 from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
@@ -62,17 +62,19 @@ def identified(
         progress=progress,
     )
     result = replace(result, true_modes=truth.beside(result.about, true_modes), input_limit=asked.input_limit)
+    files: dict[Path, bytes] = {}
     if report is not None:
         from workflow.report.identify_page import identify_page  # loads matplotlib: a second
 
         with progress.stage("report") as update:
             inputs = {str(path): storage.sha256_of_file(path) for path in asked.files}
-            storage.write_text(report, identify_page(result, inputs, update))
+            files[report] = identify_page(result, inputs, update).encode()
     if out is not None:
         plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, asked.promised.level)
-        storage.write_npz(out, codec.to_arrays(plant))
+        files[out] = storage.npz_bytes(codec.to_arrays(plant))
     if export is not None:
-        write_model(export, ModelFile(result.about.model, result.spread.frequency))
+        files[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))
+    storage.write_together(files)
     return _summary(result, out, report, export)
 
 

@@ -97,14 +97,14 @@ def diagnose_cases(
     code = code_digest("diagnosis", drawing=True)
     engine = engine or (Engine() if time_limit_s is None else Engine(time_limit_s=time_limit_s))
     work = [Work(one, controller, code, engine) for one in loaded]
-    directory = DiagnosisDirectory.begin(
-        out,
-        inputs={one.case.name: one.input_sha256 for one in loaded},
-        options={"controller": controller, **engine.options},
-        resume=resume,
-        replace=replace,
-    )
-    with directory.locked():
+    with DiagnosisDirectory(out).writing(resume=resume, replace=replace):
+        directory = DiagnosisDirectory.begin(
+            out,
+            inputs={one.case.name: one.input_sha256 for one in loaded},
+            options={"controller": controller, **engine.options},
+            resume=resume,
+            replace=replace,
+        )
         documents, failures = _compute(directory, work, jobs or os.cpu_count() or 1, progress)
         failures = [*unreadable, *failures]
         if len(places) == 1 and failures:
@@ -166,10 +166,9 @@ def _compute(
                 failures[name] = found
             else:
                 files, cpu_s = found
-                directory.save(name, files)
-                answers[name] = json.loads(files[f"{name}.json"])
                 timings[name] = {"cpu_s": round(cpu_s, 3)}
-                directory.write("timings.json", codec.plain_text(timings).encode())
+                directory.save(name, {**files, "timings.json": codec.plain_text(timings).encode()})
+                answers[name] = json.loads(files[f"{name}.json"])
             watch(index, 1.0, "done")
     return (
         [answers[name] for name in order if name in answers],

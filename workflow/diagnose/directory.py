@@ -75,14 +75,14 @@ class DiagnosisDirectory(Store):
         storage.write_bytes(self.path / name, content)
 
     def save(self, case: str, files: Mapping[str, bytes]) -> None:
-        """All files of a case, its JSON file last; what an earlier answer had besides goes."""
+        """All files of a case, its JSON file last, and the timings; what an earlier answer had goes."""
         answer = f"{case}.json"
         (self.path / answer).unlink(missing_ok=True)
         for ending in _ENDINGS:
             if f"{case}{ending}" not in files:
                 (self.path / f"{case}{ending}").unlink(missing_ok=True)
-        for name in sorted(files, key=lambda name: name == answer):
-            self.write(name, files[name])
+        names = sorted(files, key=lambda name: name == answer)
+        storage.write_together({self.path / name: files[name] for name in names})
 
     def finished(self, case: str, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
         """The answer to a case if it is there, whole and made from this; else None."""

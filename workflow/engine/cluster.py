@@ -20,7 +20,10 @@ from workflow.engine.errors import InputError, StageError, one_line
 from workflow.engine.executor import Failure, R, Task, Watch, attempt
 
 CONNECT_S = 10.0
-WITHOUT_WORKERS_S = 60.0
+# A study that cannot go on says so within a minute.
+WITHOUT_WORKERS_S = 50.0
+SILENT_S = 40.0
+ANSWER_S = 10.0
 _LOOK_S = 0.05
 _ASK_S = 2.0
 
@@ -44,8 +47,9 @@ async def _call(distributed: Any, address: str) -> None:
 class DaskCluster:
     """The workers behind a scheduler's address. `close` hangs up.
 
-    A worker that dies is the scheduler's business: its task goes to another one. A scheduler that dies ends
-    the work with one line.
+    A worker that dies, or is not heard of any more while others are, is the scheduler's business: its task
+    goes to another one. A scheduler that dies or does not answer, or has no worker that it hears of, ends the
+    work with one line.
 
     Raises InputError when the extra is not installed, nobody answers, or there are no workers.
     """
@@ -60,6 +64,8 @@ class DaskCluster:
             ) from error
         self._distributed = distributed
         self.address = address
+        self._last_seen: dict[str, Any] = {}
+        self._heard_s = self._staffed_s = 0.0
         # Its own reports of lost connections would bury our one line.
         self._loggers = [
             logger
@@ -99,10 +105,12 @@ class DaskCluster:
     @property
     def width(self) -> int:
         """How many tasks run at once, as far as is known."""
-        return max(1, self._workers() or 1)
+        self._ask()
+        return max(1, len(self._last_seen))
 
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """Position and result of every task, as they finish. Raises StageError when the scheduler is lost."""
+        """Position and result of every task, as they finish. Raises StageError when the scheduler is lost or
+        silent, or has no workers."""
         name = uuid.uuid4().hex  # results of other work on the same cluster are not ours
         with warnings.catch_warnings():
             # A large plant travels with its task: nothing is lost with a worker.
@@ -111,20 +119,23 @@ class DaskCluster:
                 self._client.submit(run_on_worker, task, key=f"flexlink-{name}-{index}", pure=False): index
                 for index, task in enumerate(tasks)
             }
-        staffed = looked = time.monotonic()
+        asked_s = self._heard_s = self._staffed_s = time.monotonic()
         while futures:
             # A client that loses its scheduler cancels them all.
             finished = [future for future in futures if future.done()]
             if not finished:
                 time.sleep(_LOOK_S)
-            if time.monotonic() - looked > _ASK_S:
-                looked = time.monotonic()
-                staffed = staffed if self._workers() == 0 else looked
-                if looked - staffed > WITHOUT_WORKERS_S:
-                    raise StageError(
-                        f"the Dask cluster at {self.address} had no worker for {WITHOUT_WORKERS_S:.0f} s; "
-                        "--resume continues the study"
-                    )
+            if time.monotonic() - asked_s > _ASK_S:
+                self._ask()
+                asked_s = time.monotonic()
+                missing = ""
+                if asked_s - self._heard_s > SILENT_S:
+                    missing = f"the Dask scheduler at {self.address} has not answered for {SILENT_S:.0f} s"
+                elif self._heard_s - self._staffed_s > WITHOUT_WORKERS_S:
+                    seconds = f"{WITHOUT_WORKERS_S:.0f} s"
+                    missing = f"the Dask cluster at {self.address} had no worker that answers for {seconds}"
+                if missing:
+                    raise StageError(f"{missing}; --resume continues the study")
             for future in finished:
                 yield futures.pop(future), self._result(future)
 
@@ -141,12 +152,18 @@ class DaskCluster:
             # What goes wrong in a task is its result: this is a worker that cannot even load it.
             return Failure(f"the worker cannot run flexlink ({type(error).__name__}: {one_line(error)})")
 
-    def _workers(self) -> int | None:
-        """How many workers the scheduler knows; None when it does not say."""
-        try:
-            return len(self._client.scheduler_info(n_workers=-1)["workers"])
-        except (OSError, TimeoutError, RuntimeError, KeyError):  # KeyError: while the connection is broken
-            return None
+    def _ask(self) -> None:
+        """Note when the scheduler was heard of last, and when it had heard of a worker. A process that is
+        stopped, or cut off, keeps its connections: only what it says tells that it is there."""
+        with suppress(
+            OSError, TimeoutError, RuntimeError, KeyError
+        ):  # KeyError: while a connection is broken
+            identity = self._client.sync(self._client.scheduler.identity, callback_timeout=ANSWER_S)
+            seen = {name: about["last_seen"] for name, about in identity["workers"].items()}
+            self._heard_s = time.monotonic()
+            if any(self._last_seen.get(name) != at for name, at in seen.items()):
+                self._staffed_s = self._heard_s
+            self._last_seen = seen
 
     def _restore(self) -> None:
         self._settings.__exit__(None, None, None)

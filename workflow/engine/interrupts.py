@@ -18,6 +18,12 @@ def watch() -> None:
             signal.signal(number, _remember)
 
 
+def ignore() -> None:
+    """From here on nothing is to be interrupted."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
 def check() -> None:
     """Raises KeyboardInterrupt if one came and went under in compiled code that calls back into Python: what
     such a library returns then is a solution of nothing."""

@@ -101,30 +101,32 @@ class RunDirectory(Store):
         afresh.
 
         `config` is the resolved configuration (JSON-able), `inputs` maps every input file as the user named
-        it to its SHA-256. Raises InputError: see `prepare`; on resuming also a changed configuration
-        (naming the key) or a changed input file (naming the file).
+        it to its SHA-256. Hold the lock (`writing`). Raises InputError: see `prepare`; on resuming also a
+        changed configuration (naming the key) or a changed input file (naming the file).
         """
         path = Path(path)
         run = cls(path)
         if run.prepare(resume=resume, replace=replace):
             run._check_same(config, inputs)
             return run
-        storage.write_text(path / "config.toml", config_text)
-        storage.write_json(path / "config.json", config)
+        manifest = {
+            "layout": LAYOUT_VERSION,
+            "status": "running",
+            "started": _now(),
+            "seed": seed,
+            "python": python_version(),
+            "versions": package_versions(),
+            "config_sha256": hash_of(config),
+            "inputs": dict(inputs),
+            "stages": {},
+        }
         # The manifest comes last: a directory without it holds nothing worth keeping and is begun afresh.
-        storage.write_json(
-            run.manifest_path,
+        storage.write_together(
             {
-                "layout": LAYOUT_VERSION,
-                "status": "running",
-                "started": _now(),
-                "seed": seed,
-                "python": python_version(),
-                "versions": package_versions(),
-                "config_sha256": hash_of(config),
-                "inputs": dict(inputs),
-                "stages": {},
-            },
+                path / "config.toml": config_text.encode(),
+                path / "config.json": storage.json_bytes(config),
+                run.manifest_path: storage.json_bytes(manifest),
+            }
         )
         return run
 

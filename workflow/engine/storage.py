@@ -14,7 +14,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,18 +34,32 @@ AnyArray = npt.NDArray[Any]
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Replace `path` by `content` atomically. Raises InputError (one line) where the disk refuses."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    write_together({path: content})
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Replace files that belong together: none where the disk has no room for all of them, each atomically.
+
+    Raises InputError (one line) where the disk refuses.
+    """
+    temporary = {path: path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}") for path in contents}
+    path = Path()
     try:
         try:
-            with open(temporary, "wb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, path)
+            for path, content in contents.items():
+                with open(temporary[path], "wb") as stream:
+                    stream.write(content)
+                    stream.flush()
+                    os.fsync(stream.fileno())
+            for path in contents:
+                os.replace(temporary[path], path)
         except BaseException:
-            temporary.unlink(missing_ok=True)
+            for leftover in temporary.values():
+                with suppress(OSError):  # what went wrong first is what is said
+                    leftover.unlink(missing_ok=True)
             raise
-        _flush_directory(path.parent)
+        for folder in {path.parent for path in contents}:
+            _flush_directory(folder)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from error
 
@@ -90,20 +104,16 @@ def write_text(path: Path, content: str) -> None:
 
 def write_new_directory(out: Path, texts: Mapping[str, str]) -> list[Path]:
     """Files by name in a directory, made where it is absent: all of them or none. Raises InputError."""
-    existed, files = out.is_dir(), list[Path]()
+    existed, files = out.is_dir(), {out / name: text.encode() for name, text in texts.items()}
     try:
         with naming(f"cannot write {out}"):
             out.mkdir(parents=True, exist_ok=True)
-        for name, text in texts.items():
-            write_text(out / name, text)
-            files.append(out / name)
+        write_together(files)
     except InputError:
-        for path in files:
-            path.unlink()
         if not existed and out.is_dir():
             out.rmdir()
         raise
-    return files
+    return list(files)
 
 
 def csv_text(columns: Mapping[str, AnyArray]) -> str:
@@ -114,9 +124,14 @@ def csv_text(columns: Mapping[str, AnyArray]) -> str:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Atomic JSON, strict: non-finite floats become `{"$float": "inf"}` and come back as floats."""
+    """Atomic JSON as of `json_bytes`."""
+    write_bytes(path, json_bytes(document))
+
+
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """Strict JSON: non-finite floats become `{"$float": "inf"}` and come back as floats."""
     tagged, _ = codec.pack(document)
-    write_text(path, json.dumps(tagged, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    return (json.dumps(tagged, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode("utf-8")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from workflow.engine import storage
-from workflow.engine.errors import InputError
+from workflow.engine.errors import InputError, naming
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Store:
                 raise InputError(f"cannot write {self.path}: {ancestor} is not a directory")
             # Permission bits do not tell of read-only file systems, nor bind the administrator: try.
             trial = ancestor / f".flexlink.{os.getpid()}{storage.TEMPORARY_SUFFIX}"
-            trial.mkdir()
-            trial.rmdir()
+            trial.touch()
+            trial.unlink()
             entries = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
         except OSError as error:
             raise InputError(f"cannot write {self.path}: {error.strerror or error}") from error
@@ -70,6 +70,8 @@ class Store:
         if strangers and not there:
             what = f"no {self.what} is there" if resume or replace else "not empty"
             raise InputError(f"{self.path}: {what} (it holds {min(strangers)!r}); choose another --out")
+        if not there and not any(any((self.path / name).iterdir()) for name in held & {*self.folders}):
+            held -= {*self.folders}  # of a command that ended before it had begun
         if held and not (resume or replace):
             raise InputError(
                 f"{self.path}: not empty, an earlier {self.what} is there; choose another --out, continue it "
@@ -77,16 +79,32 @@ class Store:
             )
         return there
 
+    @contextmanager
+    def writing(self, *, resume: bool = False, replace: bool = False) -> Iterator[None]:
+        """Hold the directory, made where it is absent, from before it is begun or continued: two commands
+        never mix in it. Raises InputError: see `refuse_unless_free`; also where another process writes."""
+        self.refuse_unless_free(resume=resume, replace=replace)
+        existed = self.path.is_dir()
+        with naming(f"cannot write {self.path}"):
+            self.path.mkdir(parents=True, exist_ok=True)
+        with self.locked():
+            try:
+                yield
+            except BaseException:
+                if not existed and not self.manifest_path.is_file():
+                    with suppress(OSError):
+                        self.discard()
+                raise
+
     def prepare(self, *, resume: bool = False, replace: bool = False) -> bool:
-        """Make the directory and its folders; with `replace` what is there is deleted first.
+        """Make the directory and its folders; with `replace` what is there is deleted first (hold the lock).
 
         Returns whether an earlier one is there now, to be continued. Raises InputError: see
-        `refuse_unless_free`; also where another process is writing it.
+        `refuse_unless_free`.
         """
         there = self.refuse_unless_free(resume=resume, replace=replace)
-        if replace and self.path.is_dir():
-            with self.locked():  # never under the hands of a living writer
-                self.discard()
+        if replace:
+            self.clear()
         try:
             for folder in ("", *self.folders):
                 (self.path / folder).mkdir(parents=True, exist_ok=True)
@@ -99,15 +117,19 @@ class Store:
         return storage.locked(self.path, self.what, *(self.path / folder for folder in self.folders))
 
     def discard(self) -> None:
-        """Delete what is ours, and the directory itself if nothing else is in it."""
+        """Delete what is ours, and the directory itself if nothing else is in it (hold the lock)."""
         if not self.path.is_dir():
             return
+        self.clear()
+        if {entry.name for entry in self.path.iterdir()} <= {"lock"}:
+            (self.path / "lock").unlink(missing_ok=True)
+            self.path.rmdir()
+
+    def clear(self) -> None:
+        """Delete what is ours but the lock."""
         for name in (*self.own_entries(), self.manifest_name):
             entry = self.path / name
             if entry.is_dir():
                 shutil.rmtree(entry)
             else:
                 entry.unlink(missing_ok=True)
-        if {entry.name for entry in self.path.iterdir()} <= {"lock"}:
-            (self.path / "lock").unlink(missing_ok=True)
-            self.path.rmdir()

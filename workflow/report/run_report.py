@@ -19,7 +19,7 @@ def write_report(
     progress: Callable[[float, str], None] | None = None,
     also: Iterable[str] = (),
 ) -> Path:
-    """Draw every picture into `figures/`, then write `report.html`; each file is whole or absent.
+    """Draw every picture into `figures/`, and write `report.html`: all of them or none.
 
     also: kinds of file beside SVG, pdf or png.
     Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
@@ -40,14 +40,13 @@ def write_report(
         summary=summarise(results, config),
     )
     run.figures_path.mkdir(exist_ok=True)
-    written = set()
-    for name, picture in page.pictures.items():
-        for kind, content in {picture.kind: picture.content, **picture.files}.items():
-            path = run.figures_path / f"{name}.{kind}"
-            storage.write_bytes(path, content)
-            written.add(path.name)
+    files = {
+        run.figures_path / f"{name}.{kind}": content
+        for name, picture in page.pictures.items()
+        for kind, content in {picture.kind: picture.content, **picture.files}.items()
+    }
+    storage.write_together({**files, run.report_path: page.html.encode()})
     for stale in sorted(run.figures_path.iterdir()):
-        if stale.suffix in (".svg", ".png", ".pdf") and stale.name not in written:
+        if stale.suffix in (".svg", ".png", ".pdf") and stale not in files:
             stale.unlink()
-    storage.write_text(run.report_path, page.html)
     return run.report_path

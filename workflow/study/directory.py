@@ -70,8 +70,12 @@ class StudyDirectory(Store):
                     f"{path}: cannot resume, the base changed at {changed}; choose another --out or start "
                     "afresh with --replace"
                 )
-        storage.write_text(study.path / "study.toml", text)
-        storage.write_json(study.manifest_path, document)
+        storage.write_together(
+            {
+                study.path / "study.toml": text.encode(),
+                study.manifest_path: storage.json_bytes(document),
+            }
+        )
         return study
 
     def _refuse_own_base(self, base: Base) -> None:

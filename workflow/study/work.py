@@ -67,8 +67,8 @@ def compute_study(
         executor: Executor = here
         if scheduler is not None:
             executor = stack.enter_context(closing(DaskCluster(scheduler)))
-        directory = StudyDirectory.begin(out, text=text, base=base, resume=resume, replace=replace)
-        with directory.locked():
+        with StudyDirectory(out).writing(resume=resume, replace=replace):
+            directory = StudyDirectory.begin(out, text=text, base=base, resume=resume, replace=replace)
             share = _POINT_S * count / executor.width
             progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
             work = _Work(directory, base, maker.base_point(), executor, here, progress, count)
@@ -199,7 +199,7 @@ def _done(
 def _write_up(
     directory: StudyDirectory, study: StudyConfig, text: str, base: Base, rows: Sequence[PointRow]
 ) -> RunSummary:
-    """Table, picture and page, the page last."""
+    """Table, picture and page: all of them or none."""
     # Imported here: only this step draws, and matplotlib takes a second to load.
     import workflow.study.pareto  # noqa: F401 (the page's drawing)
     from workflow.report.rendering import render_page
@@ -207,13 +207,13 @@ def _write_up(
     title = study.study.title or base.config.run.title or base.config.run.name
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
     view = StudyView(title, study, text, where, rows, _units(directory, rows))
-    storage.write_text(directory.path / "table.csv", csv_text(study.axes, rows, view.fronts))
-    storage.write_text(directory.path / "table.json", codec.plain_text(view.document))
     directory.link_numbers(rows)
     page = render_page("study.html.j2", title=title, study=view)
-    for name, picture in page.pictures.items():
-        storage.write_bytes(directory.path / f"{name}.{picture.kind}", picture.content)
-    storage.write_text(directory.page_path, page.html)
+    files = {f"{name}.{picture.kind}": picture.content for name, picture in page.pictures.items()}
+    files["table.csv"] = csv_text(study.axes, rows, view.fronts).encode()
+    files["table.json"] = codec.plain_text(view.document).encode()
+    files[directory.page_path.name] = page.html.encode()
+    storage.write_together({directory.path / name: content for name, content in files.items()})
     return study_summary(view, str(directory.page_path))
 
 

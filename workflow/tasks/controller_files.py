@@ -108,7 +108,7 @@ def write_controller(
         content |= {
             filter_file(path): filter_bytes(reference_filter, path.suffix, c) for path in targets(out)
         }
-    for path, data in content.items():
-        if not path.is_file() or path.read_bytes() != data:
-            storage.write_bytes(path, data)
+    storage.write_together(
+        {path: data for path, data in content.items() if not path.is_file() or path.read_bytes() != data}
+    )
     return list(content)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -57,17 +58,18 @@ def run_pipeline(
         with threadpool_limits(1):
             ready = first.run(StageInput(config, None, progress, called))
     ready_s = time.monotonic() - started
-    existed = out.exists()
-    run = RunDirectory.begin(
-        out,
-        config_text=config_text,
-        config=config.to_document(),
-        seed=config.run.seed,
-        inputs=inputs,
-        resume=resume,
-        replace=replace,
-    )
-    with run.locked(), threadpool_limits(1):  # more threads round otherwise
+    existed, run = out.exists(), RunDirectory(out)
+    # More threads round otherwise.
+    with run.writing(resume=resume, replace=replace), threadpool_limits(1):
+        RunDirectory.begin(
+            out,
+            config_text=config_text,
+            config=config.to_document(),
+            seed=config.run.seed,
+            inputs=inputs,
+            resume=resume,
+            replace=replace,
+        )
         run.record_status("running")
         stages = STAGES if page is None else (*STAGES, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
@@ -79,7 +81,8 @@ def run_pipeline(
             _keep_controller(results, config, dialect)
             summary = summarise(results, config)
         except KeyboardInterrupt:
-            run.record_status("interrupted")
+            with suppress(InputError):  # a full disk, a directory that is gone
+                run.record_status("interrupted")
             raise CommandInterruptedError(out) from None
         except BaseException as error:
             _fail(run, error, created=not existed)
@@ -178,5 +181,5 @@ def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:
         # Nothing of value is there yet, and a half-filled directory would refuse the corrected attempt.
         run.discard()
         return
-    if run.manifest_path.is_file():
+    with suppress(InputError):  # what went wrong first is what is said
         run.record_status(f"failed: {one_line(error) or type(error).__name__}")

@@ -1,0 +1,83 @@
+"""Files of every kind spoilt at random, by the loops of the tests: each is read, or refused in one line of at
+most 300 characters that names the file, within 60 s.
+
+What would compute is cut off where it begins: this is about files. Binary files have bits turned and bytes
+replaced, doubled or taken out; texts values, names, lines and characters changed. Formats that a compiled
+library reads take a process each.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from benchmarks.harness import Print, main
+from tests.ident import test_hostile_logs as logs
+from tests.ident.mutations import Tally
+from tests.workflow import test_hostile_models as models
+from tests.workflow import test_nothing_breaks_it as texts
+from tests.workflow.command import FAST_ARM, draw_nothing
+from workflow.commands.run import run_from_files
+
+
+def run(
+    out: Print,
+    *,
+    spoilt: int = 450,
+    controllers: int = 600,
+    tampered: int = 300,
+    binary: int = 600,
+    child: int = 100,
+) -> None:
+    out(f"{'':46}{'tried':>7}{'refused':>9}{'wrong':>7}   longest line   slowest refusal, CPU s")
+    total = Tally()
+
+    def told(kind: str, found: Tally) -> None:
+        counts = f"{found.tried:7d}{found.refused:9d}{len(found.wrong):7d}"
+        out(f"{kind:<46}{counts}{found.longest:15d}{found.slowest_s:25.2f}")
+        if found is total:
+            return
+        for line in found.wrong:
+            out(f"    {line}")
+        total.tried += found.tried
+        total.refused += found.refused
+        total.wrong += found.wrong
+        total.longest = max(total.longest, found.longest)
+        total.slowest_s = max(total.slowest_s, found.slowest_s)
+
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as name:
+        folder = Path(name)
+        told_each: list[tuple[str, Callable[[], Tally]]] = [
+            *((f"log: {log}", lambda log=log: logs.damaged(log, folder, binary)) for log in logs.IN_PROCESS),
+            *(
+                (f"model: {file}", lambda file=file: models.damaged(file, folder, binary))
+                for file in models.WHOLE
+            ),
+            *(
+                (
+                    f"controller {suffix}",
+                    lambda suffix=suffix: texts.spoilt_controllers(folder, controllers, suffix),
+                )
+                for suffix in (".json", ".mat")
+            ),
+            *((f"log: {log}", lambda log=log: logs.damaged(log, folder, child)) for log in logs.IN_A_CHILD),
+        ]
+        for kind, found in told_each:
+            told(kind, found())
+        with pytest.MonkeyPatch.context() as patch:
+            draw_nothing(patch)
+            run_from_files(FAST_ARM, folder / "run")
+            texts.cut_computations_off(patch)
+            (folder / "good").mkdir()
+            good = texts.good_files(folder / "good")
+            for number, kind in enumerate(texts.KINDS):
+                told(f"given to a command: {kind}", texts.spoilt_files(good[kind], number, folder, spoilt))
+            told("run directory, then report or --resume", texts.tampered(folder / "run", folder, tampered))
+    told("all", total)
+
+
+if __name__ == "__main__":
+    main(run, seeds="of the tests")
