@@ -56,13 +56,7 @@ def run(
                 (f"model: {file}", lambda file=file: models.damaged(file, folder, binary))
                 for file in models.WHOLE
             ),
-            *(
-                (
-                    f"controller {suffix}",
-                    lambda suffix=suffix: texts.spoilt_controllers(folder, controllers, suffix),
-                )
-                for suffix in (".json", ".mat")
-            ),
+            ("controller .json", lambda: texts.spoilt_controllers(controllers)),
             *((f"log: {log}", lambda log=log: logs.damaged(log, folder, child)) for log in logs.IN_A_CHILD),
         ]
         for kind, found in told_each:

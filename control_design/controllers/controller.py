@@ -16,8 +16,6 @@ from control_design.controllers.law import Law
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
-from ident.data.foreign_files import content_of
-from ident.data.mat_files import plain_variables
 
 if TYPE_CHECKING:
     import control
@@ -113,16 +111,6 @@ class Controller(Law):
             values["feedforward"] = vars(given)
         plain = {name: float("inf") if value is None else value for name, value in values.items()}
         scipy.io.savemat(Path(file) if isinstance(file, (str, PathLike)) else file, plain)  # type: ignore[arg-type]
-
-    @classmethod
-    def load_mat(cls, path: str | PathLike[str]) -> Controller:
-        """Inverse of `save_mat`. Raises ValueError: one line that begins with the file."""
-        known = plain_variables(content_of(Path(path)), path)
-        unlimited = {key: None for key in ("input_limit", "rate_limit") if known.get(key) == float("inf")}
-        try:
-            return cls.from_dict({**known, **unlimited, "format": cls.format_name()})
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
 
 
 class ControllerStepper:

@@ -21,7 +21,7 @@ import scipy.io
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.data.mat_files import plain_variables
+from ident.data.mat_files import mat_variables
 
 FORMAT = "flexlink GOBF model"
 FORMAT_VERSION = 1
@@ -86,7 +86,8 @@ class ModelFile:
     @classmethod
     def from_mat(cls, content: bytes, source: str = "model file") -> ModelFile:
         """Inverse of `to_mat`. ValueError: one line that begins with `source`."""
-        return _read(plain_variables(content, source), source)
+        document: dict[str, Any] = _plain(mat_variables(content, source))
+        return _read(document, source)
 
 
 def _as_lists(array: Any) -> Any:
@@ -94,6 +95,13 @@ def _as_lists(array: Any) -> Any:
     if np.iscomplexobj(array):
         array = np.column_stack([array.real, array.imag])
     return array.tolist()
+
+
+def _plain(value: Any) -> Any:
+    """A MATLAB variable as it would stand in JSON: text, a number, an array, or fields."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
 
 
 def _read(document: Mapping[str, Any], source: str) -> ModelFile:

@@ -43,17 +43,6 @@ def mat_variables(content: bytes, source: object) -> dict[str, Any]:
         raise ValueError(f"{source}: {error}") from None
 
 
-def plain_variables(content: bytes, source: object) -> dict[str, Any]:
-    """`mat_variables` as they would stand in JSON: an array of one number is that number."""
-    return {name: _plain(value) for name, value in mat_variables(content, source).items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
-
-
 class _File:
     """One file: the order of its bytes, and how much it may still unpack to."""
 
