@@ -485,14 +485,24 @@ def study(
 
 @app.command(short_help="Why machine and model differ: cause, size, closure.")
 def diagnose(
+    out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
     case: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             help="Case folder with case.toml, rig.toml and logs, or a TOML file like case.toml with a column "
-            "map beside logs of your own; several give an overview as well."
+            "map beside logs of your own, or one that names a simulator's model; several give an overview as "
+            "well."
         ),
-    ],
-    out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
+    ] = None,
+    mjcf: Annotated[str | None, typer.Option(help="MuJoCo model of the machine, in place of a case.")] = None,
+    fmu: Annotated[str | None, typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case.")] = None,
+    python: Annotated[
+        str | None, typer.Option(help="Python file with a simulation, in place of a case.")
+    ] = None,
+    log: Annotated[
+        list[str] | None,
+        typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
+    ] = None,
     rig: Annotated[
         str | None,
         typer.Option(
@@ -518,19 +528,28 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
-    if not any(place.exists() for place in case):
+    model = {key: name for key, name in {"mjcf": mjcf, "fmu": fmu, "python": python}.items() if name}
+    if bool(case) == bool(model) or bool(model) != bool(log):
+        raise InputError("diagnose: expected cases, or --mjcf, --fmu or --python with --log")
+    case = case or []
+    need(*([Path(name) for name in (*model.values(), *(log or []))] if model else []))
+    if case and not any(place.exists() for place in case):
         need(*case)
-    from workflow.diagnose.case_settings import read_case_file
+    from workflow.config.settings import check
+    from workflow.diagnose.case_settings import CaseSettings, case_document
 
     if len(case) == 1:
-        read_case_file(case[0])  # before what diagnoses is loaded, which takes seconds
+        file, document = case_document(case[0])
+        if not {"mjcf", "fmu", "python"} & set(document):
+            check(CaseSettings, document, source=str(file))  # before what diagnoses is loaded: seconds
     from workflow.console import TerminalProgress
 
     with TerminalProgress(quiet=quiet) as progress:
         from workflow.diagnose.command import diagnose_cases
+        from workflow.diagnose.simulator_case import settings_of
 
         found = diagnose_cases(
-            case,
+            [settings_of({**model, "log": log}, "--log")] if model else case,
             out,
             rig=rig,
             jobs=jobs,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -90,12 +90,16 @@ def _hub_first(names: tuple[Output, ...]) -> tuple[Output, ...]:
     return tuple(name for name in get_args(Output) if name in names)
 
 
+CaseName = Annotated[
+    Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=80)] | None,
+    Field(description="names the output files; letters, digits, '_', '-' and '.'"),
+]
+
+
 class CaseSettings(Section):
     """A case file."""
 
-    case: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=80)] | None = Field(
-        None, description="names the output files; letters, digits, '_', '-' and '.'"
-    )
+    case: CaseName = None
     rig: str = Field(RIG_FILE, min_length=1, description="rig file, relative to the case file")
     dt_s: float | None = Field(None, gt=0, description="sampling period of logs without a time column [s]")
     outputs: Annotated[tuple[Output, ...], AfterValidator(_hub_first)] = ("hub_angle_rad", "tip_m")
@@ -107,11 +111,17 @@ class CaseSettings(Section):
     experiments: tuple[ExperimentEntry, ...] = Field(min_length=1)
 
 
-def read_case_file(place: Path) -> tuple[Path, CaseSettings]:
+def case_document(place: Path) -> tuple[Path, dict[str, Any]]:
     """The case file of a folder, or the one named itself, and what it says. Raises InputError."""
     file = place if place.is_file() else place / CASE_FILE
     if not file.is_file():
         raise InputError(
             f"{place}: no case is there; expected a folder with {CASE_FILE}, or a TOML file like it"
         )
-    return file, check(CaseSettings, read_toml(file)[1], source=str(file))
+    return file, read_toml(file)[1]
+
+
+def read_case_file(place: Path) -> tuple[Path, CaseSettings]:
+    """`case_document`, checked. Raises InputError."""
+    file, document = case_document(place)
+    return file, check(CaseSettings, document, source=str(file))

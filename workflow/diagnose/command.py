@@ -11,9 +11,16 @@ from typing import Any
 
 from workflow.config.settings import repeated
 from workflow.diagnose.case_files import LoadedCase, load_case
-from workflow.diagnose.case_settings import CASE_FILE
+from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import DiagnosisDirectory
 from workflow.diagnose.outputs import Engine, Work
+from workflow.diagnose.simulator_case import (
+    SimulatorCase,
+    SimulatorSettings,
+    is_simulator,
+    load_simulator_case,
+    settings_of,
+)
 from workflow.diagnose.words import FILTERS, closure_words, short_answer
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest
@@ -72,7 +79,7 @@ class DiagnosisRun:
 
 
 def diagnose_cases(
-    places: Sequence[Path],
+    places: Sequence[Path | SimulatorSettings],
     out: Path,
     *,
     rig: str | None = None,
@@ -86,6 +93,7 @@ def diagnose_cases(
 ) -> DiagnosisRun:
     """Diagnose every case into `out`.
 
+    places: case folders or files, or what a simulator's case file says, with files in the current folder.
     rig: file in each case folder that is read in place of the one its case file names. jobs: processes
     (default: one per processor). time_limit_s: see `diagnosis.diagnose`. A case that
     fails does not lose the others; one that fails alone raises
@@ -119,13 +127,18 @@ def diagnose_cases(
     return DiagnosisRun(tuple(documents), tuple(failures), _summary(documents, failures, page))
 
 
-def _load(places: Sequence[Path], rig: str | None) -> tuple[list[LoadedCase], list[_Failed]]:
-    loaded, failures = [], []
+_Loaded = LoadedCase | SimulatorCase
+
+
+def _load(places: Sequence[Path | SimulatorSettings], rig: str | None) -> tuple[list[_Loaded], list[_Failed]]:
+    loaded: list[_Loaded] = []
+    failures: list[_Failed] = []
     for place in places:
         try:
-            loaded.append(load_case(place, rig))
+            loaded.append(_loaded(place, rig))
         except InputError as error:
-            failures.append((place.resolve().name, Failure(str(error), bad_input=True)))
+            named = place.resolve() if isinstance(place, Path) else Path(place.model)
+            failures.append((named.name, Failure(str(error), bad_input=True)))
     if not loaded:
         more = f" (and {len(failures) - 1} more cases cannot be read)" if len(failures) > 1 else ""
         raise InputError(failures[0][1].reason + more)
@@ -134,6 +147,15 @@ def _load(places: Sequence[Path], rig: str | None) -> tuple[list[LoadedCase], li
             f"two cases are called {name!r}: give one another name in its {CASE_FILE} (key 'case')"
         )
     return loaded, failures
+
+
+def _loaded(place: Path | SimulatorSettings, rig: str | None) -> _Loaded:
+    if isinstance(place, SimulatorSettings):
+        return load_simulator_case(place, Path(), "--log")
+    file, document = case_document(place)
+    if not is_simulator(document):
+        return load_case(place, rig)
+    return load_simulator_case(settings_of(document, str(file)), file.parent, str(file))
 
 
 def _compute(

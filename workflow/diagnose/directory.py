@@ -3,6 +3,7 @@
     diagnose.json              inputs and options; a resumed diagnosis is held to them
     <case>.json .html          the answer, for programs and for people
     <case>.rig.toml            repaired rig; <case>.effects.toml the effects to add, where there are any
+    <case>.xml                 repaired MuJoCo model, of a case that names one
     <case>.next.csv            voltage of the experiment to run next, where one is proposed
     index.html                 overview of several cases
     timings.json               seconds per case; the only file that differs from run to run
@@ -27,7 +28,7 @@ from workflow.engine.store import Store
 
 LAYOUT_VERSION = 1
 MANIFEST = "diagnose.json"
-_ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv")
+_ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv", ".xml")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 from diagnosis.answer import Diagnosis
 from workflow.diagnose.case_files import LoadedCase
+from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.engine import codec
 
 FORMAT = "flexlink-diagnosis-1"
@@ -14,7 +15,7 @@ LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
 
 
 def document_of(
-    loaded: LoadedCase, found: Diagnosis, beside: Mapping[str, Any] | None = None
+    loaded: LoadedCase | SimulatorCase, found: Diagnosis, beside: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """The answer as plain values.
 
@@ -51,7 +52,7 @@ def document_of(
         "deviations": found.deviations,
         "repair": {
             "values": {
-                key: {"stated": loaded.case.rig.value(key), "repaired": found.rig.value(key)}
+                key: {"stated": loaded.case.machine.description.value(key), "repaired": found.rig.value(key)}
                 for key in found.deviations
             },
             "effects": [effect.to_dict() for effect in found.repair],

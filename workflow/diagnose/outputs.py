@@ -14,6 +14,7 @@ import tomlkit
 from diagnosis.answer import Diagnosis
 from diagnosis.diagnosis import diagnose
 from diagnosis.machine.case import Case
+from diagnosis.machine.own_plant import PlantCase
 from diagnosis.where.findings import Where
 from diagnosis.where.where import where
 from plant.effects import LOOK_ALIKES, Effect
@@ -23,6 +24,8 @@ from workflow.diagnose.controller_check import ControllerCheck, NoControllerErro
 from workflow.diagnose.document import document_of
 from workflow.diagnose.following import Following, following
 from workflow.diagnose.per_cent import moved, partial_answers, shown
+from workflow.diagnose.plant_page import plant_page
+from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.diagnose.words import FILTERS
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
@@ -44,7 +47,7 @@ class Engine:
         """What of it an answer depends on."""
         return {} if self.time_limit_s == float("inf") else {"time_limit_s": self.time_limit_s}
 
-    def __call__(self, case: Case, *, progress: Report | None = None) -> Diagnosis:
+    def __call__(self, case: Case | PlantCase, *, progress: Report | None = None) -> Diagnosis:
         return diagnose(case, progress=progress, time_limit_s=self.time_limit_s)
 
 
@@ -52,7 +55,7 @@ class Engine:
 class Work:
     """One case to do, here or in a process of its own. controller: whether the controllers are compared."""
 
-    loaded: LoadedCase
+    loaded: LoadedCase | SimulatorCase
     controller: bool
     code_sha256: str
     engine: Engine
@@ -72,6 +75,8 @@ class Work:
         The JSON file names the others' hashes and is to be written last. Raises InputError or StageError, one
         line.
         """
+        if isinstance(self.loaded, SimulatorCase):
+            return self._of_simulator(self.loaded, report)
         loaded, case = self.loaded, self.loaded.case
         with naming(f"case {case.name}"):
             found = self.engine(case, progress=lambda f, m: report(_ENGINE * f, m))
@@ -100,11 +105,29 @@ class Work:
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.proposal or {})},
             "controller": {"skipped": no_check} if check is None else check.document(),
         }
+        return self._with_document(loaded, found, beside, files), time.process_time()
+
+    def _of_simulator(self, loaded: SimulatorCase, report: Report) -> tuple[dict[str, bytes], float]:
+        name = loaded.case.name
+        with naming(f"case {name}"):
+            found = self.engine(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
+            files = {f"{name}.html": plant_page(found).encode()}
+            if loaded.repaired is not None:
+                files[f"{name}.xml"] = loaded.repaired(found).encode()
+        beside = {"next_experiment": {"advice": following(found).advice}}
+        return self._with_document(loaded, found, beside, files), time.process_time()
+
+    def _with_document(
+        self,
+        loaded: LoadedCase | SimulatorCase,
+        found: Diagnosis,
+        beside: Mapping[str, Any],
+        files: dict[str, bytes],
+    ) -> dict[str, bytes]:
         document = document_of(loaded, found, beside)
         document["made_from"] = self.made_from
         document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
-        files[f"{case.name}.json"] = codec.plain_text(document).encode()
-        return files, time.process_time()
+        return {**files, f"{loaded.case.name}.json": codec.plain_text(document).encode()}
 
 
 def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:

@@ -1,0 +1,371 @@
+"""Forty generated arms against their MuJoCo models: is the effect named, how near is its size, false alarms.
+
+Arms of one and two joints follow random steps under a sampled PD controller; angles have noise of 0.2 mrad.
+The model has masses, damping and armature drawn off by their usual tolerances. Every other truth comes from
+MuJoCo at a fifth of the model's step, with the effect put in by other means than the candidates use (torques
+of our own on the joints, an added geom, a tilted base, commands changed on their way); the others are the
+equations of motion of a planar arm, derived by hand and integrated by the classical Runge-Kutta method.
+
+Strict: the effect is the first answer. Size: the value in the repaired model (ratio times stated value, or
+size of an added effect) against the truth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any
+
+import mujoco
+import numpy as np
+from numba import njit
+from scipy.signal import butter, sosfilt
+
+from benchmarks.harness import Print, main
+from diagnosis import PlantCase, PlantExperiment, diagnose
+from diagnosis.machine.mujoco_plant import MujocoArm
+
+DT_S, STEP_S, SAMPLES, NOISE_RAD, MODEL_ERROR = 0.01, 0.0025, 300, 2e-4, 0.02
+GRAVITY = 9.81
+LENGTHS_M, MASSES_KG, DAMPING, ARMATURE = (0.3, 0.25), (1.2, 0.8), (0.25, 0.12), (0.03, 0.015)
+JOINTS = ("shoulder", "elbow")
+
+# Effect, joints of the arm, joint it is at. Where gravity does not act ("tilt"), the arm lies flat.
+KINDS = (
+    *[("frictionloss", n, j) for n, j in ((1, 0), (1, 0), (2, 0), (2, 1))],
+    *[("damping", n, j) for n, j in ((1, 0), (2, 0), (2, 1))],
+    *[("stiffness", n, j) for n, j in ((1, 0), (1, 0), (2, 1))],
+    *[("armature", n, j) for n, j in ((1, 0), (2, 0), (2, 1))],
+    *[("gain", n, j) for n, j in ((1, 0), (1, 0), (2, 0), (2, 1))],
+    *[("lag", n, j) for n, j in ((1, 0), (1, 0), (2, 1))],
+    *[("delay", n, j) for n, j in ((1, 0), (1, 0), (2, 0))],
+    *[("payload", n, j) for n, j in ((1, 0), (1, 0), (2, 1))],
+    *[("tilt", n, j) for n, j in ((1, 0), (1, 0), (2, 0))],
+    *[("sensor_offset", 2, 1)] * 3,
+    *[("none", n, 0) for n in (1, 2) * 4],
+)
+SIZES = {
+    "frictionloss": (0.08, 0.25),
+    "damping": (2.2, 3.5),
+    "stiffness": (0.6, 2.0),
+    "armature": (1.8, 3.0),
+    "gain": (0.7, 0.85),
+    "lag": (0.02, 0.05),
+    "delay": (0.015, 0.035),
+    "payload": (0.12, 0.35),
+    "tilt": (0.05, 0.15),
+    "sensor_offset": (0.06, 0.15),
+}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """masses, damping, armature (n,) of the machine; effect, joint, size; flat: gravity along the axes."""
+
+    n: int
+    masses: Any
+    damping: Any
+    armature: Any
+    effect: str
+    joint: int
+    size: float
+    flat: bool
+
+    @property
+    def name(self) -> str:
+        """Of the candidate that is right."""
+        joint = JOINTS[self.joint]
+        names = {
+            "none": "none",
+            "payload": f"link{self.n}.payload",
+            "tilt": "gravity.x",
+            "gain": f"wrong_motor{self.joint + 1}.gain",
+            "lag": f"motor{self.joint + 1}.lag",
+            "delay": f"motor{self.joint + 1}.delay",
+            "damping": f"wrong_{joint}.damping",
+            "armature": f"wrong_{joint}.armature",
+        }
+        return names.get(self.effect, f"{joint}.{self.effect}")
+
+    @property
+    def value(self) -> float:
+        """Of the quantity in the repaired model."""
+        if self.effect == "tilt":
+            return GRAVITY * float(np.sin(self.size))
+        whole = {"damping": self.damping, "armature": self.armature}
+        return self.size * float(whole[self.effect][self.joint]) if self.effect in whole else self.size
+
+    def of(self, effect: str, without: float) -> Any:
+        """(n,) of a quantity of the joints, with the effect's size at its joint."""
+        found = np.full(self.n, without)
+        if self.effect == effect:
+            found[self.joint] = self.size
+        return found
+
+
+def xml_of(
+    n: int, flat: bool, masses: Any, damping: Any, armature: Any, step_s: float, tilt: float = 0.0
+) -> str:
+    """tilt: of the base, about y [rad]."""
+    axis = "0 0 1" if flat else "0 1 0"
+    inner = ""
+    for k in reversed(range(n)):
+        at = f'pos="{LENGTHS_M[k - 1]} 0 0"' if k else f'euler="0 {tilt} 0"'
+        site = f'<site name="tip" pos="{LENGTHS_M[k]} 0 0"/>' if k == n - 1 else ""
+        inner = (
+            f'<body name="link{k + 1}" {at}><joint name="{JOINTS[k]}" axis="{axis}" damping="{damping[k]}" '
+            f'armature="{armature[k]}"/><geom type="box" pos="{LENGTHS_M[k] / 2} 0 0" '
+            f'size="{LENGTHS_M[k] / 2} 0.01 0.01" mass="{masses[k]}" contype="0" conaffinity="0"/>'
+            f"{site}{inner}</body>"
+        )
+    motors = "".join(f'<motor name="motor{k + 1}" joint="{JOINTS[k]}"/>' for k in range(n))
+    return (
+        f'<mujoco model="arm"><compiler angle="radian"/>'
+        f'<option timestep="{step_s}" gravity="0 0 {-GRAVITY}"/>'
+        f"<worldbody>{inner}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+class InMujoco:
+    """The machine in MuJoCo at a small step, with torques of our own on the joints."""
+
+    def __init__(self, truth: Truth) -> None:
+        self.truth = truth
+        tilt = truth.size if truth.effect == "tilt" else 0.0
+        stated = (
+            truth.masses,
+            truth.damping * truth.of("damping", 1.0),
+            truth.armature * truth.of("armature", 1.0),
+        )
+        spec = mujoco.MjSpec.from_string(xml_of(truth.n, truth.flat, *stated, STEP_S / 5, tilt))
+        if truth.effect == "payload":
+            tip = spec.body(f"link{truth.n}")
+            tip.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[1e-3, 0, 0],
+                pos=[LENGTHS_M[truth.n - 1], 0, 0],
+                mass=truth.size,
+                contype=0,
+                conaffinity=0,
+            )
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[:] = at_rest(truth)
+
+    @property
+    def angle(self) -> Any:
+        return self.data.qpos.copy()
+
+    def step(self, torque: Any) -> None:
+        level, spring = self.truth.of("frictionloss", 0.0), self.truth.of("stiffness", 0.0)
+        for _ in range(round(5 * DT_S / STEP_S)):
+            self.data.ctrl[:] = torque
+            v = self.data.qvel
+            self.data.qfrc_applied[:] = -level * np.tanh(v / 5e-3) - spring * self.data.qpos
+            mujoco.mj_step(self.model, self.data)
+
+
+class ByEquations:
+    """The machine as two equations of motion (absolute angles of rods, downwards positive), Runge-Kutta."""
+
+    def __init__(self, truth: Truth) -> None:
+        self.truth = truth
+        self.state = np.concatenate([at_rest(truth), np.zeros(truth.n)])
+        n = truth.n
+
+        def two(values: Any, without: float) -> Any:
+            return np.array([*values, *[without] * (2 - n)], dtype=np.float64)
+
+        load = truth.size if truth.effect == "payload" else 0.0
+        tilt = truth.size if truth.effect == "tilt" else 0.0
+        self.constants = (
+            n,
+            two(truth.masses, 0.0),
+            two(truth.damping * truth.of("damping", 1.0), 0.0),
+            two(truth.armature * truth.of("armature", 1.0), 1.0),
+            two(truth.of("frictionloss", 0.0), 0.0),
+            two(truth.of("stiffness", 0.0), 0.0),
+            load,
+            # Along the arm at zero, and along the direction to which positive angles turn it.
+            GRAVITY * np.sin(tilt),
+            0.0 if truth.flat else GRAVITY * np.cos(tilt),
+        )
+
+    @property
+    def angle(self) -> Any:
+        return self.state[: self.truth.n].copy()
+
+    def step(self, torque: Any) -> None:
+        full = np.zeros(2)
+        full[: self.truth.n] = torque
+        y = np.zeros(4)
+        y[: self.truth.n], y[2 : 2 + self.truth.n] = self.state[: self.truth.n], self.state[self.truth.n :]
+        y = _integrated(y, full, *self.constants)
+        self.state = np.concatenate([y[: self.truth.n], y[2 : 2 + self.truth.n]])
+
+
+@njit(cache=True)
+def _integrated(y, torque, n, m, d, a, level, spring, load, along, across):  # type: ignore[no-untyped-def]
+    count = 100
+    h = DT_S / count
+    for _ in range(count):
+        k1 = _slope(y, torque, n, m, d, a, level, spring, load, along, across)
+        k2 = _slope(y + h / 2 * k1, torque, n, m, d, a, level, spring, load, along, across)
+        k3 = _slope(y + h / 2 * k2, torque, n, m, d, a, level, spring, load, along, across)
+        k4 = _slope(y + h * k3, torque, n, m, d, a, level, spring, load, along, across)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return y
+
+
+@njit(cache=True)
+def _slope(y, torque, n, m, d, a, level, spring, load, along, across):  # type: ignore[no-untyped-def]
+    """Rods of square section 2 cm: inertia m (L^2 + 0.02^2) / 12 about the middle. q2 is relative to q1.
+
+    Kinetic energy with c = cos q2: J11 = I1 + I2 + m2 L1^2 + 2 h c, J12 = I2 + h c, J22 = I2, where I are
+    about the joints and h = L1 s2, s2 the static moment of rod and payload about the second joint.
+    """
+    l1, l2 = LENGTHS_M
+    q1, q2, v1, v2 = y
+    i1 = m[0] * (l1 * l1 / 3 + 0.02 * 0.02 / 12)
+    i2 = m[1] * (l2 * l2 / 3 + 0.02 * 0.02 / 12)
+    s1, s2, m2 = m[0] * l1 / 2, m[1] * l2 / 2, m[1]
+    if n == 1:
+        i1 += load * l1 * l1
+        s1 += load * l1
+    else:
+        i2 += load * l2 * l2
+        s2 += load * l2
+        m2 += load
+    c, s = np.cos(q2), np.sin(q2)
+    h = l1 * s2
+    j11 = i1 + i2 + m2 * l1 * l1 + 2 * h * c + a[0]
+    j12, j22 = i2 + h * c, i2 + a[1]
+    # Gravity moments: a rod at angle q points along (cos q, sin q); its weight pulls along (along, across).
+    one = s1 + m2 * l1
+    g1 = -one * np.sin(q1) * along + one * np.cos(q1) * across
+    g2 = -s2 * np.sin(q1 + q2) * along + s2 * np.cos(q1 + q2) * across
+    f1 = torque[0] - d[0] * v1 - level[0] * np.tanh(v1 / 5e-3) - spring[0] * q1 + g1 + g2
+    f2 = torque[1] - d[1] * v2 - level[1] * np.tanh(v2 / 5e-3) - spring[1] * q2 + g2
+    f1 += h * s * (2 * v1 * v2 + v2 * v2)
+    f2 -= h * s * v1 * v1
+    if n == 1:
+        return np.array([v1, 0.0, f1 / j11, 0.0])
+    det = j11 * j22 - j12 * j12
+    return np.array([v1, v2, (j22 * f1 - j12 * f2) / det, (j11 * f2 - j12 * f1) / det])
+
+
+def at_rest(truth: Truth) -> Any:
+    """Hanging where gravity acts (a rod at zero lies level), else at zero."""
+    return np.array([0.0 if truth.flat else np.pi / 2, 0.0])[: truth.n]
+
+
+def record(truth: Truth, rng: np.random.Generator, *, by_equations: bool) -> tuple[Any, Any]:
+    """Commands and readings (T, n) under the controller."""
+    machine: InMujoco | ByEquations = ByEquations(truth) if by_equations else InMujoco(truth)
+    n = truth.n
+    steps = np.repeat(rng.uniform(-1.0, 1.0, (SAMPLES // 60 + 1, n)), 60, axis=0)[:SAMPLES]
+    steps[:20] = 0.0
+    reference = at_rest(truth) + sosfilt(butter(2, 2.5, fs=1 / DT_S, output="sos"), steps, axis=0)
+    kp, kd = np.array([25.0, 10.0])[:n], np.array([2.5, 0.8])[:n]
+    offset = truth.of("sensor_offset", 0.0)
+    queue = deque([np.zeros(n)] * 40, maxlen=40)
+    lagged, last = np.zeros(n), None
+    U, Y = np.zeros((SAMPLES, n)), np.zeros((SAMPLES, n))
+    for k in range(SAMPLES):
+        q = machine.angle + offset + NOISE_RAD * rng.standard_normal(n)
+        speed = np.zeros(n) if last is None else (q - last) / DT_S
+        u = kp * (reference[k] - q) - kd * speed
+        queue.append(u)
+        late = truth.of("delay", 0.0) / DT_S
+        whole = np.floor(late).astype(int)
+        now = np.array([queue[-1 - w][j] for j, w in enumerate(whole)])
+        before = np.array([queue[-2 - w][j] for j, w in enumerate(whole)])
+        sent = (1 - (late - whole)) * now + (late - whole) * before
+        T = truth.of("lag", 0.0)
+        keep = np.where(T > 0, np.exp(-DT_S / np.maximum(T, 1e-9)), 0.0)
+        # Mean of the lagged command over the sample.
+        mean = sent + (lagged - sent) * np.where(T > 0, T / DT_S * (1 - keep), 0.0)
+        lagged = keep * lagged + (1 - keep) * sent
+        machine.step(mean * truth.of("gain", 1.0))
+        U[k], Y[k], last = u, q, q
+    return U, Y
+
+
+def case_of(number: int, seed: int) -> tuple[Truth, PlantCase]:
+    """The number-th case, 0 to 39."""
+    rng = np.random.default_rng([seed, number])
+    effect, n, joint = KINDS[number]
+    flat = effect == "tilt"
+    low, high = SIZES.get(effect, (1.0, 1.0))
+
+    def off(values: Any, share: float) -> Any:
+        return np.array(values[:n]) * np.exp(share * rng.standard_normal(n))
+
+    truth = Truth(
+        n, off(MASSES_KG, 0.02), off(DAMPING, 0.1), off(ARMATURE, 0.05), effect, joint,
+        float(np.exp(rng.uniform(np.log(low), np.log(high)))), flat,
+    )  # fmt: skip
+    experiments = []
+    for role in ("estimation", "held_out"):
+        U, Y = record(truth, rng, by_equations=number % 2 == 1)
+        experiments.append(PlantExperiment(role, role, np.column_stack([U, Y]), Y))  # type: ignore[arg-type]
+    spec = mujoco.MjSpec.from_string(xml_of(n, flat, MASSES_KG, DAMPING, ARMATURE, STEP_S))
+    arm = MujocoArm(spec, JOINTS[:n], DT_S)
+    arm = MujocoArm(arm.spec, JOINTS[:n], DT_S, arm.tracking(experiments))
+    plant = arm.plant(experiments, np.full(n, NOISE_RAD), model_error=MODEL_ERROR)
+    return truth, PlantCase(f"case {number}", plant, tuple(experiments))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Of one case: a line, whether the first answer is right, whether its value is near, a false alarm."""
+
+    line: str
+    none: bool
+    right: bool
+    near: bool
+    alarm: bool
+
+
+def answer(number: int, seed: int) -> Answer:
+    truth, case = case_of(number, seed)
+    begun = time.process_time()
+    found = diagnose(case)
+    cpu_s = time.process_time() - begun
+    values = dict(found.rig.parameters)
+    for change in found.repair:
+        size = next(iter(change.values.values()))
+        key = change.id.removeprefix("wrong_")
+        values[key] = values[key] * size if key in values else size
+    none, right = truth.effect == "none", found.effects[0].name == truth.name
+    off = abs(values.get(truth.name.removeprefix("wrong_"), 0.0)) / truth.value - 1
+    source = "equations" if number % 2 else "MuJoCo"
+    size = "" if none else f"{truth.value:.4g}, found {100 * off:+.1f} %"
+    line = (
+        f"{number:3d} {source:9s} {truth.n} joints  {truth.name:26s} {size:24s} -> "
+        f"{', '.join(found.combination) or found.verdict}  (gap {found.gap_refit:.1f} to "
+        f"{found.gap_after:.1f}, {cpu_s:.0f} s)"
+    )
+    return Answer(line, none, right, right and abs(off) <= 0.05, none and found.verdict == "effect")
+
+
+def run(out: Print, *, seed: int = 15, first: int = 0, cases: int = 40, jobs: int = 2) -> None:
+    numbers = range(first, first + cases)
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        answers = []
+        for one in pool.map(answer, numbers, [seed] * cases):
+            out(one.line)
+            answers.append(one)
+    effects = [one for one in answers if not one.none]
+    alarms = [one for one in answers if one.alarm]
+    out()
+    out(f"first answer right: {sum(one.right for one in effects)} of {len(effects)}")
+    out(f"right and value within 5 %: {sum(one.near for one in effects)} of {len(effects)}")
+    out(f"false alarms: {len(alarms)} of {len(answers) - len(effects)}")
+
+
+if __name__ == "__main__":
+    main(run)

@@ -1,0 +1,596 @@
+"""A MuJoCo model (MJCF) as a plant: its values are nominal parameters, what it has none of may be missing.
+
+    arm = MujocoArm.from_file("arm.xml", outputs=("shoulder", "elbow"), dt_s=0.01)
+    experiments = [PlantExperiment(name, role, np.column_stack([commands, angles]), angles), ...]
+    plant = arm.plant(experiments, noise)
+    found = diagnose(PlantCase("arm", plant, experiments))
+    text = arm.repaired(plant, found.rig, found.repair)  # MJCF
+
+Every effect is an edit of the model, so that the repaired file holds it: friction loss, damping, armature
+and stiffness of joints, gain, lag and delay of actuators, backlash, mass and inertia of links, a payload,
+gravity, delay of sensors; gain and offset of a sensor, which MJCF does not know, stand in it as
+<numeric name="SENSOR.gain"> and "SENSOR.offset" and are read from there. So is the tolerance of a value,
+"tolerance.shoulder.damping"; others have a usual one (`TOLERANCES`).
+
+A free run of an arm in a closed loop drifts away: its controller is not part of the model. The simulated
+joints are therefore held near the measured ones by a soft spring and damper of their own (`tracking_rad_s`),
+and the model is judged by what it does beside it. The start of a record is what its first rows say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.own_plant import Plant, PlantExperiment
+from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect
+from plant.effects.search_space import Dependence, geometric
+
+Put = Callable[[Any, float], None]
+
+# Relative standard deviations where the file has no <numeric name="tolerance.NAME">, by a name's last part.
+TOLERANCES = {
+    "mass": 0.03,
+    "inertia": 0.05,
+    "frictionloss": 0.2,
+    "damping": 0.2,
+    "armature": 0.1,
+    "stiffness": 0.05,
+    "gain": 0.02,
+    "lag": 0.2,
+    "delay": 0.2,
+}
+_ELSE = 0.01  # gravity, sensors
+_SMOOTHED = 9  # samples, of a measured angle whose speed is asked
+# Noise deviations that the largest start of an effect has to move a record somewhere to be looked for.
+_SEEN = 3.0
+# Of the rate at which an inverted joint falls.
+_HELD = 1.5
+_KEPT, _KEPT_PATHS = 8, 60
+_UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
+_STANDARD_GRAVITY = 9.81
+
+
+def measurable(path: str) -> tuple[str, ...]:
+    """Names of joints and sensors of one number in an MJCF file."""
+    spec = _read(path)
+    return tuple(dict.fromkeys(one.name for one in (*spec.sensors, *spec.joints) if one.name))
+
+
+def _read(path: str) -> Any:
+    # Else a trial that runs away is told on the terminal and in a file.
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        return mujoco.MjSpec.from_file(path)
+    except ValueError as error:
+        raise ValueError(f"not a model that MuJoCo reads: {' '.join(str(error).split())}") from None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number of the model. put: writes it into an MjSpec. Where the model has none of it, an effect:
+
+    parameter : with its unit; unit : its magnitude, of which low to high is its range.
+    """
+
+    name: str
+    value: float
+    put: Put
+    parameter: str = ""
+    unit: float = 1.0
+    span: tuple[float, float] = (1e-4, 1.0)
+    starts: tuple[float, float] = (3e-3, 0.6)
+    signed: bool = False
+    dependence: Dependence = "smooth"
+    group: str = ""
+
+    @property
+    def effect(self) -> PlantEffect:
+        low, high = (self.unit * share for share in self.span)
+        first, last = (self.unit * min(share, 0.6 * self.span[1]) for share in self.starts)
+        size = EffectParameter(self.parameter, low, high, tuple(geometric(first, last, 6)))
+        return PlantEffect(self.name, (size,), self.signed, dependence=self.dependence, group=self.group)
+
+
+@dataclass(frozen=True, eq=False)
+class MujocoArm:
+    """A model with its actuators as inputs and some of its sensors, or joints, as outputs.
+
+    spec : mujoco.MjSpec. outputs : (Y,) names of joints or of sensors of one number.
+    dt_s : sampling period of the records; the model takes the fewest equal steps no longer than its own.
+    tracking_rad_s : how fast the simulation is drawn to the measured joints; 0 is a free run.
+    """
+
+    spec: Any
+    outputs: tuple[str, ...]
+    dt_s: float
+    tracking_rad_s: float = 0.0
+
+    @classmethod
+    def from_file(cls, path: str, **settings: Any) -> MujocoArm:
+        """Raises ValueError, one line: a file that MuJoCo does not read, an output that is not there."""
+        return cls(_read(path), **settings)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "outputs", tuple(self.outputs))
+        spec = self.spec
+        steps = max(int(np.ceil(self.dt_s / spec.option.timestep - 1e-6)), 1)
+        spec.option.timestep = self.dt_s / steps
+        every = {"body": spec.bodies, "joint": spec.joints, "actuator": spec.actuators}
+        for what in every:
+            for k, one in enumerate(every[what]):
+                one.name = one.name or f"{what}{k}"
+        if not spec.actuators:
+            raise ValueError("the model has no actuator")
+        for name in self.outputs:
+            if spec.sensor(name) is None:
+                if spec.joint(name) is None:
+                    there = [one.name for one in (*spec.joints, *spec.sensors) if one.name]
+                    raise ValueError(f"no joint or sensor is called {name!r}; there are {', '.join(there)}")
+                spec.add_sensor(
+                    name=name,
+                    type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+                    objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                    objname=name,
+                )
+        model = spec.compile()
+        for name in self.outputs:
+            if model.sensor(name).dim[0] != 1:
+                raise ValueError(f"sensor {name} has {model.sensor(name).dim[0]} numbers, expected one")
+        # Inertias as numbers, whatever they were made of: they are then values like any other.
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+        spec.compiler.settotalmass = -1
+        for k, body in enumerate(spec.bodies):
+            if model.body_mass[k] > 0:
+                body.explicitinertial = True
+                body.mass, body.inertia = model.body_mass[k], model.body_inertia[k]
+                body.ipos, body.iquat = model.body_ipos[k], model.body_iquat[k]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """(U,) names of the actuators, in the model's order."""
+        return tuple(one.name for one in self.spec.actuators)
+
+    @cached_property
+    def nominal(self) -> Any:
+        """The compiled model."""
+        return self.spec.compile()
+
+    @cached_property
+    def tracked(self) -> tuple[tuple[int, str, float], ...]:
+        """Outputs that are angles or positions of joints: column, joint, inertia [kg m2 or kg]."""
+        found = []
+        for k, name in enumerate(self.outputs):
+            sensor = self.spec.sensor(name)
+            if sensor.type == mujoco.mjtSensor.mjSENS_JOINTPOS:
+                dof = self.nominal.joint(sensor.objname).dofadr[0]
+                found.append((k, sensor.objname, float(self.nominal.dof_M0[dof])))
+        return tuple(found)
+
+    def number(self, name: str, without: float) -> float:
+        """A <numeric> of the file."""
+        one = self.spec.numeric(name)
+        return without if one is None else float(one.data[0])
+
+    def quantities(self, experiments: Sequence[PlantExperiment]) -> dict[str, Quantity]:
+        """Everything that may be off or missing, by name."""
+        sizes = self._sizes(experiments)
+        longest = 0.2 * max(len(e.input) for e in experiments)
+        swings = [max(float(np.ptp(e.output[:, k])) for e in experiments) for k in range(len(self.outputs))]
+        found = [
+            *(one for joint in self.spec.joints for one in self._of_joint(joint, *sizes[joint.name])),
+            *(one for actuator in self.spec.actuators for one in self._of_actuator(actuator, longest)),
+            *(one for body in self.spec.bodies for one in self._of_link(body)),
+            *(
+                Quantity(
+                    f"gravity.{axis}",
+                    float(self.spec.option.gravity[k]),
+                    _gravity(k),
+                    "acceleration_m_s2",
+                    _STANDARD_GRAVITY,
+                    signed=True,
+                    group="link",
+                )
+                for k, axis in enumerate("xyz")
+            ),
+            *(one for y in zip(self.outputs, swings, strict=True) for one in self._of_sensor(*y)),
+        ]
+        return {one.name: one for one in found}
+
+    def _of_joint(self, joint: Any, force: float, travel: float, speed: float) -> Iterator[Quantity]:
+        kinds = {mujoco.mjtJoint.mjJNT_HINGE: "hinge", mujoco.mjtJoint.mjJNT_SLIDE: "slide"}
+        if joint.type not in kinds:
+            return
+        F, x, m = _UNITS[kinds[joint.type]]
+        inertia = float(self.nominal.dof_M0[self.nominal.joint(joint.name).dofadr[0]])
+        parts: tuple[tuple[str, str, float, float, Dependence], ...] = (
+            ("frictionloss", f"level_{F}", force, 1.0, "continuous"),
+            ("damping", f"coefficient_{F}s_{x}", force / speed, 10.0, "smooth"),
+            ("armature", f"inertia_{m}", inertia, 10.0, "smooth"),
+            ("stiffness", f"stiffness_{F}_{x}", force / travel, 10.0, "smooth"),
+        )
+        for key, parameter, unit, most, dependence in parts:
+            value = float(np.ravel(getattr(joint, key))[0])
+            put = _first_of(joint.name, key)
+            yield Quantity(
+                f"{joint.name}.{key}",
+                value,
+                put,
+                parameter,
+                unit,
+                (1e-4, most),
+                dependence=dependence,
+                group="joint",
+            )
+        if joint.armature > 0:
+            yield Quantity(
+                f"{joint.name}.backlash",
+                0.0,
+                _backlash(joint.name),
+                f"gap_{x}",
+                travel,
+                (1e-3, 0.5),
+                dependence="non-smooth",
+                group="joint",
+            )
+
+    def _of_actuator(self, one: Any, longest: float) -> Iterator[Quantity]:
+        """longest : of a lag or delay, in samples."""
+        lag = 0.0 if one.dyntype == mujoco.mjtDyn.mjDYN_NONE else float(one.dynprm[0])
+        late = partial(
+            Quantity, unit=self.dt_s, span=(0.02, longest), starts=(0.2, min(20.0, longest)), group="actuator"
+        )
+        yield Quantity(f"{one.name}.gain", 1.0, _gain(one.name))
+        yield late(f"{one.name}.lag", lag, _lag(one.name), "time_constant_s")
+        put = _delay("actuator", one.name, self.spec.option.timestep)
+        yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
+
+    def _of_link(self, body: Any) -> Iterator[Quantity]:
+        model = self.nominal
+        k = model.body(body.name).id
+        if not (body.mass > 0 and model.body_weldid[k]):
+            return
+        yield Quantity(f"{body.name}.mass", float(body.mass), _mass(body.name))
+        # Of a link on one hinge in the world, inertia is what armature is.
+        if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
+            yield Quantity(f"{body.name}.inertia", 1.0, _inertia(body.name))
+        if body.sites and k not in model.body_parentid[1:]:
+            put = _payload(body.name, tuple(body.sites[0].pos))
+            yield Quantity(
+                f"{body.name}.payload", 0.0, put, "mass_kg", float(body.mass), (1e-3, 10.0), group="link"
+            )
+
+    def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:
+        sensor = self.spec.sensor(name)
+        yield Quantity(f"{name}.sensor_gain", self.number(f"{name}.gain", 1.0), _number(f"{name}.gain"))
+        offset, put = self.number(f"{name}.offset", 0.0), _number(f"{name}.offset")
+        yield Quantity(f"{name}.sensor_offset", offset, put, "offset", swing, signed=True, group="sensor")
+        put = _delay("sensor", name, self.spec.option.timestep)
+        late = ((0.02, 100.0), (0.2, 10.0))
+        yield Quantity(
+            f"{name}.sensor_delay", float(sensor.delay), put, "delay_s", self.dt_s, *late, group="sensor"
+        )
+
+    def _sizes(self, experiments: Sequence[PlantExperiment]) -> dict[str, tuple[float, float, float]]:
+        """Largest force of its actuators, travel and speed of every joint; of one not measured, of all."""
+        seen: dict[str, tuple[float, float, float]] = {}
+        for k, joint, _ in self.tracked:
+            force = position = speed = 0.0
+            for e in experiments:
+                q = e.output[:, k]
+                v = savgol_filter(q, _SMOOTHED, 2, deriv=1, delta=self.dt_s)
+                total = np.zeros(len(q))
+                for u, one in enumerate(self.spec.actuators):
+                    if one.target == joint:
+                        g, b = one.gear[0], one.biasprm
+                        total += g * (one.gainprm[0] * e.input[:, u] + b[0] + g * (b[1] * q + b[2] * v))
+                force = max(force, float(np.max(np.abs(total))))
+                position, speed = max(position, float(np.ptp(q))), max(speed, float(np.max(np.abs(v))))
+            seen[joint] = force, position, speed
+        usual = tuple(max((one[k] for one in seen.values()), default=0.0) or 1.0 for k in range(3))
+        return {
+            joint.name: tuple(s or u for s, u in zip(seen.get(joint.name, (0.0,) * 3), usual, strict=True))  # type: ignore[misc]
+            for joint in self.spec.joints
+        }
+
+    def _commanded(
+        self, simulation: Simulation, stated: Mapping[str, float], experiments: Sequence[PlantExperiment]
+    ) -> float:
+        """Share of the motion that the commands make beside the tracking; 1 in a free run."""
+        if not (self.tracking_rad_s and self.tracked):
+            return 1.0
+        made = moved = 0.0
+        for e in experiments:
+            held = e.input.copy()
+            held[:, : len(self.inputs)] = np.mean(held[:, : len(self.inputs)], axis=0)
+            by_commands = simulation(stated, {}, e.input) - simulation(stated, {}, held)
+            made += float(np.sum(np.var(by_commands, axis=0) / np.var(e.output, axis=0)))
+            moved += len(self.outputs)
+        return float(min(np.sqrt(made / moved), 1.0))
+
+    def tracking(self, experiments: Sequence[PlantExperiment]) -> float:
+        """Half the largest speed over the travel [rad/s], and enough to hold every joint against gravity."""
+        model, data = self.nominal, mujoco.MjData(self.nominal)
+        mujoco.mj_forward(model, data)
+        fastest = 0.0
+        for _, name, inertia in self.tracked:
+            joint = model.joint(name)
+            _, travel, speed = self._sizes(experiments)[name]
+            axis, body = data.xaxis[joint.id], joint.bodyid[0]
+            pull = np.linalg.norm(np.cross(axis, model.opt.gravity)) * float(model.body_subtreemass[body])
+            arm = np.linalg.norm(np.cross(axis, data.subtree_com[body] - data.xanchor[joint.id]))
+            falls = np.sqrt(pull * arm / inertia) if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE else 0.0
+            fastest = max(fastest, 0.5 * speed / travel, _HELD * float(falls))
+        return fastest
+
+    def repaired(self, plant: Plant, repaired: Plant, effects: Sequence[Change]) -> str:
+        """MJCF of the model with the values of a repaired plant (`Diagnosis.rig`) and effects (`repair`)."""
+        values = dict(repaired.parameters)
+        for change in effects:
+            size = next(iter(change.values.values()))
+            name = change.id.removeprefix("wrong_")
+            values[name] = values[name] * size if name in values else size
+        assert isinstance(plant.simulation, Simulation)
+        spec = plant.simulation.edited({k: v for k, v in values.items() if v != plant.parameters.get(k)})
+        spec.compile()
+        return str(spec.to_xml())
+
+    def plant(
+        self, experiments: Sequence[PlantExperiment], noise: Real, *, model_error: float = 0.0
+    ) -> Plant:
+        """The arm with everything that its model has as nominal parameters and all else as effects.
+
+        experiments : input (T, U + Y) commands, then outputs as measured; output (T, Y).
+        model_error : share of the motion that commands make; beside the tracking that is less than all of it.
+        """
+        every = self.quantities(experiments)
+        stated = {name: one.value for name, one in every.items() if one.value != 0.0}
+        tolerances = {name: self.number(f"tolerance.{name}", _usual_tolerance(name)) for name in stated}
+        simulation = Simulation(self, every)
+        as_stated = simulation(stated, {}, experiments[0].input)
+
+        def seen(effect: PlantEffect) -> bool:
+            size = effect.parameters[0]
+            moved = simulation(stated, {effect.name: {size.name: size.starts[-1]}}, experiments[0].input)
+            return bool(np.max(np.abs(moved - as_stated) / noise) > _SEEN)
+
+        missing = [one.effect for one in every.values() if one.value == 0.0]
+        return Plant(
+            simulation,
+            stated,
+            {name: value for name, value in tolerances.items() if value > 0},
+            self.outputs,
+            noise,
+            tuple(effect for effect in missing if seen(effect)),
+            model_error * self._commanded(simulation, stated, experiments),
+            self.dt_s,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """parameters, effects, inputs (T, U + Y) -> outputs (T, Y)."""
+
+    arm: MujocoArm
+    quantities: Mapping[str, Quantity]
+    _models: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _paths: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    def edited(self, values: Mapping[str, float]) -> Any:
+        """The model (MjSpec) with these values."""
+        spec = self.arm.spec.copy()
+        for name, value in values.items():
+            self.quantities[name].put(spec, value)
+        return spec
+
+    def __call__(
+        self, parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
+    ) -> Real:
+        values = {**parameters, **{name: next(iter(size.values())) for name, size in effects.items()}}
+        changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
+        key = tuple(changed.items())
+        if key not in self._models:
+            if len(self._models) >= _KEPT:
+                self._models.pop(next(iter(self._models)))
+            self._models[key] = self._compiled(self.edited(changed))
+        return self._run(self._models[key], values, inputs)
+
+    def _compiled(self, spec: Any) -> tuple[Any, Any]:
+        omega = self.arm.tracking_rad_s
+        for _, joint, inertia in self.arm.tracked if omega else ():
+            one = spec.add_actuator(name=f"tracking {joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            one.gaintype, one.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+            one.gainprm[0] = 1.0
+            one.biasprm[1], one.biasprm[2] = -inertia * omega**2, -2 * inertia * omega
+        model = spec.compile()
+        return model, mujoco.MjData(model)
+
+    def _run(self, compiled: tuple[Any, Any], values: Mapping[str, float], inputs: Real) -> Real:
+        arm, (model, data) = self.arm, compiled
+        U, T = len(arm.inputs), len(inputs)
+        h = model.opt.timestep
+        steps = round(arm.dt_s / h)
+        control = np.zeros((T * steps, model.nu))
+        control[:, :U] = np.repeat(inputs[:, :U], steps, axis=0)
+        mujoco.mj_resetData(model, data)
+        gain = np.array([values.get(f"{name}.sensor_gain", 1.0) for name in arm.outputs])
+        offset = np.array([values.get(f"{name}.sensor_offset", 0.0) for name in arm.outputs])
+        # All integrators but one hold the speed of a whole step, which is that of its middle.
+        shift = 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5 * h
+        omega = arm.tracking_rad_s
+        for j, (k, joint, inertia) in enumerate(arm.tracked):
+            late = values.get(f"{arm.outputs[k]}.sensor_delay", 0.0)
+            path, speed, first, begin = self._path(inputs[:, U + k], h, late, shift)
+            data.joint(joint).qpos[0] = (first - offset[k]) / gain[k]
+            data.joint(joint).qvel[0] = begin / gain[k]
+            if omega:
+                target = omega**2 * (path - offset[k]) + 2 * omega * speed
+                control[:, U + j] = inertia / gain[k] * target
+        if model.na:
+            data.act[:] = 0.0
+            for u in range(U):
+                if (
+                    model.actuator_actadr[u] >= 0
+                    and model.actuator_dyntype[u] != mujoco.mjtDyn.mjDYN_INTEGRATOR
+                ):
+                    data.act[model.actuator_actadr[u]] = inputs[0, u]
+        for u in range(U):
+            n = model.actuator_history[u, 0]
+            if n:
+                mujoco.mj_initCtrlHistory(model, data, u, None, np.full((n, 1), inputs[0, u]))
+        if model.nhistory:
+            mujoco.mj_forward(model, data)
+            for s in range(model.nsensor):
+                n = model.sensor_history[s, 0]
+                if n:
+                    first = data.sensordata[model.sensor_adr[s]]
+                    mujoco.mj_initSensorHistory(model, data, s, None, np.full((n, 1), first), 0.0)
+        state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        _, sensed = rollout.rollout(model, data, state[None], control[None])
+        columns = [model.sensor(name).adr[0] for name in arm.outputs]
+        return np.asarray(sensed[0, ::steps][:, columns] * gain + offset)
+
+    def _path(self, y: Real, step_s: float, late_s: float, shift_s: float) -> tuple[Real, Real, float, float]:
+        """What was measured, and its slope, at every step, read `late_s` later; both at the first row."""
+        key = (y.tobytes(), late_s)
+        found: tuple[Real, Real, float, float]
+        if key not in self._paths:
+            if len(self._paths) >= _KEPT_PATHS:
+                self._paths.pop(next(iter(self._paths)))
+            dt_s = self.arm.dt_s
+            path = CubicSpline(dt_s * np.arange(len(y)), y)
+            at = np.minimum(step_s * np.arange(len(y) * round(dt_s / step_s)) + late_s, dt_s * (len(y) - 1))
+            self._paths[key] = path(at), path(np.maximum(at - shift_s, 0.0), 1), *_begun(y, dt_s)
+        found = self._paths[key]
+        return found
+
+
+def _begun(q: Real, dt_s: float) -> tuple[float, float]:
+    """Position and speed of the first row; at rest unless the first samples say otherwise."""
+    n = min(_SMOOTHED, len(q))
+    fit, covariance = np.polyfit(dt_s * np.arange(n), q[:n], 1, cov=True)
+    if abs(fit[0]) < 4 * np.sqrt(covariance[0, 0]):
+        return float(q[0]), 0.0
+    fit = np.polyfit(dt_s * np.arange(n), q[:n], 2)
+    return float(fit[2]), float(fit[1])
+
+
+def _usual_tolerance(name: str) -> float:
+    return TOLERANCES.get(name.rpartition(".")[2], _ELSE)
+
+
+def _first_of(joint: str, key: str) -> Put:
+    """A number of a joint, or the first of several (of a polynomial of the speed)."""
+
+    def put(spec: Any, value: float) -> None:
+        one = spec.joint(joint)
+        if np.ndim(getattr(one, key)):
+            _set_component(one, key, 0, value)
+        else:
+            setattr(one, key, value)
+
+    return put
+
+
+def _gravity(k: int) -> Put:
+    return lambda spec, value: _set_component(spec.option, "gravity", k, value)
+
+
+def _set_component(one: Any, key: str, k: int, value: float) -> None:
+    whole = np.array(getattr(one, key), dtype=np.float64)
+    whole[k] = value
+    setattr(one, key, whole)
+
+
+def _gain(name: str) -> Put:
+    """Force of an actuator, its feedback included."""
+
+    def put(spec: Any, factor: float) -> None:
+        one = spec.actuator(name)
+        one.gainprm = np.array(one.gainprm) * np.r_[[factor] * 3, np.ones(7)]
+        one.biasprm = np.array(one.biasprm) * np.r_[[factor] * 3, np.ones(7)]
+
+    return put
+
+
+def _lag(name: str) -> Put:
+    def put(spec: Any, value: float) -> None:
+        one = spec.actuator(name)
+        if one.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+            one.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+            one.actearly = True
+        _set_component(one, "dynprm", 0, value)
+
+    return put
+
+
+def _delay(kind: str, name: str, step_s: float) -> Put:
+    def put(spec: Any, value: float) -> None:
+        one = getattr(spec, kind)(name)
+        one.delay, one.nsample, one.interp = value, int(np.ceil(value / step_s)) + 2, 1
+
+    return put
+
+
+def _mass(name: str) -> Put:
+    """At the same density and shape: inertia in proportion."""
+
+    def put(spec: Any, value: float) -> None:
+        body = spec.body(name)
+        body.inertia = np.array(body.inertia) * (value / body.mass)
+        body.mass = value
+
+    return put
+
+
+def _inertia(name: str) -> Put:
+    def put(spec: Any, factor: float) -> None:
+        body = spec.body(name)
+        body.inertia = np.array(body.inertia) * factor
+
+    return put
+
+
+def _payload(name: str, at: tuple[float, float, float]) -> Put:
+    def put(spec: Any, mass: float) -> None:
+        load = spec.body(name).add_body(name=f"{name} payload", pos=at)
+        load.explicitinertial, load.mass, load.ipos = True, mass, np.zeros(3)
+        load.inertia = np.full(3, 1e-9 * mass)
+
+    return put
+
+
+def _backlash(name: str) -> Put:
+    """A second joint on the same axis that is free within the gap; armature stays at the first, the motor."""
+
+    def put(spec: Any, gap: float) -> None:
+        joint = spec.joint(name)
+        joint.parent.add_joint(
+            name=f"{name} backlash",
+            type=joint.type,
+            axis=joint.axis,
+            pos=joint.pos,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            range=np.array([-0.5, 0.5]) * gap,
+            solref_limit=np.array([2 * spec.option.timestep, 1.0]),
+        )
+
+    return put
+
+
+def _number(name: str) -> Put:
+    def put(spec: Any, value: float) -> None:
+        one = spec.numeric(name) or spec.add_numeric(name=name, size=1)
+        one.data = np.array([value])
+
+    return put

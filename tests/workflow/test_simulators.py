@@ -1,0 +1,142 @@
+"""`flexlink diagnose` on models of other simulators: end to end, refusals, docs/simulators.md as it is."""
+
+from __future__ import annotations
+
+import doctest
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from diagnosis import PlantExperiment
+from tests.workflow.command import ROOT
+from workflow.diagnose.simulator_case import load_simulator_case, settings_of
+from workflow.engine.errors import InputError
+
+GUIDE, EXAMPLE = ROOT / "docs" / "simulators.md", ROOT / "examples" / "mujoco_arm"
+DT_S = 0.01
+
+HINGE = """<mujoco><option timestep="0.005"/><worldbody><body name="rod">
+<joint name="hinge" axis="0 0 1" damping="0.2" armature="0.01"/>
+<inertial pos="0.5 0 0" mass="1" diaginertia="0.001 0.05 0.05"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+
+
+def snippets(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.S)
+
+
+def write_log(path: Path, seed: int, friction: float) -> None:
+    """A rod on a hinge under random torques, by hand: semi-implicit steps of 0.1 ms, dry friction exact."""
+    rng = np.random.default_rng(seed)
+    torque = rng.uniform(-1, 1, 15).repeat(16)
+    torque[:16] = 0.0
+    x = v = 0.0
+    h, rows = 1e-4, []
+    for k, u in enumerate(torque):
+        rows.append([k * DT_S, u, x + 2e-4 * rng.standard_normal()])
+        for _ in range(round(DT_S / h)):
+            free = v + h / 0.31 * (u - 0.2 * v)
+            v = np.sign(free) * max(abs(free) - h / 0.31 * friction, 0.0)
+            x += h * v
+    np.savetxt(path, rows, delimiter=",", header="time_s,motor,hinge", comments="")
+
+
+def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink):
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    write_log(tmp_path / "one.csv", 0, 0.12)
+    write_log(tmp_path / "two.csv", 1, 0.12)
+    (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"\nlog = ["one.csv", "two.csv"]\n')
+    out = tmp_path / "out"
+    answer = flexlink("diagnose", str(tmp_path / "arm.toml"), "--out", str(out), "--json", "--jobs", "1")
+    (case,) = answer.document()["cases"]
+    assert case["combination"] == ["hinge.frictionloss"]
+    repaired = mujoco.MjModel.from_xml_path(str(out / "arm.xml"))
+    assert repaired.joint("hinge").frictionloss[0] == pytest.approx(0.12, rel=0.1)
+    assert "hinge.frictionloss" in (out / "arm.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ('mjcf = "no.xml"\nlog = "one.csv"', "no such model file"),
+        ('mjcf = "arm.xml"\nlog = "no.csv"', "no.csv: no such file"),
+        (
+            'mjcf = "arm.xml"\nfmu = "arm.fmu"\nlog = "one.csv"',
+            "expected one of mjcf, fmu, python; got mjcf and fmu",
+        ),
+        ('mjcf = "one.csv"\nlog = "one.csv"', "one.csv: not a model that MuJoCo reads"),
+        ('mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {hinge = "q"}', "is named after a joint or sensor"),
+        ('mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {motor = "u"}', "u"),
+        ('mjcf = "arm.xml"\nlog = "one.csv"\ntolerances = {mass = 0.1}', "no parameter is called 'mass'"),
+        ('mjcf = "arm.xml"\nlog = "one.csv"\nnoise = {elbow = 0.1}', "no output is called 'elbow'"),
+        ('mjcf = "arm.xml"\nlog = "one.csv"\nmodel_err = 0.1', "did you mean model_error?"),
+        ('python = "empty.py"\nlog = "one.csv"', "does not define simulate"),
+        ('python = "wrong.py"\nlog = "one.csv"', "ended with NameError"),
+        ('fmu = "arm.xml"\nlog = "one.csv"', "not a zip archive"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("fmpy")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    (tmp_path / "arm.fmu").write_text("")
+    (tmp_path / "empty.py").write_text("")
+    (tmp_path / "wrong.py").write_text("nothing")
+    write_log(tmp_path / "one.csv", 0, 0.0)
+    with pytest.raises(InputError, match=re.escape(complaint)) as raised:
+        load_simulator_case(settings_of(tomllib.loads(text), "case.toml"), tmp_path, "case.toml")
+    assert "\n" not in str(raised.value)
+
+
+def test_the_command_refuses_with_exit_code_2(tmp_path, refused):
+    for arguments in (("--mjcf", "arm.xml"), ("--log", "run.csv"), ()):
+        assert "--mjcf" in refused("diagnose", *arguments, "--out", tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_python_file_becomes_a_case_that_another_process_can_load(tmp_path):
+    (source,) = snippets("python")
+    (tmp_path / "motor.py").write_text(source)
+    voltage = np.random.default_rng(0).uniform(-1, 1, 20).repeat(15)
+    speed, rows = 0.0, []
+    for k, u in enumerate(voltage):
+        rows.append([k * DT_S, u, speed])
+        speed += DT_S / 0.2 * (10 * u - speed)
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="time_s,voltage_V,speed_rad_s", comments="")
+    settings = settings_of({"python": "motor.py", "log": "run.csv"}, "options")
+    load, made_of = load_simulator_case(settings, tmp_path, "options").__reduce__()
+    case = load(*made_of).case
+    assert [len(e.output) for e in case.experiments] == [200, 100]
+    assert [e.role for e in case.experiments] == ["estimation", "held_out"]
+    assert {"input_delay", "output_offset"} <= {effect.name for effect in case.plant.effects}
+    assert case.plant.tolerances == {"time_constant_s": 0.05, "gain_rad_Vs": 0.05}
+
+
+def test_the_guide_runs_and_its_files_are_those_of_the_example():
+    pytest.importorskip("mujoco")
+    from diagnosis.machine.mujoco_plant import MujocoArm
+
+    assert snippets("toml")[0] == (EXAMPLE / "arm.toml").read_text()
+    settings_of(tomllib.loads(snippets("toml")[1]), "guide")
+    settings = settings_of(tomllib.loads(snippets("toml")[0]), "guide")
+    experiments: tuple[PlantExperiment, ...] = load_simulator_case(
+        settings, EXAMPLE, "guide"
+    ).case.experiments
+    given = {"MujocoArm": MujocoArm, "np": np, "example": EXAMPLE, "experiments": experiments}
+    test = doctest.DocTestParser().get_doctest(GUIDE.read_text(), given, GUIDE.name, str(GUIDE), 0)
+    result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test)
+    assert (result.failed, result.attempted) == (0, 5)
+
+
+def test_the_logs_of_the_example_are_what_its_script_records(tmp_path):
+    pytest.importorskip("mujoco")
+    import runpy
+
+    runpy.run_path(str(EXAMPLE / "record.py"))["main"](tmp_path)
+    for name in ("first.csv", "second.csv"):
+        again, kept = (np.loadtxt(folder / name, delimiter=",", skiprows=1) for folder in (tmp_path, EXAMPLE))
+        np.testing.assert_allclose(again, kept, rtol=0, atol=1e-3)

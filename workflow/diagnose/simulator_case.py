@@ -1,0 +1,301 @@
+"""Cases of one's own simulation: an MJCF model, an FMU or a Python file beside logs (docs/simulators.md)."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, PositiveFloat, model_validator
+
+from diagnosis.answer import Diagnosis
+from diagnosis.machine.listed_effects import KINDS
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
+from diagnosis.machine.with_effects import with_effects
+from ident.data.record_files import read_table
+from ident.data.table import Table
+from workflow.config.settings import Section, check
+from workflow.diagnose.case_settings import CaseName
+from workflow.engine import storage
+from workflow.engine.errors import InputError, naming
+from workflow.engine.run_directory import hash_of
+
+_KINDS = ("mjcf", "fmu", "python")
+_PLACES = ("input", "output")
+# Of one log the last part judges what the first part fitted.
+_FITTED = 2 / 3
+# Of an FMU's or a Python file's value where nothing else is stated.
+_TOLERANCE = 0.05
+# Third differences of white noise have twenty times its variance; no motion is left in them.
+_THIRD = 20.0
+
+
+class SimulatorSettings(Section):
+    """A TOML file that names a model, or the options of the command line."""
+
+    case: CaseName = None
+    mjcf: str | None = Field(None, description="MuJoCo model")
+    fmu: str | None = Field(None, description="FMI 2.0 for co-simulation")
+    python: str | None = Field(None, description="file with simulate, PARAMETERS, INPUTS and OUTPUTS")
+    log: str | Annotated[tuple[str, ...], Field(min_length=1)] = Field(
+        description="log files; the last one judges, and of a single one its last third"
+    )
+    columns: dict[str, str] = Field({}, description="name in the model -> column, where they differ")
+    dt_s: PositiveFloat | None = Field(None, description="sampling period of logs without a time column")
+    noise: dict[str, PositiveFloat] = Field(
+        {}, description="output -> standard deviation; default: estimated"
+    )
+    tolerances: dict[str, PositiveFloat] = Field({}, description="parameter -> relative standard deviation")
+    model_error: float = Field(0.05, ge=0, lt=1, description="share of the motion that the model may miss")
+    tracking_rad_s: float | None = Field(None, ge=0, description="MJCF: see docs/simulators.md; 0: free run")
+    motion: Literal["position", "speed"] | None = Field(
+        None, description="FMU and Python: the first output is that of the body which the first input pushes"
+    )
+
+    @model_validator(mode="after")
+    def _one_model(self) -> SimulatorSettings:
+        stated = [key for key in _KINDS if getattr(self, key) is not None]
+        if len(stated) != 1:
+            raise ValueError(f"expected one of mjcf, fmu, python; got {' and '.join(stated) or 'none'}")
+        return self
+
+    @property
+    def logs(self) -> tuple[str, ...]:
+        return (self.log,) if isinstance(self.log, str) else self.log
+
+    @property
+    def model(self) -> str:
+        return str(self.mjcf or self.fmu or self.python)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorCase:
+    """See `workflow.diagnose.case_files.LoadedCase`. repaired: diagnosis -> MJCF, None of other
+    simulators."""
+
+    case: PlantCase
+    rig_file: str
+    input_sha256: str
+    repaired: Callable[[Diagnosis], str] | None
+    made_of: tuple[SimulatorSettings, Path, str] = field(repr=False)
+    descriptions: Mapping[str, str] = field(default_factory=dict)
+    suspected: tuple[str, ...] = ()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A simulator lives in one process: another one loads it again."""
+        return load_simulator_case, self.made_of
+
+
+def is_simulator(document: Mapping[str, Any]) -> bool:
+    """Whether a TOML file names a simulator's model."""
+    return any(key in document for key in _KINDS)
+
+
+def settings_of(document: Mapping[str, Any], source: str) -> SimulatorSettings:
+    return check(SimulatorSettings, dict(document), source=source)
+
+
+def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) -> SimulatorCase:
+    """Model and logs relative to `folder`. Raises InputError: one line naming the file and what is wrong."""
+    model = folder / settings.model
+    if not model.is_file():
+        raise InputError(f"{source}: no such model file: {model}")
+    paths = [folder / name for name in settings.logs]
+    tables = []
+    for path in paths:
+        with naming(str(path)):
+            tables.append(read_table(path))
+    dt_s = _sampling(tables, settings)
+    name = settings.case or model.stem
+    with naming(str(model)):
+        inputs, outputs, finish = _SIMULATORS[next(k for k in _KINDS if getattr(settings, k))](
+            model, tables, settings, dt_s
+        )
+    experiments = _experiments(paths, tables, settings, inputs, outputs, tracked=settings.mjcf is not None)
+    noise = _noise(experiments, outputs, settings)
+    with naming(str(model)):
+        plant, repaired = finish(experiments, noise)
+        unknown = [key for key in settings.tolerances if key not in plant.parameters]
+        if unknown:
+            raise InputError(
+                f"{source}: tolerances: no parameter is called {unknown[0]!r}; there are "
+                f"{', '.join(plant.parameters)}"
+            )
+        plant = replace(plant, tolerances={**plant.tolerances, **settings.tolerances})
+        case = PlantCase(name, plant, experiments)
+    hashes = [storage.sha256_of_file(path) for path in (model, *paths)]
+    return SimulatorCase(
+        case,
+        model.name,
+        hash_of({"settings": settings.model_dump(mode="json"), "files": hashes}),
+        repaired,
+        (settings, folder, source),
+    )
+
+
+_Finish = Callable[[Sequence[PlantExperiment], Real], tuple[Plant, Callable[[Diagnosis], str] | None]]
+_Simulator = Callable[
+    [Path, Sequence[Table], SimulatorSettings, float], tuple[tuple[str, ...], tuple[str, ...], _Finish]
+]
+
+
+def _needs(package: str, extra: str) -> None:
+    if find_spec(package) is None:
+        raise ValueError(f"needs the package {package}: pip install 'flexlink[{extra}]'")
+
+
+def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
+    _needs("mujoco", "mujoco")
+    from diagnosis.machine.mujoco_plant import MujocoArm, measurable
+
+    names = {settings.columns.get(name, name): name for name in measurable(str(model))}
+    outputs = tuple(name for column, name in names.items() if column in tables[0].names)
+    if not outputs:
+        raise ValueError(
+            f"no column of {tables[0].path} is named after a joint or sensor ({', '.join(names)}); say which "
+            "is which under [columns]"
+        )
+    arm = MujocoArm.from_file(str(model), outputs=outputs, dt_s=dt_s)
+
+    def finish(experiments: Sequence[PlantExperiment], noise: Real) -> Any:
+        tracking = settings.tracking_rad_s
+        if tracking is None:
+            tracking = arm.tracking(experiments)
+        plant = replace(arm, tracking_rad_s=tracking).plant(
+            experiments, noise, model_error=settings.model_error
+        )
+        return plant, lambda found: arm.repaired(plant, found.rig, found.repair)
+
+    return arm.inputs, outputs, finish
+
+
+def _fmu(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
+    _needs("fmpy", "fmu")
+    from diagnosis.machine.fmu_plant import Fmu
+
+    fmu = Fmu(model, dt_s)
+    finish = _with_all(fmu, fmu.parameters, {}, fmu.effects, fmu.inputs, fmu.outputs, settings, dt_s)
+    return fmu.inputs, fmu.outputs, finish
+
+
+def _python(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
+    try:
+        there = runpy.run_path(str(model))
+    except Exception as error:
+        raise ValueError(f"ended with {type(error).__name__}: {error}") from error
+    missing = [key for key in ("simulate", "PARAMETERS", "INPUTS", "OUTPUTS") if key not in there]
+    if missing:
+        raise ValueError(f"does not define {missing[0]}; expected simulate, PARAMETERS, INPUTS and OUTPUTS")
+    inputs, outputs = tuple(there["INPUTS"]), tuple(there["OUTPUTS"])
+    tolerances, effects = there.get("TOLERANCES", {}), tuple(there.get("EFFECTS", ()))
+    simulate, parameters = there["simulate"], there["PARAMETERS"]
+    return (
+        inputs,
+        outputs,
+        _with_all(simulate, parameters, tolerances, effects, inputs, outputs, settings, dt_s),
+    )
+
+
+_SIMULATORS: Mapping[str, _Simulator] = {"mjcf": _mjcf, "fmu": _fmu, "python": _python}
+
+
+def _with_all(
+    simulation: Callable[..., Real],
+    parameters: Mapping[str, float],
+    tolerances: Mapping[str, float],
+    effects: tuple[Any, ...],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    settings: SimulatorSettings,
+    dt_s: float,
+) -> _Finish:
+    """A simulation with the listed effects around inputs and outputs, and around its body where stated."""
+
+    def finish(experiments: Sequence[PlantExperiment], noise: Real) -> tuple[Plant, None]:
+        every = {name: tolerances.get(name, _TOLERANCE) for name in parameters}
+        plant = Plant(
+            simulation, parameters, every, tuple(outputs), noise, effects, settings.model_error, dt_s
+        )
+        motion = outputs[0] if settings.motion else None
+        around = partial(with_effects, experiments=experiments, dt_s=dt_s, at_rest_before=False)
+        plant = around(plant, "all", motion=motion, motion_is=settings.motion or "position")
+        there = {effect.name for effect in plant.effects}
+        kinds = {place: [k for k in KINDS if k in there and KINDS[k].where == place] for place in _PLACES}
+        for column, name in enumerate(inputs[1:], start=1):
+            plant = around(plant, kinds["input"], input=column, prefix=f"{name}_")
+        for name in outputs[1:]:
+            plant = around(plant, kinds["output"], output=name, prefix=f"{name}_")
+        return plant, None
+
+    return finish
+
+
+def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:
+    """The same in all logs."""
+    found = []
+    for table in tables:
+        column = settings.columns.get("time_s", "time_s")
+        if column not in table.names and settings.dt_s is None:
+            raise InputError(
+                f"{table.path}: no column time_s; state dt_s, or which column is the time under [columns]"
+            )
+        stamps = table.columns([column])[column] if column in table.names else None
+        with naming(str(table.path)):
+            found.append(table.sampling_time(stamps, column, None if stamps is not None else settings.dt_s))
+    if max(found) > 1.001 * min(found):
+        raise InputError(f"{tables[0].path}: logs are sampled every {min(found):.6g} to {max(found):.6g} s")
+    return found[0]
+
+
+def _experiments(
+    paths: Sequence[Path],
+    tables: Sequence[Table],
+    settings: SimulatorSettings,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    tracked: bool,
+) -> tuple[PlantExperiment, ...]:
+    """Commands (with what was measured behind them where the simulation tracks it) and outputs."""
+    columns = [settings.columns.get(name, name) for name in (*inputs, *outputs)]
+    found = []
+    for k, (path, table) in enumerate(zip(paths, tables, strict=True)):
+        with naming(str(path)):
+            read = table.columns(columns)
+        whole = np.column_stack([read[column] for column in columns])
+        y = whole[:, len(inputs) :]
+        u = whole if tracked else whole[:, : len(inputs)]
+        name = path.stem if [p.stem for p in paths].count(path.stem) == 1 else f"{path.stem} {k + 1}"
+        if len(paths) > 1:
+            role: Literal["estimation", "held_out"] = "held_out" if k == len(paths) - 1 else "estimation"
+            found.append(PlantExperiment(name, role, u, y))
+            continue
+        cut = int(_FITTED * len(y))
+        found.append(PlantExperiment(f"{name} (first part)", "estimation", u[:cut], y[:cut]))
+        found.append(PlantExperiment(f"{name} (last part)", "held_out", u[cut:], y[cut:]))
+    return tuple(found)
+
+
+def _noise(
+    experiments: Sequence[PlantExperiment], outputs: Sequence[str], settings: SimulatorSettings
+) -> Real:
+    """As stated, else what no motion explains: from third differences, at least a step of the readings."""
+    unknown = [name for name in settings.noise if name not in outputs]
+    if unknown:
+        raise InputError(f"noise: no output is called {unknown[0]!r}; there are {', '.join(outputs)}")
+    found = []
+    for k, name in enumerate(outputs):
+        y = np.concatenate([np.diff(e.output[:, k], 3) for e in experiments])
+        steps = np.abs(np.concatenate([np.diff(e.output[:, k]) for e in experiments]))
+        step = float(np.min(steps[steps > 0], initial=np.inf))
+        rough = 1.4826 * float(np.median(np.abs(y))) / np.sqrt(_THIRD)
+        least = 1e-6 * max(float(np.ptp(e.output[:, k])) for e in experiments)
+        quantised = step / np.sqrt(12) if np.isfinite(step) else 0.0
+        found.append(settings.noise.get(name) or max(rough, quantised, least))
+    return np.array(found)
