@@ -202,6 +202,10 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
     measured, (low, high) = run.loop.sensitivity.measured, run.loop.sensitivity.band_rad_s
     omega = np.geomspace(0.9 * low, min(1.1 * high, run.plant.nyquist_rad_s), 900)
     curve = curves_of(run, omega)[0]
+    low = min(float(m.omega_rad_s[0]) for m in measured)
+    high = max(float(m.omega_rad_s[-1]) for m in measured)
+    at = omega[np.argmax(curve.worst)]
+    start, stop = max(low, at / 3), min(high, at * 3)
     figure, (whole, near) = style.panels(3.9, 1, 2)
     for axes in (whole, near):
         axes.fill_between(omega, curve.nominal, curve.worst, **style.BAND)
@@ -209,17 +213,17 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
         axes.plot(omega, curve.worst, color=style.UNCERTAIN, lw=1.2, label=label)
         axes.plot(omega, curve.nominal, **_PREDICTED)
         for m, look in zip(measured, _MARKERS, strict=False):
-            bars = {"yerr": 2 * m.std, "elinewidth": 0.6, "capsize": 0} if axes is near else {}
-            axes.errorbar(m.omega_rad_s, m.magnitude, ls="none", label=m.name, **look, **bars)
+            if axes is whole:
+                axes.plot(m.omega_rad_s, m.magnitude, ls="none", label=m.name, **look)
+                continue
+            bars, part = {"elinewidth": 0.6, "capsize": 0}, (m.omega_rad_s >= start) & (m.omega_rad_s <= stop)
+            values = m.omega_rad_s[part], m.magnitude[part], 2 * m.std[part]
+            axes.errorbar(*values, ls="none", label=m.name, **look, **bars)
         axes.set(xscale="log", xlabel="frequency [rad/s]")
     whole.set(yscale="log", ylabel="|S| [1]", title="Sensitivity, reference to error")
-    low = min(float(m.omega_rad_s[0]) for m in measured)
-    high = max(float(m.omega_rad_s[-1]) for m in measured)
     whole.set_xlim(low / 1.1, high * 1.1)
     inside = (omega >= low) & (omega <= high)
     whole.set_ylim(0.7 * float(curve.nominal[inside].min()), 1.6 * float(curve.worst.max()))
-    at = omega[np.argmax(curve.worst)]
-    start, stop = max(low, at / 3), min(high, at * 3)
     peak = float(curve.worst.max())
     shown = np.concatenate(
         [m.magnitude[(m.omega_rad_s >= start) & (m.omega_rad_s <= stop)] for m in measured]

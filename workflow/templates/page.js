@@ -389,6 +389,7 @@ class Plot {
 }
 
 const plots = [...document.querySelectorAll(".plot[data-plot]")].map(holder => new Plot(holder));
+document.getElementById("hint").hidden = !plots.length;
 const narrow = matchMedia("(max-width: 640px)");
 const part = () => narrow.matches && plots.forEach(plot => plot.part());
 narrow.addEventListener("change", part);
