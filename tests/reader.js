@@ -1,7 +1,7 @@
 // What a reader would mind about a page: words too pale, boxes too narrow, pictures without words. [faults, least contrast]
 () => {
   document.querySelectorAll("details").forEach(part => part.open = true);
-  const faults = [], numbers = text => (text.match(/[\d.]+/g) ?? []).map(Number);
+  const faults = document.querySelector("main h1") ? [] : ["no page"], numbers = text => (text.match(/[\d.]+/g) ?? []).map(Number);
   const light = colour => {
     const [r, g, b] = colour.map(v => v / 255).map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4);
     return .2126 * r + .7152 * g + .0722 * b;
