@@ -173,7 +173,7 @@ def test_packaged_default_is_the_example():
     ).read_text()
 
 
-# own_log.toml is a pattern to fill in and needs its logs made first: test_own_log.py walks through it.
+# own_log.toml is a pattern to fill in and needs its logs made first: test_readme.py runs it.
 NAMED_ARMS = sorted(path for path in (ROOT / "examples").glob("*.toml") if path.stem != "own_log")
 
 

@@ -71,8 +71,13 @@ def test_commands_of_the_readme_give_the_right_answer(clean, flexlink):
     assert call("run").document()["certified"]
     assert Path("runs/mine/controller.c").is_file()
     (answer,) = call("diagnose").document()["cases"]
-    truth = tomllib.loads(Path("examples/gap_case/machine.toml").read_text(encoding="utf-8"))
-    assert answer["combination"] == [effect["name"] for effect in truth["source"]["effects"]]
+    machine = tomllib.loads(Path("examples/gap_case/machine.toml").read_text(encoding="utf-8"))
+    (truth,) = machine["source"]["effects"]
+    assert answer["combination"] == [truth["name"]]
+    low, high = answer["effects"][0]["intervals"]["torque_Nm"]
+    # One case: the truth lies in an interval twice as wide.
+    assert abs(truth["torque_Nm"] - (low + high) / 2) < high - low
+    assert answer["gap_after"] < 1.05 < answer["gap_refit"]
 
 
 @pytest.mark.slow
