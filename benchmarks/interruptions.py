@@ -77,6 +77,15 @@ class Command:
         """Of the living, and of the dead that have been waited for."""
         return sum(sum(map(int, fields[11:15])) for fields in self._session()) / _TICKS_PER_S
 
+    def largest_mib(self) -> float:
+        """The most memory that one of the living ever had."""
+        peaks = [0.0]
+        for fields in self._session():
+            with suppress(OSError, IndexError):
+                status = Path(f"/proc/{fields[-1]}/status").read_text()
+                peaks.append(float(status.partition("VmHWM:")[2].split()[0]) / 1024)
+        return max(peaks)
+
     def _session(self) -> Iterator[list[str]]:
         for entry in Path("/proc").iterdir():
             with suppress(OSError):
@@ -84,7 +93,7 @@ class Command:
                     # After the name, which may hold blanks: state, parent, group, session, ...
                     fields = (entry / "stat").read_text().rpartition(")")[2].split()
                     if int(fields[3]) == self.process.pid and fields[0] != "Z":
-                        yield fields
+                        yield [*fields, entry.name]
 
     def left(self, seconds: float) -> int:
         """How many of its processes are there still after at most so long."""

@@ -41,6 +41,13 @@ def logs(tmp_path_factory) -> Path:
     return folder
 
 
+def test_more_samples_than_memory_are_refused(logs, refused, monkeypatch):
+    monkeypatch.setattr("workflow.tasks.records.MOST_SAMPLES", 100)
+    line = refused("identify", logs / "first.csv", *COLUMNS)
+    assert line.startswith("flexlink: first: ")
+    assert "at most 100 are identified together" in line
+
+
 def identify_first(logs, **written):
     fresh = [logs / "fresh.csv"]
     return identify_logs([logs / "first.csv"], "u_V", "tip_m", time="t_s", validation=fresh, **written)

@@ -21,6 +21,8 @@ from workflow.tasks.results import RecordsResult, RunRecord
 from workflow.tasks.simulated_rig import simulate_record
 from workflow.tasks.stage import StageInput
 
+MOST_SAMPLES = 2_000_000
+
 
 def make_records(stage: StageInput) -> RecordsResult:
     """All records of the configuration, in its order, simulated or read.
@@ -94,11 +96,18 @@ def refuse_constant_input(record: Record) -> None:
 
 
 def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
-    """The records with the first one's sampling time. Raises InputError where they really differ.
+    """The records with the first one's sampling time. Raises InputError where they really differ, or are
+    together longer than the memory of most machines allows.
 
     Time stamps are written with a few digits, so that the mean interval of equal clocks differs in its last
     digits.
     """
+    samples = sum(len(record.input) for record in records)
+    if samples > MOST_SAMPLES:
+        raise InputError(
+            f"{records[0].name}: {samples} samples in all, at most {MOST_SAMPLES} are identified together "
+            "(4 kB of memory each); take fewer or shorter records, or a longer sampling period"
+        )
     first = records[0]
     for other in records[1:]:
         if not abs(other.dt_s - first.dt_s) <= 1e-6 * first.dt_s:

@@ -1,0 +1,86 @@
+"""Time and memory over the size of what is given: one command in a process of its own for each size.
+
+Identification: one log of white-noise voltage through a lag and a light mode, order given; then several logs
+of one length. Study: points of the fast arm of the tests. Diagnosis: short cases. CPU seconds of all its
+processes, and the largest memory that one of them ever had. A size of 0 is left out.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import scipy.signal
+
+from benchmarks.harness import Print, main
+from benchmarks.interruptions import Command
+from tests.workflow.diagnosis_examples import FRICTION, write_case
+from tests.workflow.study_examples import TWO_POINTS
+
+DT_S = 0.005
+
+
+def write_log(path: Path, samples: int, seed: int) -> Path:
+    rng = np.random.default_rng(seed)
+    voltage = rng.standard_normal(samples)
+    mode = np.exp((-0.6 + 11.9j) * DT_S)
+    lag = scipy.signal.lfilter([0.0, 0.1], [1.0, -0.9], voltage)
+    swing = scipy.signal.lfilter([0.0, 0.01], np.poly([mode, mode.conj()]).real, voltage)
+    angle = lag + swing + 0.01 * rng.standard_normal(samples)
+    np.savez(path, t_s=DT_S * np.arange(samples), u_V=voltage, y_rad=angle)
+    return path
+
+
+def used_by(*arguments: object) -> tuple[float, float]:
+    """CPU seconds and MiB of a command. Raises RuntimeError where it does not end with 0."""
+    command, cpu_s, mib = Command([*map(str, arguments), "--quiet"]), 0.0, 0.0
+    while command.process.poll() is None:
+        cpu_s, mib = max(cpu_s, command.cpu_s()), max(mib, command.largest_mib())
+        time.sleep(0.1)
+    code, error = command.ended()
+    if code != 0:
+        raise RuntimeError(f"{arguments[0]} ended with {code}: {error[-300:]}")
+    return cpu_s, mib
+
+
+def told(out: Print, what: str, size: int, used: tuple[float, float]) -> None:
+    seconds, mib = used
+    out(f"{what:<40}{size:>10}{seconds:>10.1f}{mib:>10.0f}{1e3 * seconds / size:>14.4g}")
+
+
+def run(
+    out: Print,
+    *,
+    samples: tuple[int, ...] = (10_000, 100_000, 1_000_000, 10_000_000),
+    records: tuple[int, ...] = (1, 5, 50),
+    record_samples: int = 20_000,
+    points: tuple[int, ...] = (2, 20, 500),
+    cases: tuple[int, ...] = (1, 10, 100),
+) -> None:
+    out(f"{'':40}{'size':>10}{'CPU s':>10}{'MiB':>10}{'CPU ms each':>14}")
+    roles = ("--input", "u_V", "--output", "y_rad", "--time", "t_s", "--real", 1, "--pairs", 1, "--delay", 0)
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as name:
+        folder = Path(name)
+        used_by("identify", write_log(folder / "first.npz", 5000, 0), *roles)  # compiles
+        for size in samples:
+            log = write_log(folder / "log.npz", size, 1)
+            told(out, "identification, samples of one record", size, used_by("identify", log, *roles))
+        logs = [write_log(folder / f"{k}.npz", record_samples, k) for k in range(max(records, default=0))]
+        for size in records:
+            found = used_by("identify", *logs[:size], *roles)
+            told(out, f"identification, records of {record_samples}", size, found)
+        for size in filter(None, points):
+            values = np.linspace(1.0, 1.5, size).round(4).tolist()
+            (folder / "study.toml").write_text(TWO_POINTS.replace("[1.0, 1.5]", str(values)))
+            call = ("study", "--config", folder / "study.toml", "--out", folder / f"study{size}", "--jobs", 1)
+            told(out, "study, points", size, used_by(*call))
+        places = [write_case(folder / f"case{k}", FRICTION, seed=k) for k in range(max(cases, default=0))]
+        for size in filter(None, cases):
+            more = ("--out", folder / f"out{size}", "--no-controller", "--jobs", 1)
+            told(out, "diagnosis, cases", size, used_by("diagnose", *places[:size], *more))
+
+
+if __name__ == "__main__":
+    main(run, seeds="0 to 99")
