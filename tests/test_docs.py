@@ -24,7 +24,11 @@ DOCS = ROOT / "docs"
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # Run by tests of their own.
-ELSEWHERE = {"from_python.md": "test_front_door.py", "own_plant.md": "workflow/test_plant_page.py"}
+ELSEWHERE = {
+    "from_python.md": "test_front_door.py",
+    "own_plant.md": "workflow/test_plant_page.py",
+    "simulators.md": "workflow/test_simulators.py",
+}
 CONSOLE = ["c_code.md", "which_data.md"]
 LONG = ["tutorials/engineer.md", "tutorials/student.md"]
 
