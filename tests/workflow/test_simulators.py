@@ -98,6 +98,13 @@ def test_the_command_refuses_with_exit_code_2(tmp_path, refused):
         assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_of_a_stranger_runs_nothing(tmp_path, refused):
+    (tmp_path / "case.toml").write_text('python = "evil.py"\nlog = "one.csv"\n')
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    assert "name case.toml itself" in refused("diagnose", tmp_path, "--out", tmp_path / "out")
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_python_file_becomes_a_case_that_another_process_can_load(tmp_path):
     (source,) = snippets("python")
     (tmp_path / "motor.py").write_text(source)
