@@ -32,12 +32,12 @@ def run(
     binary: int = 600,
     child: int = 100,
 ) -> None:
-    out(f"{'':46}{'tried':>7}{'refused':>9}{'wrong':>7}   longest line   slowest refusal, CPU s")
+    out(f"{'':52}{'tried':>7}{'refused':>9}{'wrong':>7}   longest line   slowest refusal, CPU s")
     total = Tally()
 
     def told(kind: str, found: Tally) -> None:
         counts = f"{found.tried:7d}{found.refused:9d}{len(found.wrong):7d}"
-        out(f"{kind:<46}{counts}{found.longest:15d}{found.slowest_s:25.2f}")
+        out(f"{kind:<52}{counts}{found.longest:15d}{found.slowest_s:25.2f}")
         if found is total:
             return
         for line in found.wrong:
