@@ -177,10 +177,14 @@ def test_a_page_with_two_pictures(faults_seen, page):
     assert faults_seen(page) == []
 
 
-def test_report_of_a_run(faults_seen, tmp_path):
+def test_report_of_a_run(browser, faults_seen, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
-    assert faults_seen(write_report(RunResults(run), settings)) == []
+    path = write_report(RunResults(run), settings)
+    assert faults_seen(path) == []
+    assert path.stat().st_size < 1_000_000
+    browser.open(path, 1280, 800)
+    assert browser.ask("document.documentElement.scrollHeight") < 12 * 800  # as it opens
 
 
 def test_page_of_a_planned_experiment(faults_seen, tmp_path):

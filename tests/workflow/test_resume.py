@@ -104,7 +104,7 @@ def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path, number):
 def plain_page(monkeypatch):
     """Resuming is about numbers: an empty page saves the seconds that drawing takes."""
 
-    def write(results, config, progress=None):
+    def write(results, config, progress=None, also=()):
         storage.write_text(results.run.report_path, "<html></html>\n")
         return results.run.report_path
 
