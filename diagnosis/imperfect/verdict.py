@@ -25,7 +25,7 @@ _VOLUME = 0.25
 # Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
 _PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
 # An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
-_INTERESTS, _INTERESTS_WIDTH = 1.15, 0.06
+_INTERESTS, _INTERESTS_WIDTH = 1.2, 0.06
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
@@ -35,7 +35,7 @@ _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
 # A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
 _WORSE, _WORSE_BY = 1.15, 0.2
 # What an effect that contains a simpler one has to gain over it.
-_CONTAINING = 2.0
+_CONTAINING = 1.0
 # Logarithm of how much less probable a cause beyond the list is that looks like an effect.
 _UNLISTED = 0.55
 # Sets this far behind in score take no part.
