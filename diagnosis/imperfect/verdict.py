@@ -25,7 +25,7 @@ _VOLUME = 0.25
 # Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
 _PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
 # An effect interests from this many model errors on; the limit is soft, its width in natural logarithms.
-_INTERESTS, _INTERESTS_WIDTH = 1.2, 0.06
+_INTERESTS, _INTERESTS_WIDTH = 1.18, 0.06
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
@@ -166,13 +166,15 @@ def _judged(
             _part(search, reduced, name, rest or search.base, model_error, listed)
             for name, rest in rests.items()
         ]
+        for part in within:
+            seen = parts.get(part.name, part)
+            parts[part.name] = Part(part.name, max(part.share, seen.share), max(part.matters, seen.matters))
         least = min(within, key=lambda part: (part.matters, part.share))
         smaller = rests[least.name]
-        if least.matters >= 0.5 or len(within) == 1 or smaller is None:
-            parts |= {part.name: part for part in within}
+        if least.matters >= 0.5 or smaller is None:
             break
         # Two effects that can replace each other would both seem to carry nothing: the lesser goes first.
-        parts[least.name], reduced = least, smaller
+        reduced = smaller
     at_edge = any(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
