@@ -167,8 +167,9 @@ def _judged(
             for name, rest in rests.items()
         ]
         for part in within:
-            seen = parts.get(part.name, part)
-            parts[part.name] = Part(part.name, max(part.share, seen.share), max(part.matters, seen.matters))
+            share = max(part.share, parts[part.name].share if part.name in parts else 0.0)
+            matters = max(part.matters, _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH))
+            parts[part.name] = Part(part.name, share, matters)
         least = min(within, key=lambda part: (part.matters, part.share))
         smaller = rests[least.name]
         if least.matters >= 0.5 or smaller is None:
