@@ -14,11 +14,14 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lapack, qr, solve_triangular, svd
 
 from ident.basis.posterior import EmbeddingReport
 from ident.data.arrays import RealArray
 
+# Rows of a record that stand in memory with all their columns: some hundred megabytes.
+_PIECE = 65536
 # Columns of the QR decomposition that are done at a time.
 _PANEL = 32
 # Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
@@ -33,12 +36,49 @@ _SCALES, _VISIBLE_SHARE, _LARGEST_ENERGY = 6, 0.1, 1e12
 
 
 @dataclass(frozen=True, eq=False)
+class Delays:
+    """Matrix (T,L) of an input (T,) one, two, ... samples ago, zero before the record; rows are made where
+    they are asked for, because all of a long record would not fit into memory.
+
+    first (n,L): in place of its first n rows. begin: rows before that one are left out.
+    """
+
+    input: RealArray
+    length: int
+    first: RealArray
+    begin: int = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.input.size - self.begin, self.length
+
+    def __getitem__(self, rows: slice) -> RealArray:
+        begin, end, _ = (self.begin + index for index in rows.indices(self.shape[0]))
+        if end <= begin:
+            return np.zeros((0, self.length))
+        known = self.input[max(begin - self.length, 0) : end - 1]
+        before = np.concatenate([np.zeros(max(self.length - begin, 0)), known])
+        made = sliding_window_view(before, self.length)[:, ::-1].copy()
+        replaced = self.first[begin:end]
+        made[: len(replaced)] = replaced
+        return made
+
+    def __matmul__(self, taps: RealArray) -> RealArray:
+        return np.concatenate([self[rows] @ taps for rows in pieces(self.shape[0])])
+
+
+def pieces(n_rows: int) -> list[slice]:
+    """Rows of a long record that are worked on together."""
+    return [slice(begin, begin + _PIECE) for begin in range(0, n_rows, _PIECE)]
+
+
+@dataclass(frozen=True, eq=False)
 class RegressionBlock:
     """Rows of one record: nuisance (T,n), regressors F (T,p), kernel columns Psi (T,L), output y (T,)."""
 
     nuisance: RealArray
     regressors: RealArray
-    kernel: RealArray
+    kernel: RealArray | Delays
     output: RealArray
 
 
@@ -112,8 +152,8 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
 def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
     """One QR for all records: each block, its nuisance projected out, is stacked under the last triangle.
 
-    Cost O(N (p + L)^2), memory that of the largest block. Raises ValueError when rows do not exceed p + L or
-    the input does not excite a regressor.
+    Cost O(N (p + L)^2), memory that of the largest block's F and a piece of its Psi. Raises ValueError when
+    rows do not exceed p + L or the input does not excite a regressor.
     """
     triangle: RealArray | None = None
     n_rows = 0
@@ -124,7 +164,11 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
         # The nuisance as the first columns: below its rows, the triangle is that of everything orthogonal
         # to it, for the price of a few columns more.
         rank = basis.shape[1]
-        upper = triangle_of(np.column_stack([basis, block.regressors, block.kernel, block.output]))
+        upper = np.zeros((0, rank + p + length + 1))
+        for rows in pieces(block.output.size):
+            piece = [basis[rows], block.regressors[rows], block.kernel[rows], block.output[rows]]
+            stacked = np.column_stack(piece)
+            upper = triangle_of(np.vstack([upper, stacked]) if len(upper) else stacked)
         upper = upper[rank : rank + p + length + 1, rank:]
         n_rows += block.output.size - rank
         triangle = upper if triangle is None else triangle_of(np.vstack([triangle, upper]))

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
@@ -15,7 +14,7 @@ from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import first_rows, whitened
-from ident.uncertainty.embedding_algebra import RegressionBlock
+from ident.uncertainty.embedding_algebra import Delays, RegressionBlock
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +85,11 @@ class EmbeddingRows:
     def blocks(self) -> Iterator[RegressionBlock]:
         """Rows with kernel columns; those that are dropped are left out, for they count as data here."""
         for rows in self:
-            kernel = _shifted(rows.input, self.fir_length)
-            n = len(rows.first)
-            if n:
-                kernel[:n] = rows.first @ _shifted(rows.head, self.fir_length)
-            used = slice(0 if np.any(rows.first) else n, None)
-            yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel[used], rows.output[used])
+            dropped = 0 if np.any(rows.first) else len(rows.first)
+            head = Delays(rows.head, self.fir_length, np.zeros((0, self.fir_length)))
+            kernel = Delays(rows.input, self.fir_length, rows.first @ head[:], dropped)
+            used = slice(dropped, None)
+            yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel, rows.output[used])
         if self.known_std is not None:
             # What is known of the shared coefficients: as many measurements of them, each off by one.
             q = self.n_known
@@ -138,8 +136,3 @@ class EmbeddingRows:
     def _driven(self, u: RealArray) -> RealArray:
         columns = regressor(self.poles, u)
         return np.column_stack([columns, u]) if self.structure.feedthrough else columns
-
-
-def _shifted(u: RealArray, length: int) -> RealArray:
-    """(T, length): the input one, two, ... samples ago, zero before the record."""
-    return np.asarray(toeplitz(np.concatenate([np.zeros(1), u[:-1]]), np.zeros(length)), dtype=np.float64)

@@ -7,7 +7,9 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.stats import multivariate_normal
 
+from ident.uncertainty import embedding_algebra
 from ident.uncertainty.embedding_algebra import (
+    Delays,
     RegressionBlock,
     conditional_posterior,
     evaluate_grid,
@@ -212,3 +214,27 @@ def test_a_column_given_twice_is_left_out_and_nothing_else_changes():
     np.testing.assert_allclose(
         (factor_twice @ factor_twice.T)[np.ix_(rest, rest)], covariance, atol=1e-9 * np.abs(covariance).max()
     )
+
+
+def test_delays_are_made_piece_by_piece(monkeypatch):
+    rng = np.random.default_rng(11)
+    u, first = rng.standard_normal(40), rng.standard_normal((3, 7))
+    whole = toeplitz(np.concatenate([[0.0], u[:-1]]), np.zeros(7))
+    whole[:3] = first
+    delays = Delays(u, 7, first)
+    np.testing.assert_array_equal(delays[:], whole)
+    for rows in (slice(0, 2), slice(2, 9), slice(5, 40), slice(38, 99)):
+        np.testing.assert_array_equal(delays[rows], whole[rows])
+    np.testing.assert_array_equal(Delays(u, 7, first, 3)[2:9], whole[5:12])
+    taps = rng.standard_normal(7)
+    monkeypatch.setattr(embedding_algebra, "_PIECE", 9)
+    np.testing.assert_allclose(delays @ taps, whole @ taps, rtol=1e-12)
+    # A record that is reduced in pieces has the triangle of the whole one.
+    nuisance, regressors, y = np.ones((40, 1)), rng.standard_normal((40, 2)), rng.standard_normal(40)
+    pieces = reduce_regression([RegressionBlock(nuisance, regressors, delays, y)])
+    monkeypatch.undo()
+    at_once = reduce_regression([RegressionBlock(nuisance, regressors, whole, y)])
+    for name in ("r11", "r12", "r22"):
+        found, expected = getattr(pieces, name), getattr(at_once, name)
+        np.testing.assert_allclose(np.abs(found), np.abs(expected), rtol=1e-10, atol=1e-12)
+    assert pieces.rest == pytest.approx(at_once.rest, rel=1e-10)
