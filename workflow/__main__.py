@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 import sys
+from contextlib import suppress
 
 from workflow.engine import interrupts
 
@@ -17,7 +20,13 @@ def main() -> int:
         interrupts.ignore()  # all is done and said
     except KeyboardInterrupt:  # while it was loaded
         sys.stderr.write("flexlink: interrupted\n")
-        return interrupts.exit_code()
+        code = interrupts.exit_code()
+    if interrupts.came():
+        # CPython ends itself with SIGINT once a KeyboardInterrupt passed through exec("..."), handled or not.
+        atexit._run_exitfuncs()
+        with suppress(OSError):
+            sys.stdout.flush()
+        os._exit(code)
     return code
 
 

@@ -16,6 +16,8 @@ from ident.data.table import Table
 
 # A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
 # more.
+# Of a gain in any units; its square is still a number.
+_LARGEST = 1e100
 _PSD_TOLERANCE = 1e-9
 
 FREQUENCY_COLUMNS = {"omega_rad_s": 1.0, "omega_rad_per_s": 1.0, "frequency_Hz": 2 * np.pi}
@@ -74,7 +76,9 @@ class FrequencyUncertainty:
         _refuse_first(omega < 0, omega, "omega must not be negative")
         nyquist = np.pi / self.dt_s
         _refuse_first(omega > nyquist * (1 + 1e-9), omega, f"omega is above pi / dt_s = {nyquist:.6g} rad/s")
-        _refuse_first(~np.isfinite(centre), omega, "the centre is not finite")
+        _refuse_first(
+            ~(np.abs(centre) < _LARGEST), omega, f"the centre is not finite, or beyond {_LARGEST:g}"
+        )
         _refuse_first(~np.all(np.isfinite(covariance), axis=(1, 2)), omega, "the covariance is not finite")
         skew = np.abs(covariance[:, 0, 1] - covariance[:, 1, 0])
         largest = np.abs(covariance).max(axis=(1, 2))

@@ -153,7 +153,7 @@ def test_command_writes_the_whole_directory(flexlink, ready, tmp_path):
     assert answer.err == ""
     assert document["report"] == str(out / PAGE)
     assert sorted(os.listdir(out)) == sorted(
-        [*(f"figure-{n}.svg" for n in range(1, 8)), "table.csv", "table.json", PAGE]
+        [*(f"figure-{n}.svg" for n in range(1, 8)), "lock", "table.csv", "table.json", PAGE]
     )
     assert json.loads((out / "table.json").read_text())["rows"] == document["numbers"]["rows"]
     assert os.listdir(out.parent) == ["paper"]  # no traces beside it

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +17,6 @@ import scipy.io
 
 from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
 from workflow.cli import main
-from workflow.engine.errors import InputError
 
 FILES_CONFIG = """
 [run]
@@ -456,14 +457,14 @@ def test_design_of_an_impossible_specification_is_three_like_a_run(flexlink, tmp
 def test_a_full_disk_leaves_no_half_of_the_experiments(refused, monkeypatch, tmp_path):
     from workflow.engine import storage
 
-    write = storage.write_bytes
+    fsync = storage.os.fsync
 
-    def second_does_not_fit(path, content):
-        if path.name.startswith("02"):
-            raise InputError(f"cannot write {path}: No space left on device")
-        write(path, content)
+    def second_does_not_fit(descriptor):
+        if Path(os.readlink(f"/proc/self/fd/{descriptor}")).name.startswith(".02"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
 
-    monkeypatch.setattr(storage, "write_bytes", second_does_not_fit)
+    monkeypatch.setattr(storage.os, "fsync", second_does_not_fit)
     assert "No space left" in refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "new")
     assert not (tmp_path / "new").exists()
 

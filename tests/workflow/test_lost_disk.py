@@ -94,7 +94,7 @@ def test_a_study_goes_on(tmp_path, monkeypatch, continued, flexlink):
     before = point_bytes(tmp_path / "out")
     shutil.copytree(tmp_path / "out", tmp_path / "again")
     shutil.rmtree(tmp_path / "again/points")
-    assert flexlink("study", "--config", study, "--out", tmp_path / "again", "--resume").code == 0
+    assert call("study", "--config", study, "--out", tmp_path / "again", "--resume").code == 0
     assert_same_study(tmp_path / "out", tmp_path / "again")
     assert point_bytes(tmp_path / "again") == before
 

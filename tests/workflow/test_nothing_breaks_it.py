@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import shutil
 import warnings
 from collections.abc import Callable
@@ -182,7 +183,8 @@ def refusal(arguments: list[str], folder: Path) -> str | None:
             code = main(arguments)
         except ComputesError:
             return None
-    line = error.getvalue().removesuffix("\n").removeprefix("flexlink: ")
+    told = re.sub(r"(?m)^flexlink: \d+ s: .*\n", "", error.getvalue())  # signs of life of long work
+    line = told.removesuffix("\n").removeprefix("flexlink: ")
     assert code in (0, 2, 3), f"exit {code}: {line}"
     assert code != 2 or str(folder) in line, f"no file named: {line}"
     return line if code == 2 else None

@@ -82,7 +82,9 @@ def far_study(folder: Path, address: str) -> tuple[Path, tuple[object, ...]]:
 
 
 def finished_points(out: Path) -> int:
-    return len(list(out.glob("points/*/stages/closed_loop.*")))
+    # Not through the links that have the points' numbers.
+    folders = [point for point in out.glob("points/*") if not point.is_symlink()]
+    return sum(1 for point in folders for _ in point.glob("stages/closed_loop.*"))
 
 
 @pytest.mark.slow

@@ -73,6 +73,8 @@ def _refuse_extremes(document: Any, path: Path) -> None:
                 below += [(key, item) for item in value]
             elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
                 raise InputError(f"{path}: {shortened(key)}: an integer beyond 64 bits, {shortened(value)}")
+            elif isinstance(value, str) and "\0" in value:
+                raise InputError(f"{path}: {shortened(key)}: a NUL character in {shortened(value)}")
         level = below
     if level:
         raise InputError(f"{path}: nested deeper than {MOST_LEVELS} levels")

@@ -31,6 +31,11 @@ def check() -> None:
         raise KeyboardInterrupt
 
 
+def came() -> bool:
+    """Whether an interrupt has come."""
+    return _came is not None
+
+
 def exit_code() -> int:
     """128 + the signal, as shells expect: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
     return 128 + (_came or signal.SIGINT)

@@ -70,6 +70,6 @@ def _number(axes: Axes, at: npt.NDArray[np.float64], number: npt.NDArray[np.int6
             xytext=(6, 5),
             textcoords="offset points",
             fontsize=8.5,
-            color=style.PREDICTED,
+            color=style.REFERENCE,
             zorder=4,
         )

@@ -37,6 +37,8 @@ from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import words
 
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
+# Of an entry of a state space in any units: products of some of them are still numbers.
+_LARGEST = 1e50
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +193,8 @@ def _matrix(path: Path, name: str, value: Any) -> np.ndarray[Any, np.dtype[np.fl
             raise ValueError
     except ValueError:
         raise InputError(f"{path}: {name} must be a matrix of real numbers") from None
-    if not np.all(np.isfinite(matrix)):
-        raise InputError(f"{path}: {name} has a value that is not finite")
+    if not np.all(np.abs(matrix) < _LARGEST):
+        raise InputError(f"{path}: {name} has a value that is not finite or beyond {_LARGEST:g}")
     return np.asarray(matrix, dtype=np.float64)
 
 
