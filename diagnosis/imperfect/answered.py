@@ -96,11 +96,10 @@ def _competing(case: Case, search: Search, found: judging.Verdict) -> tuple[Comp
         key = tuple(sorted(part.name for part in one.parts if part.matters >= 0.5))
         if key and not any(set(key) <= set(other) or set(other) <= set(key) for other in kept):
             kept[key] = one.explanation.end
-    by_output = (
-        part.reshape(-1, case.noise.size).sum(axis=0)
+    floor, counted = (
+        part.reshape(-1, case.noise.size).sum(axis=0)  # bands are ordered record, octave, output
         for part in (records.levels.floor, records.levels.counted)
     )
-    floor, counted = by_output
     level = dict(zip(case.outputs, np.sqrt(judging.TEMPER * floor / counted), strict=True))
     noise = np.array([level.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
     return tuple(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -77,7 +77,7 @@ class Search:
         self.records = Records(self.case, self.case.estimation)
         self.held_out = Records(self.case, self.case.held_out)
         self.points: list[tuple[Candidate, list[Point]]] = []
-        self._asked: set[tuple[object, ...]] = set()
+        self._reduced: set[tuple[object, ...]] = set()  # sets already fitted without one of their effects
 
     @property
     def base(self) -> Explanation:
@@ -97,22 +97,15 @@ class Search:
         nominal = descend(self.records, (), np.zeros(P), np.zeros(0), self.records.at_rest(), iterations=12)
         self.add(nominal)
         self._alone()
-        self._containing(self._likeliest(lambda e: len(e.names) == 1))
+        self._containing(self.found)
         for count in range(2, weighing.most_effects + 1):
             likeliest = max(self.found, key=lambda e: e.evidence)
             if count > 3 and np.max(likeliest.shares) <= weighing.model_error:
                 break
             self._together(count)
-        self._containing(self._likeliest(lambda e: len(e.names) > 1)[:_CONTINUED])
+        several = best_of_sets(e for e in self.found if len(e.names) > 1)
+        self._containing(list(several.values())[:_CONTINUED])
         self._look_alikes()
-
-    def _likeliest(self, among: Callable[[Explanation], bool]) -> list[Explanation]:
-        """The best explanation by each set of effects, the likeliest first."""
-        best: dict[tuple[str, ...], Explanation] = {}
-        for explanation in sorted(self.found, key=lambda e: -e.evidence):
-            if among(explanation):
-                best.setdefault(explanation.key, explanation)
-        return list(best.values())
 
     def _late(self, what: str) -> bool:
         if time.monotonic() < self.deadline_s:
@@ -164,14 +157,14 @@ class Search:
             iterations=9,
         )
 
-    def _containing(self, pool: Sequence[Explanation]) -> None:
-        """Effects that contain a simpler one (Stribeck friction Coulomb's), from where sets of it ended."""
+    def _containing(self, sets: Sequence[Explanation]) -> None:
+        """Effects that contain a simpler one (Stribeck friction Coulomb's), from where sets of it ended: with
+        several further values the first time, then with those that this found."""
+        pool = list(best_of_sets(sets).values())
         for candidate in self.case.machine.candidates(self.case.experiments):
             simple = candidate.kind.contains
-            known = [points[0] for other, points in self.points if other.effect == candidate.effect]
-            starts = [point.coordinates[1:] for point in known] or sorted({x[1:] for x in candidate.starts})[
-                ::2
-            ]
+            starts = [points[0].coordinates[1:] for c, points in self.points if c.effect == candidate.effect]
+            starts = starts or [np.array(x) for x in sorted({x[1:] for x in candidate.starts})[::2]]
             for inner in [e.end for e in pool if simple in e.names]:
                 if self._late(candidate.effect):
                     return
@@ -196,12 +189,9 @@ class Search:
                 self.add(best)
 
     def _together(self, count: int) -> None:
-        pool = sorted((e for e in self.found if len(e.names) == count - 1), key=lambda e: -e.evidence)
-        parents: dict[tuple[str, ...], Explanation] = {}
-        for explanation in pool:
-            if len(parents) < _PARENTS[count > 2]:
-                parents.setdefault(explanation.key, explanation)
-        for k, parent in enumerate(parents.values()):
+        pool = best_of_sets(e for e in self.found if len(e.names) == count - 1)
+        parents = list(pool.values())[: _PARENTS[count > 2]]
+        for k, parent in enumerate(parents):
             words = f"fitting more beside {' and '.join(parent.names)}"
             self.progress(min(0.45 + 0.25 * (count - 2) + 0.25 * k / len(parents), 0.95), words)
             if self._late(f"further effects beside {' and '.join(parent.names)}"):
@@ -265,8 +255,8 @@ class Search:
         end = explanation.end
         rest = tuple(c for j, c in enumerate(end.candidates) if j != k)
         key = tuple(sorted(c.effect for c in rest))
-        if rest and (asked := (*explanation.names, explanation.evidence, k)) not in self._asked:
-            self._asked.add(asked)
+        if rest and (this := (*explanation.names, explanation.evidence, k)) not in self._reduced:
+            self._reduced.add(this)
             x = np.concatenate([end.coordinates_of(j) for j in range(len(end.candidates)) if j != k])
             self.add(descend(self.records, rest, end.deviations, x, end.start))
         return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)
@@ -353,6 +343,14 @@ class Search:
                 break
             start, e, loss = moved, e2, loss2
         return start, e
+
+
+def best_of_sets(found: Iterable[Explanation]) -> dict[tuple[str, ...], Explanation]:
+    """The best explanation by each set of effects, the likeliest first."""
+    best: dict[tuple[str, ...], Explanation] = {}
+    for explanation in sorted(found, key=lambda e: -e.evidence):
+        best.setdefault(explanation.key, explanation)
+    return best
 
 
 def _spread(points: Sequence[Point]) -> Sequence[Point]:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import expit, softmax
 
 from diagnosis.evidence.hypotheses import Probabilities
-from diagnosis.imperfect.search import Explanation, Search
+from diagnosis.imperfect.search import Explanation, Search, best_of_sets
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
@@ -121,11 +121,7 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
 def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
     """The sets that take part, best first."""
     model_error = search.case.machine.weighing.model_error
-    best: dict[tuple[str, ...], Explanation] = {}
-    for explanation in search.found:
-        known = best.get(explanation.key)
-        if known is None or explanation.evidence > known.evidence:
-            best[explanation.key] = explanation
+    best = best_of_sets(search.found)
     score = {
         key: score_of(explanation, listed, model_error)
         for key, explanation in best.items()
@@ -163,13 +159,10 @@ def _judged(
             for k, name in enumerate(reduced.names)
         }
         within = [
-            _part(search, reduced, name, rest or search.base, model_error, listed)
+            _part(search, reduced, name, rest or search.base, parts.get(name), listed)
             for name, rest in rests.items()
         ]
-        for part in within:
-            share = max(part.share, parts[part.name].share if part.name in parts else 0.0)
-            matters = max(part.matters, _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH))
-            parts[part.name] = Part(part.name, share, matters)
+        parts |= {part.name: part for part in within}
         least = min(within, key=lambda part: (part.matters, part.share))
         smaller = rests[least.name]
         if least.matters >= 0.5 or smaller is None:
@@ -197,13 +190,15 @@ def _part(
     explanation: Explanation,
     name: str,
     rest: Explanation,
-    model_error: float,
+    seen: Part | None,
     listed: Sequence[str],
 ) -> Part:
-    """What an effect carries within a set; rest: the set without it."""
+    """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
+    set without it."""
     carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
-    share = float(np.sqrt(np.prod(np.max(carried, axis=1))))
-    matters = _soft(share / (_INTERESTS * model_error), _INTERESTS_WIDTH)
+    share = max(float(np.sqrt(np.prod(np.max(carried, axis=1)))), seen.share if seen else 0.0)
+    limit = _INTERESTS * search.case.machine.weighing.model_error
+    matters = _soft(share / limit, _INTERESTS_WIDTH)
     off = _tolerances_off(search, explanation, explanation.names.index(name))
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances.
