@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import butter, filtfilt
 
-from benchmarks.own_plant import MODEL_ERROR, SHARE, Real, given, lagged, late_value
+from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
 
@@ -238,7 +238,6 @@ def case(
         ("force_N",),
         np.array([noise]),
         effects(simulated == "loop", refined),
-        model_error=MODEL_ERROR,
     )
 
     def experiment(role: Role, piece: slice) -> PlantExperiment:

@@ -15,8 +15,6 @@ Real = npt.NDArray[np.float64]
 
 # Coulomb friction as a share of the static one.
 SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear")
-# Share of the motion that the simulation of a real machine may miss: below that nothing interests.
-MODEL_ERROR = 0.05
 
 
 def given(effects: Mapping[str, Mapping[str, float]]) -> Callable[..., float]:

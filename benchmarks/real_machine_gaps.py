@@ -2,8 +2,8 @@
 
     FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.real_machine_gaps
 
-Per machine: noise from repeats of one motion; below 5 % of the motion nothing interests, for every one. Gaps
-are the pooled RMS of (measured - model)/noise on held-out records. "closed" is relative to the model as
+Per machine: noise from repeats of one motion, and nothing else set (no model error is stated). Gaps are the
+pooled RMS of (measured - model)/noise on held-out records. "closed" is relative to the model as
 stated with its values moved.
 """
 
@@ -24,7 +24,7 @@ def tell(out: Print, found: Diagnosis) -> None:
         f"{name} {value:.3g}" for name, value in zip(plant.output_names, plant.noise, strict=True)
     )
     out(
-        f"  noise {noise}; below {100 * plant.model_error:.0f} % of the motion nothing interests. "
+        f"  noise {noise}; below {100 * found.case.model_error:.0f} % of the motion nothing is named. "
         f"Verdict {found.verdict} ({found.detail_verdict}): {_names(found.combination)}"
     )
     sets = sorted(found.sets.items(), key=lambda item: -item[1])[:4]

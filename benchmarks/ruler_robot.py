@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from scipy.optimize import least_squares
 
-from benchmarks.own_plant import MODEL_ERROR, SHARE, Real, given, held_input, lagged, late_value
+from benchmarks.own_plant import SHARE, Real, given, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
 
@@ -180,7 +180,6 @@ def case(folder: Path, fitted: tuple[int, ...] = (50, 75), judged: tuple[int, ..
         ("theta_counts",),
         np.array([noise]),
         effects(),
-        model_error=MODEL_ERROR,
     )
     roles: tuple[tuple[Role, int, tuple[int, ...]], ...] = (
         ("estimation", 1, fitted),

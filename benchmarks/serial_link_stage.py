@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import lfilter
 
-from benchmarks.own_plant import MODEL_ERROR, SHARE, Real, given, held_input, lagged, late_value
+from benchmarks.own_plant import SHARE, Real, given, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 
 DT_S, PERIOD, SUBSTEPS = 0.002, 5000, 2
@@ -226,7 +226,6 @@ def case(folder: Path, stage: int) -> PlantCase:
         ("theta_rad", "alpha_rad"),
         noise,
         effects(),
-        model_error=MODEL_ERROR,
     )
     return PlantCase(
         f"Quanser serial flexible link, stage {stage}",

@@ -26,9 +26,10 @@ from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.intervals import parameter_intervals
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.imperfect.answered import beside_imperfections
+from diagnosis.imperfect.answered import beside_imperfections, reaches_noise, searched
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
+from diagnosis.machine.own_plant import PlantCase
 from diagnosis.machine.rounding import Rounding, leads_over, rounding_effect
 from diagnosis.next_experiment.discrimination import (
     CompetingHypothesis,
@@ -57,13 +58,25 @@ def diagnose(
 
     case : A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
     progress : Called with the share done (0 to 1) and what is being done.
-    time_limit_s : After it nothing more is tried, and the answer says what was not; only of a machine that
-        states a model error.
+    time_limit_s : After it nothing more is tried, and the answer says what was not; only
+        beside a model error.
     rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
     """
     rng = np.random.default_rng(0) if rng is None else rng
-    if case.machine.weighing.model_error > 0:
-        return beside_imperfections(case, progress or (lambda fraction, message: None), rng, time_limit_s)
+    progress = progress or (lambda fraction, message: None)
+    weighing = case.machine.weighing
+    if not weighing.model_error > 0:
+        return _without_error(case, progress, rng)
+    found = searched(case, progress, time_limit_s)
+    if not weighing.stated and isinstance(case, PlantCase) and not found.left_out and reaches_noise(found):
+        exact = _without_error(case.without_model_error(), progress, rng)
+        if exact.verdict != "unknown":
+            return exact
+    return beside_imperfections(found, rng)
+
+
+def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:
+    """Of a machine whose simulation, with the right effects, is as good as the sensors."""
     found = search(case, progress)
     model = ResidualModel(case)
     every: Sequence[Hypothesis]

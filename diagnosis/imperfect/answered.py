@@ -33,17 +33,32 @@ from diagnosis.next_experiment.discrimination import CompetingHypothesis, fitted
 _DRAWS, _MOST_COMPETING = 1000, 3
 # Small effects stay in the repaired model from this share of the model error on.
 _LEAST_KEPT = 0.3
+# RMS in noise deviations: what a simulation without error leaves, and a little that the search has not found.
+_NEAR_NOISE = 2.0
 
 
-def beside_imperfections(
-    case: CaseOfMachine, progress: Progress, rng: np.random.Generator, time_limit_s: float = np.inf
-) -> Diagnosis:
-    """Diagnose a case whose machine states a model error; what a time limit leaves out is said."""
+def searched(case: CaseOfMachine, progress: Progress, time_limit_s: float = np.inf) -> Search:
+    """Everything fitted that a diagnosis beside a model error weighs."""
     search = Search(case, progress, time.monotonic() + time_limit_s)
     search.run()
+    return search
+
+
+def reaches_noise(search: Search) -> bool:
+    """Whether some set leaves little beyond the noise of any output and record: it may be exact."""
+    return any(
+        max(np.sqrt(np.mean(part**2, axis=0)).max() for part in _whitened(search.case, e).values())
+        < _NEAR_NOISE
+        for e in search.found
+    )
+
+
+def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
+    """The answer of a search beside a model error; what a time limit left out is said."""
+    case = search.case
     listed = case.machine.weighing.listed
     found = judging.judged(search, listed)
-    progress(1.0, "done")
+    search.progress(1.0, "done")
     refit = search.base
     accepted = refit
     if found.accepted:

@@ -106,9 +106,9 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
             search.simpler(one)
         if len(search.found) == known:
             break
-    probabilities = _probabilities(
-        sets, listed, _enough(search.base, search.case.machine.weighing.model_error)
-    )
+    weighing = search.case.machine.weighing
+    none_enough = _enough(search.base, weighing.model_error) if weighing.stated else 0.0
+    probabilities = _probabilities(sets, listed, none_enough)
     answer = probabilities.answer
     if answer in ("none", "unknown"):
         return Verdict(probabilities, sets, answer, ())
@@ -248,7 +248,8 @@ def _soft(ratio: float, width: float) -> float:
 
 def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: float) -> Probabilities:
     """Every set shared out: unknown where it is not complete, else those of its effects that matter; none of
-    them only as far as the nominal alone leaves no more than imperfections (none_enough)."""
+    them only as far as the nominal alone leaves no more than imperfections, which do not interest
+    (none_enough)."""
     weights = softmax([s.score for s in sets])
     shared: dict[tuple[str, ...], float] = {}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
@@ -263,10 +264,11 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
                 share = weight * one.complete
                 for part in one.parts:
                     share *= part.matters if part in chosen else 1 - part.matters
-                if one.parts and not chosen:
-                    shared[("unknown",)] += share * (1 - none_enough)
-                    cause["unknown"] += share * (1 - none_enough)
-                    share *= none_enough
+                if not chosen:
+                    enough = none_enough / (1.0 if one.parts else one.complete)
+                    shared[("unknown",)] += share * (1 - enough)
+                    cause["unknown"] += share * (1 - enough)
+                    share *= enough
                 names = tuple(sorted(part.name for part in chosen))
                 shared[names] = shared.get(names, 0.0) + share
                 lead = max(chosen, key=lambda part: part.share).name if chosen else "none"

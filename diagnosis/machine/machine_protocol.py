@@ -32,11 +32,14 @@ class Weighing:
     model_error : float. Share of the motion (RMS of an output about its mean) that a good model may miss;
         zero where the simulation is as good as the sensors.
     most_effects : int. Beside a model error, effects that are looked for together.
+    stated : bool. Somebody has said that the model error does not interest; else it is what is usual, and
+        what no effect explains is an unknown cause however small.
     """
 
     listed: tuple[str, ...] = tuple(EFFECTS)
     model_error: float = 0.0
     most_effects: int = 3
+    stated: bool = True
 
 
 @dataclass(frozen=True, eq=False)

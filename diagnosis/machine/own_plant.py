@@ -40,6 +40,8 @@ Simulate = Callable[..., Real]
 
 # Of a machine of which nothing else is known; searched as long as something of interest is left.
 _MOST_EFFECTS = 5
+# What a good model of a real machine may miss of its motion, where nobody has stated it.
+_USUAL_MODEL_ERROR = 0.05
 # In noise deviations: beyond any record, and its square is still a number.
 _RUNAWAY = 1e12
 # What a simulation may raise where a trial runs away; any other error is one of the simulation.
@@ -62,9 +64,10 @@ class Plant:
     output_names : (Y,)
     noise : (Y,). Noise standard deviations, from repeats of an experiment where there are any.
     effects : tuple of PlantEffect
-    model_error : float. Share of the motion (RMS of an output about its mean) that the simulation may miss
-        even with the right effects. No simulation of a real machine reaches its noise; with zero here what is
-        left over makes the answer "unknown".
+    model_error : float or None. Share of the motion (RMS of an output about its mean) that the simulation may
+        miss even with the right effects: no simulation of a real machine reaches its noise, and with zero
+        here what is left over makes the answer "unknown". None: zero where the simulation with the right
+        effects does reach the noise, else 0.05; a smaller gap that no effect explains is then "unknown".
     dt_s : float. Sampling period, for pages; `with_effects` states it.
     start : name -> standard deviation (around zero) of a state at the start of a record that nobody knows
         Beside a model error it is fitted for every record; the simulation takes the states (name -> value) as
@@ -77,7 +80,7 @@ class Plant:
     output_names: tuple[str, ...]
     noise: Real
     effects: tuple[PlantEffect, ...] = ()
-    model_error: float = 0.0
+    model_error: float | None = None
     dt_s: float = float("nan")
     start: Mapping[str, float] = field(default_factory=dict)
 
@@ -96,7 +99,7 @@ class Plant:
             raise ValueError(
                 f"plant: needs one noise level above zero per output ({count}); got {self.noise}"
             )
-        if not self.model_error >= 0:
+        if self.model_error is not None and not self.model_error >= 0:
             raise ValueError(f"plant: model_error must not be negative; got {self.model_error}")
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
@@ -115,7 +118,9 @@ class Plant:
 
     @cached_property
     def weighing(self) -> Weighing:
-        return Weighing(tuple(kind.id for kind in self.missing), float(self.model_error), _MOST_EFFECTS)
+        stated = self.model_error is not None
+        model_error = _USUAL_MODEL_ERROR if self.model_error is None else float(self.model_error)
+        return Weighing(tuple(kind.id for kind in self.missing), model_error, _MOST_EFFECTS, stated)
 
     @property
     def description(self) -> Plant:
@@ -134,7 +139,7 @@ class Plant:
     def unknown_start(self) -> UnknownStart:
         """Of the states that are named as such, beside a model error."""
         known = replace(KNOWN_START, zero_outputs=np.zeros((0, self.noise.size)))
-        if not (self.start and self.model_error > 0):
+        if not (self.start and self.weighing.model_error > 0):
             return known
         states = len(self.start)
         return replace(
@@ -268,9 +273,13 @@ class PlantCase(RecordedCase[PlantExperiment]):
     def outputs(self) -> tuple[str, ...]:
         return self.plant.output_names
 
+    def without_model_error(self) -> PlantCase:
+        """The same with a simulation that is stated to be as good as the sensors."""
+        return replace(self, plant=replace(self.plant, model_error=0.0))
+
     @property
     def model_error(self) -> float:
-        return self.plant.model_error
+        return self.plant.weighing.model_error
 
     @property
     def dt_s(self) -> float:

@@ -94,6 +94,27 @@ def test_a_stated_model_error_is_no_unknown_cause():
     assert (found.verdict, found.combination) == ("none", ())
 
 
+@pytest.mark.parametrize(
+    ("cubic_N_m3", "tone_N", "stated", "verdict"),
+    [
+        # The simulation can be exact: less than 5 % of the motion is named all the same.
+        (150.0, 0.0, None, "effect"),
+        (150.0, 0.0, 0.05, "none"),
+        # Something small is always missing: that must not hide what is large.
+        (4e3, 0.6, None, "effect"),
+        (4e3, 0.6, 0.0, "unknown"),
+    ],
+)
+def test_without_a_stated_model_error_the_records_say_whether_there_is_one(
+    cubic_N_m3, tone_N, stated, verdict
+):
+    def acceleration(t, x, v, f):
+        return (f - 80.0 * x - 3.0 * v - cubic_N_m3 * x**3 + tone_N * np.sin(25 * t)) / 2.0
+
+    found = diagnose(_case(acceleration, model_error=stated))
+    assert (found.verdict, found.combination) == (verdict, ("stiffening",) * (verdict == "effect"))
+
+
 def test_the_example_runs_and_finds_what_it_lacks(capsys):
     own_plant.main()
     said = capsys.readouterr().out

@@ -53,9 +53,11 @@ def score_folders(labelled: Path, found: Path, *, partial: bool = False) -> dict
     }
     if not answers:
         raise InputError(f"{labelled}: no labelled case is there; expected <case>/answer.toml")
-    documents = {}
+    documents, timings = {}, dict[str, Any]()
     for path in sorted(found.rglob("*.json")):
         document = json.loads(path.read_text("utf-8"))
+        if path.name == "timings.json":  # of the same directory
+            timings |= document
         if isinstance(document, dict) and document.get("format") == FORMAT:
             documents[str(document["case"])] = document
     strange = sorted(documents.keys() - answers.keys())
@@ -64,7 +66,7 @@ def score_folders(labelled: Path, found: Path, *, partial: bool = False) -> dict
     if not documents:
         raise InputError(f"{found}: no diagnosis is there; expected the --out of flexlink diagnose")
     names = [name for name in answers if name in documents or not partial]
-    said = [documents.get(name) or failed(name, "no diagnosis") for name in names]
+    said = [(documents.get(name) or failed(name, "no diagnosis")) | timings.get(name, {}) for name in names]
     return scores(said, [answers[name] for name in names], FAMILIES)
 
 
