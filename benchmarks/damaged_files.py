@@ -17,8 +17,7 @@ import pytest
 from benchmarks.harness import Print, main
 from tests.ident import test_hostile_logs as logs
 from tests.ident.mutations import Tally
-from tests.workflow import test_hostile_models as models
-from tests.workflow import test_nothing_breaks_it as texts
+from tests.workflow import test_hostile_models as models, test_nothing_breaks_it as texts
 from tests.workflow.command import FAST_ARM, draw_nothing
 from workflow.commands.run import run_from_files
 

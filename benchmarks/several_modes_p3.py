@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmarks.harness import Print, main, timed
 from ident import IdentOptions, identify
-from tests.ident.benchmark_plants import P3_MODES, max_length_sequence, p3
-from tests.ident.benchmark_plants import run as simulated
+from tests.ident.benchmark_plants import P3_MODES, max_length_sequence, p3, run as simulated
 
 
 def run(out: Print, *, seeds: int = 8) -> None:

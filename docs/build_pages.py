@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
@@ -162,9 +163,9 @@ def python() -> str:
         "# Python",
         "What `import flexlink` offers. A walk through it: [flexlink from Python](../from_python.md).",
     ]
-    for module, names in flexlink._MODULES.items():
+    for module in ("models", "design", "machines", "causes", "pictures", "tables"):
         parts.append(f"## {module}")
-        for name in sorted(names):
+        for name in sorted(import_module(f"flexlink.{module}").__all__):
             thing = getattr(flexlink, name)
             try:
                 signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))

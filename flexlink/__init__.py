@@ -19,60 +19,9 @@ Tables      `table`
 `LoopRun`, `Simulation` and `SynthesisResult` are what `simulate_loop`, `simulate` and `synthesise` return.
 """
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
 from flexlink.own_packages import find_own_first
 
-if TYPE_CHECKING:
-    from flexlink.causes import *
-    from flexlink.design import *
-    from flexlink.machines import *
-    from flexlink.models import *
-    from flexlink.pictures import *
-    from flexlink.tables import *
-
-_MODULES = {
-    "models": (
-        "EmbeddingOptions", "FrequencyUncertainty", "FrfRepeats", "GobfModel", "IdentOptions",
-        "Identification", "Poles", "Record", "Uncertainty", "band_limited", "empirical_frf", "identify",
-        "identify_frf", "identify_miso", "pole_intervals", "uncertainty",
-    ),
-    "design": (
-        "Certificate", "Controller", "LoopRun", "RationalWeight", "Specification", "SynthesisOptions",
-        "SynthesisResult", "UncertainPlant", "c_source", "certify", "simulate_loop", "step_metrics",
-        "synthesise",
-    ),
-    "machines": (
-        "Rig", "SampledArm", "Simulation", "effect", "multisine", "paper_link", "prbs", "simulate",
-    ),
-    "causes": (
-        "Case", "Diagnosis", "Experiment", "diagnose",
-    ),
-    "pictures": (
-        "bode", "compare", "plot",
-    ),
-    "tables": (
-        "table",
-    ),
-}  # fmt: skip
-_WHERE = {name: module for module, names in _MODULES.items() for name in names}
-
-__all__ = sorted(_WHERE)
-
 find_own_first()
-
-
-def __getattr__(name: str) -> Any:
-    """PEP 562: the module behind a name is imported when the name is first asked for."""
-    if name not in _WHERE:
-        raise AttributeError(f"module 'flexlink' has no attribute {name!r}")
-    value = getattr(import_module(f"flexlink.{_WHERE[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from diagnosis import answer
-from diagnosis import diagnosis as chain
+from diagnosis import answer, diagnosis as chain
 from diagnosis.machine.case import Case, Experiment
 from flexlink.shown import Shown, dressed
 

@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 
 from control_design.analysis.between_grid_points import AllFrequencies, Obstacle, bound_all_frequencies
-from control_design.analysis.joint_coverage import JointCoverage, at_level
-from control_design.analysis.joint_coverage import joint_coverage as calibrate
+from control_design.analysis.joint_coverage import JointCoverage, at_level, joint_coverage as calibrate
 from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
 from control_design.analysis.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
 from control_design.analysis.worst_case import worst_case

@@ -13,8 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy.stats import chi2, f as fisher
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real

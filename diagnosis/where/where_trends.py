@@ -7,8 +7,7 @@ from itertools import permutations, product
 from operator import itemgetter
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import t as student
+from scipy.stats import chi2, t as student
 
 from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.case import Case, Experiment

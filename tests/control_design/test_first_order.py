@@ -5,8 +5,7 @@ from __future__ import annotations
 import control
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from control_design import Channel, LoopFunction, RationalWeight, Specification, UncertainPlant
 from control_design.plants.first_order import FirstOrder, Intervals

@@ -8,8 +8,7 @@ import control
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ident import GobfModel, Poles
 from ident.basis.model_files import FORMAT, ModelFile

@@ -4,8 +4,7 @@ import typing
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.signal import lfilter
 
 from ident.basis.coordinates import search_space

@@ -29,8 +29,7 @@ from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks import closed_loop as closed_loop_stage
-from workflow.tasks import uncertainty as uncertainty_stage
+from workflow.tasks import closed_loop as closed_loop_stage, uncertainty as uncertainty_stage
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.loop_conditions import condition_run
 from workflow.tasks.results import (

@@ -29,8 +29,7 @@ from workflow.text.formats import (
     signed,
     yes_no,
 )
-from workflow.text.templates import environment as shared
-from workflow.text.templates import render_text
+from workflow.text.templates import environment as shared, render_text
 
 
 @pytest.mark.parametrize(

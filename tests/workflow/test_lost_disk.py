@@ -225,8 +225,7 @@ def test_from_another_folder(fast_run, tmp_path, monkeypatch, flexlink, refused)
 
 def test_files_are_found_again_from_another_folder(tmp_path, monkeypatch):
     """Logs of a configuration are named from its own folder, whatever folder it is called from."""
-    from tests.workflow.test_cli import good_table
-    from tests.workflow.test_cli import write_case as write_own
+    from tests.workflow.test_cli import good_table, write_case as write_own
     from workflow.config.run_config import load_config
 
     (tmp_path / "a").mkdir()

@@ -10,8 +10,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from dataclasses import replace as with_fields
+from dataclasses import dataclass, replace as with_fields
 from functools import partial
 from pathlib import Path
 
@@ -30,8 +29,7 @@ from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.diagnosis_examples import write_case
 from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY
-from tests.workflow.test_cli import good_table
-from tests.workflow.test_cli import write_case as write_own
+from tests.workflow.test_cli import good_table, write_case as write_own
 from tests.workflow.test_design_sources import (
     QUICK,
     WISH,

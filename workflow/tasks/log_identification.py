@@ -24,8 +24,8 @@ from ident.friction import (
     fit_friction,
     refuse_unrecorded,
     refuse_unseen_shaft,
+    without_friction as behind_friction,
 )
-from ident.friction import without_friction as behind_friction
 from ident.identification import Identification
 from ident.uncertainty import ResponsePosterior
 from ident.uncertainty.embedding import tangent

@@ -20,8 +20,7 @@ from control_design.controllers.controller import Controller
 from control_design.controllers.feedforward import FrictionFeedforward
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
-from control_design.plants.plant_set import Channel as PlantChannel
-from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.plant_set import Channel as PlantChannel, UncertainPlant
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
