@@ -15,17 +15,17 @@ from workflow.figures.registry import drawing
 
 @drawing("gap_next")
 def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequence[str]) -> Figure:
-    """Voltage, and difference (T, Y) of the two likeliest answers in noise deviations, hub before tip."""
+    """Voltage, and difference (T, Y) of the two likeliest answers in standard deviations, hub before tip."""
     time_s = np.arange(proposal.voltage_V.size, dtype=np.float64) * proposal.dt_s
     figure, (above, below) = style.panels(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
     above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
     above.set(ylabel="voltage [V]", title="Proposed experiment")
-    below.axhspan(-2, 2, **gap_style.NOISE_BAND)
+    below.axhspan(-2, 2, **{**gap_style.NOISE_BAND, "label": "2 standard deviations"})
     for signal, (words, _, colour) in zip(difference.T, gap_style.OUTPUTS.values(), strict=False):
         below.plot(*outline(time_s, signal), color=colour, lw=1.0, label=words)
     title = f"{style.plain(names[0], 48)} minus {style.plain(names[1], 48)}"
     below.set_title(title, fontweight="normal", fontsize=9.5)
-    below.set(xlabel="time [s]", ylabel="difference\nover noise [1]")
+    below.set(xlabel="time [s]", ylabel="difference over\nstandard deviation [1]")
     below.margins(x=0.01)
     return figure
 
