@@ -102,8 +102,10 @@ class Sensors(_Checked):
 class Sampling(_Checked):
     """Sampling of inputs (held) and outputs."""
 
-    dt_s: Positive = Field(le=10, description="sampling period; the voltage is held over it")
-    transport_delay_s: NotNegative = Field(0.0, description="from the logged voltage to the motor's")
+    dt_s: float = Field(gt=0, le=10, description="sampling period; the voltage is held over it")
+    transport_delay_s: float = Field(
+        0.0, ge=0, le=60, description="from the logged voltage to the motor's; every sample of it is stored"
+    )
 
 
 class Rig(_Checked):

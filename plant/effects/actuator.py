@@ -21,7 +21,7 @@ class InputDelay(Effect):
     adds_to = "sampling.transport_delay_s"
     sought = Sought((2e-4, 100), (0.04, 30, 14), "dt_s")
 
-    delay_s: NotNegative = Field(le=60.0, description="delay of the voltage; every sample of it is stored")
+    delay_s: float = Field(ge=0, le=60.0, description="delay of the voltage; every sample of it is stored")
 
     def modify(self, machine: Machine) -> Machine:
         return with_voltage(machine, delay_s=machine.voltage.delay_s + self.delay_s)

@@ -56,6 +56,12 @@ def test_the_recorded_rigs_are_read(gap_cases):
             "dt_s = 0.005\n[tolerances]\n'hub.inertia_kg_m2' = 0.0",
             "tolerances.hub.inertia_kg_m2: expected greater than 0, got 0.0",
         ),
+        ("dt_s = 0.005", "dt_s = 5000.0", "sampling.dt_s: expected less than or equal to 10, got 5000.0"),
+        (
+            "dt_s = 0.005",
+            "dt_s = 0.005\ntransport_delay_s = 1e6",
+            "sampling.transport_delay_s: expected less than or equal to 60, got 1000000.0",
+        ),
         ("length_m = 1.0", "length_m = = 1.0", "not valid TOML: Invalid value (at line 4, column 12)"),
     ],
 )
