@@ -6,10 +6,12 @@ import math
 import os
 import re
 import shutil
+import signal
 import sys
 import tomllib
 from contextlib import closing
 from dataclasses import replace
+from multiprocessing import forkserver
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -262,6 +264,26 @@ def test_a_task_that_kills_its_process_fails_alone():
     assert found[1].reason == "the process computing it died 3 times (out of memory?)"
     for index in (0, 2, 3):
         assert "code of the worker" in found[index].reason
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked off another one on Linux only")
+def test_the_process_that_others_are_forked_off_may_die_too(monkeypatch):
+    """A task, another one when that process has just been killed, and one whose start meets a dead one."""
+    task = Task((NO_POINT,), {}, ("design",), "0" * 64)
+    with closing(LocalProcesses(1, preload=["workflow.study.task"])) as processes:
+        found = processes.run([task] * 3)
+        assert "code of the worker" in next(found)[1].reason
+        os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)
+        assert "code of the worker" in next(found)[1].reason
+        ensure_running = forkserver._forkserver.ensure_running
+
+        def dead_at_once() -> None:
+            ensure_running()
+            os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)
+            monkeypatch.undo()
+
+        monkeypatch.setattr(forkserver._forkserver, "ensure_running", dead_at_once)
+        assert "code of the worker" in next(found)[1].reason
 
 
 SEARCH = (

@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -137,7 +138,7 @@ class LocalProcesses:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, task), daemon=True)
         with one_thread_each():
-            process.start()
+            _begin(process)
         theirs.close()
         self._running[ours] = (index, process)
 
@@ -148,6 +149,16 @@ class LocalProcesses:
             process.join()
             connection.close()
         self._running.clear()
+
+
+def _begin(process: BaseProcess) -> None:
+    """Start it, where the process that all are forked off dies meanwhile off a new one. Raises StageError."""
+    for _ in range(MOST_ATTEMPTS):
+        try:
+            return process.start()
+        except (EOFError, ConnectionError):
+            time.sleep(0.5)  # until the dead one is known to be dead
+    raise StageError("no process can be begun: the one they are forked off dies each time (out of memory?)")
 
 
 def _work(connection: Connection, task: Task[Any]) -> None:
