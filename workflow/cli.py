@@ -41,7 +41,6 @@ from workflow.engine.errors import (
 from workflow.engine.threads import one_thread
 
 if TYPE_CHECKING:
-    from control_design.controllers.c_code import Dialect
     from workflow.tasks.summary import RunSummary
 
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json")  # of what can be continued
@@ -67,10 +66,17 @@ Resume = Annotated[
 Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
 CPrefix = Annotated[
-    str, typer.Option("--c-prefix", help="What names in the C code begin with: PREFIX_step, PREFIX_state.")
+    str | None,
+    typer.Option(
+        "--c-prefix",
+        help="What names in the C code begin with: PREFIX_step, PREFIX_state; controller if left out.",
+    ),
 ]
 CFloat = Annotated[
-    bool, typer.Option("--c-float", help="C code in float instead of double; fixed point is left out.")
+    bool | None,
+    typer.Option(
+        "--c-float/--c-double", help="Numbers of the C code; double if left out. Fixed point is not offered."
+    ),
 ]
 
 
@@ -108,8 +114,8 @@ def run(
     ] = None,
     resume: Resume = False,
     replace: Replace = False,
-    c_prefix: CPrefix = "controller",
-    c_float: CFloat = False,
+    c_prefix: CPrefix = None,
+    c_float: CFloat = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -125,7 +131,7 @@ def run(
             out,
             resume=resume,
             replace=replace,
-            dialect=_dialect(c_prefix, c_float),
+            c_code=_c_code(c_prefix, c_float),
             progress=progress,
         )
     _show(summary, as_json)
@@ -412,8 +418,8 @@ def design(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
-    c_prefix: CPrefix = "controller",
-    c_float: CFloat = False,
+    c_prefix: CPrefix = None,
+    c_float: CFloat = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -422,6 +428,7 @@ def design(
     from workflow.console import TerminalProgress
 
     with TerminalProgress(quiet=quiet) as progress:
+        from control_design.controllers.c_code import Dialect
         from workflow.commands.design import design_controller
 
         summary = design_controller(
@@ -429,7 +436,7 @@ def design(
             specification,
             out=out,
             seed=seed,
-            dialect=_dialect(c_prefix, c_float),
+            dialect=Dialect(**_c_code(c_prefix, c_float)),
             progress=progress,
         )
     _show(summary, as_json)
@@ -569,12 +576,17 @@ def diagnose(
         raise typer.Exit(found.exit_code)
 
 
-def _dialect(prefix: str, single: bool) -> Dialect:
+def _c_code(prefix: str | None, single: bool | None) -> dict[str, Any]:
+    """The fields of a `Dialect` that are stated."""
     from control_design.controllers.c_code import Dialect
     from workflow.engine.errors import naming
 
+    number = None if single is None else "float" if single else "double"
+    stated = {"prefix": prefix, "number": number}
+    found: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
     with naming("--c-prefix"):
-        return Dialect(prefix, "float" if single else "double")
+        Dialect(**found)
+    return found
 
 
 def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:
@@ -653,7 +665,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         # typer turns Ctrl-C into a silent exit of this code.
         return _interrupted(arguments) if code == EXIT_INTERRUPTED else code
-    except (KeyboardInterrupt, typer.Abort):
+    except KeyboardInterrupt:
         return _interrupted(arguments)
     except CommandInterruptedError as error:
         return _interrupted(arguments, error.out)
@@ -725,7 +737,8 @@ def _explain(error: Exception) -> tuple[str, int]:
         return what + describe_os_error(error), EXIT_BAD_INPUT
     if isinstance(error, MemoryError):
         return f"out of memory ({error}); shorter records, delays and searches need less", EXIT_INTERNAL
-    return f"internal error: {type(error).__name__}: {error} (--debug shows where)", EXIT_INTERNAL
+    cause = error.__cause__ if isinstance(error, typer.Abort) else error  # what typer makes of an EOFError
+    return f"internal error: {type(cause).__name__}: {cause} (--debug shows where)", EXIT_INTERNAL
 
 
 def _complain(message: str, code: int) -> int:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from workflow.config.run_config import built_in_config, load_config
 from workflow.engine.errors import InputError
@@ -14,7 +14,6 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
 
 if TYPE_CHECKING:
-    from control_design.controllers.c_code import Dialect
     from workflow.tasks.summary import RunSummary
 
 
@@ -24,14 +23,13 @@ def run_from_files(
     *,
     resume: bool = False,
     replace: bool = False,
-    dialect: Dialect | None = None,
+    c_code: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Load a configuration and run it; see `run_pipeline`.
 
     Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
-    without `out` a new directory below runs/ is made. `dialect` says how controller.c is written. Raises
-    InputError.
+    without `out` a new directory below runs/ is made. Raises InputError.
     """
     if (resume or replace) and out is None:
         raise InputError(
@@ -59,7 +57,7 @@ def run_from_files(
         page=REPORT,
         resume=resume,
         replace=replace,
-        dialect=dialect,
+        c_code=c_code,
         progress=progress,
     )
 

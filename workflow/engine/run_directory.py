@@ -60,6 +60,7 @@ class _Manifest(BaseModel):
     config_sha256: str
     inputs: dict[str, str]
     stages: dict[str, _StageEntry]
+    c_code: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -244,9 +245,9 @@ class RunDirectory(Store):
         }
         storage.write_json(self.manifest_path, manifest)
 
-    def record_status(self, status: str) -> None:
-        """`running`, `complete`, `complete, not certified` or `failed: <one line>`."""
-        manifest = self.manifest()
+    def record_status(self, status: str, **more: Any) -> None:
+        """`running`, `complete`, `complete, not certified` or `failed: <one line>`; `more` beside it."""
+        manifest = self.manifest() | more
         manifest["status"] = status
         manifest["updated"] = _now()
         storage.write_json(self.manifest_path, manifest)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -13,7 +15,7 @@ from control_design.controllers.c_code import Dialect
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
-from workflow.engine.errors import CommandInterruptedError, InputError, one_line
+from workflow.engine.errors import CommandInterruptedError, InputError, naming, one_line
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.controller_files import write_controller
@@ -33,15 +35,16 @@ def run_pipeline(
     resume: bool = False,
     replace: bool = False,
     page: Stage | None = None,
-    dialect: Dialect | None = None,
+    c_code: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
     `config_text` is kept as config.toml (the file as the user wrote it; `called` in complaints); `resume`
     takes up a run that is there, `replace` starts it afresh; `page` is the stage that comes last and writes
-    the page; `dialect` says how controller.c is written. A result that is not certified is no error: the page
-    is written all the same and `RunSummary.certified` says so.
+    the page; `c_code` are the fields of `Dialect` that are stated, kept with the run for when it is taken up.
+    A result that is not certified is no error: the page is written all the same and `RunSummary.certified`
+    says so.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -70,7 +73,8 @@ def run_pipeline(
             resume=resume,
             replace=replace,
         )
-        run.record_status("running")
+        dialect = _dialect(run, c_code or {})
+        run.record_status("running", c_code=asdict(dialect))
         stages = STAGES if page is None else (*STAGES, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
         try:
@@ -160,7 +164,15 @@ def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs:
     )
 
 
-def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect | None) -> None:
+def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
+    """How its C code is written: as stated now, or else before. Raises InputError."""
+    kept = run.manifest().get("c_code", {})
+    with naming(str(run.manifest_path)):
+        before = replace(Dialect(), **{name: kept[name] for name in ("prefix", "number") if name in kept})
+    return replace(before, **stated)
+
+
+def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect) -> None:
     """controller.json, .c and .h in the run directory; none of an earlier design stay."""
     design, certify = results.design, results.certify
     written: list[Path] = []
