@@ -2,15 +2,17 @@
 ends with the same bytes.
 
 A chain is one command stopped several times at random moments and continued each time, then left to finish.
-After a kill (SIGKILL, by turns of the command alone and of all its processes) it is called again with
---resume; after an interrupt (SIGINT and SIGHUP reach all processes of a terminal, SIGTERM the command) as the
-line on standard error says. Moments are drawn in CPU seconds of the command and its processes, so that they
-fall everywhere however busy the machine is. Checked each time: exit code, the line, how long the end took, no
-process left; at the end: the same files with the same bytes as undisturbed, and no others.
+After a kill of the command, alone or with all its processes, it is called again with --resume; a kill of one
+of its processes it has to get over itself; after an interrupt, of the command or of all processes as a
+terminal does it, it is called again as the line on standard error says. Moments are drawn in CPU seconds of
+the command and its processes, so that they fall everywhere however busy the machine is. Checked each time:
+exit code, the line, how long the end took, no process left; at the end: the same files with the same bytes as
+undisturbed, and no others.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shlex
 import signal
@@ -18,10 +20,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,18 +34,46 @@ from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.study_examples import TWO_POINTS
 
 LONGEST_END_S = 2.0
-_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# Python has not reached our code yet: the signal ends it without a line (docs/limits.md).
+_BEFORE_US_S = 0.15
 # They name times and processes.
 _DIFFERS = ("manifest.json", "timings.json", "lock")
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
+class Way(NamedTuple):
+    """Of stopping: which signal, and what it reaches: "command", "all" of its processes, or "one" of them."""
+
+    number: signal.Signals
+    reach: str
+
+    def __str__(self) -> str:
+        return f"{self.number.name}, {self.reach}"
+
+
+KILLS = tuple(Way(signal.SIGKILL, reach) for reach in ("command", "all", "one"))
+INTERRUPTS = tuple(
+    Way(number, reach)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    for reach in ("command", "all")
+)
+
+
+class Stop(NamedTuple):
+    """A way, after how many CPU seconds, and which one of the processes, from 0 to 1."""
+
+    way: Way
+    moment_s: float
+    which: float
+
+
 @dataclass
 class Found:
-    """What became of the stops of one kind."""
+    """What became of the stops of one way."""
 
     stops: int = 0
     past_the_end: int = 0
+    silent: int = 0
     wall_s: list[float] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
     bad: list[str] = field(default_factory=list)
@@ -108,8 +139,16 @@ class Command:
             time.sleep(0.02)
         return self.process.poll() is None
 
-    def signal(self, number: int, *, all_of_them: bool) -> None:
-        (os.killpg if all_of_them else os.kill)(self.process.pid, number)
+    def signal(self, way: Way, which: float) -> None:
+        """Send it; to `which`, from 0 to 1, of the other processes where it is for one of them."""
+        others = sorted({int(fields[-1]) for fields in self._session()} - {self.process.pid})
+        if way.reach == "all":
+            os.killpg(self.process.pid, way.number)
+        elif way.reach == "command":
+            os.kill(self.process.pid, way.number)
+        elif others:
+            with suppress(ProcessLookupError):
+                os.kill(others[int(which * len(others))], way.number)
 
     def ended(self, seconds: float = 1800.0) -> tuple[int, str]:
         """Exit code and standard error without lines of progress."""
@@ -147,52 +186,58 @@ def chain(
     call: Sequence[str],
     out: Path,
     whole: dict[str, bytes],
-    stops: Sequence[tuple[int, float]],
-    found: Found,
+    stops: Sequence[Stop],
+    found: Mapping[Way, Found],
 ) -> None:
-    """One command stopped by these signals at these CPU seconds, then finished and compared."""
+    """One command stopped so, then finished and compared."""
     first = [*call, "--out", str(out)]
-    coming = first
-    for number, moment_s in stops:
-        at = f"{shlex.join(call[:1])} {signal.Signals(number).name} at {moment_s:.2f} s"
-        command = Command(coming)
-        if not command.wait_for_cpu(moment_s):
-            found.past_the_end += 1
-            command.ended()
+    coming, command = first, Command(first)
+    for way, moment_s, which in stops:
+        at, here = f"{call[0]} {way} at {moment_s:.2f} s", found[way]
+        if not command.wait_for_cpu(command.cpu_s() + moment_s):
+            here.past_the_end += 1
             break
-        found.stops += 1
+        here.stops += 1
         before_s, sent_s = command.cpu_s(), time.monotonic()
-        everybody = number in (signal.SIGINT, signal.SIGHUP) or (
-            number == signal.SIGKILL and found.stops % 2 == 0
-        )
-        command.signal(number, all_of_them=everybody)
+        command.signal(way, which)
+        if way.reach == "one":
+            continue
         after_s = before_s
         while command.process.poll() is None:
             after_s = max(after_s, command.cpu_s())
             time.sleep(0.01)
-        found.wall_s.append(time.monotonic() - sent_s)
-        found.cpu_s.append(after_s - before_s)
+        here.wall_s.append(time.monotonic() - sent_s)
+        here.cpu_s.append(after_s - before_s)
         code, error = command.ended()
-        if code == 0:  # all was done
-            found.past_the_end += 1
         if left := command.left(10.0):
-            found.bad.append(f"{at}: {left} processes left")
-        if number == signal.SIGKILL or code == 0:
+            here.bad.append(f"{at}: {left} processes left")
+        if here.cpu_s[-1] > LONGEST_END_S:
+            here.bad.append(f"{at}: {here.cpu_s[-1]:.1f} s of CPU until the end")
+        if code == 0:  # all was done
+            here.past_the_end += 1
             coming = [*first, "--resume"]
-            continue
-        coming, complaint = _continued(code, error, number, first, out)
-        if complaint:
-            found.bad.append(f"{at}: {complaint}")
-        if found.cpu_s[-1] > LONGEST_END_S:
-            found.bad.append(f"{at}: {found.cpu_s[-1]:.1f} s of CPU until the end")
-    code, error = Command(coming).ended()
+        elif way.number == signal.SIGKILL:
+            coming = [*first, "--resume"]
+        elif code == -way.number and moment_s < _BEFORE_US_S:
+            here.silent += 1
+        else:
+            coming, complaint = _continued(code, error, way.number, first, out)
+            if complaint:
+                here.bad.append(f"{at}: {complaint}")
+        command = Command(coming)
+    code, error = command.ended()
+    last = found[stops[-1].way]
+    told = f"{call[0]} after " + "; ".join(f"{way} at {moment_s:.2f} s" for way, moment_s, _ in stops)
     if code != 0:
-        found.bad.append(f"{call[0]} resumed after {stops}: exit {code}: {error.strip()[-300:]}")
+        last.bad.append(f"{told}: exit {code}: {error.strip()[-300:]}")
+    if left := command.left(10.0):
+        last.bad.append(f"{told}: {left} processes left")
     files = contents(out)
-    for name in sorted(whole.keys() | files.keys()):
-        if whole.get(name) != files.get(name):
-            what = "missing" if name not in files else "left over" if name not in whole else "differs"
-            found.bad.append(f"{call[0]} resumed after {stops}: {name} {what}")
+    differ = [name for name in sorted(whole.keys() | files.keys()) if whole.get(name) != files.get(name)]
+    if differ:
+        last.bad.append(
+            f"{told}: {len(differ)} files missing, left over or different: {', '.join(differ[:5])}"
+        )
 
 
 def _continued(code: int, error: str, number: int, first: Sequence[str], out: Path) -> tuple[list[str], str]:
@@ -206,10 +251,14 @@ def _continued(code: int, error: str, number: int, first: Sequence[str], out: Pa
 
 
 def random_stops(
-    rng: np.random.Generator, kinds: Sequence[int], count: int, whole_s: float
-) -> list[tuple[int, float]]:
-    """Random signals; moments up to half of what the whole takes, so that a chain gets on."""
-    return [(int(rng.choice(kinds)), float(rng.uniform(0, 0.5 * whole_s))) for _ in range(count)]
+    rng: np.random.Generator, ways: Sequence[Way], begin: int, count: int, whole_s: float
+) -> list[Stop]:
+    """The ways by turns from this one on; moments up to half of what the whole takes, so that a chain gets
+    on."""
+    return [
+        Stop(ways[(begin + k) % len(ways)], float(rng.uniform(0, 0.5 * whole_s)), float(rng.random()))
+        for k in range(count)
+    ]
 
 
 def run(
@@ -225,30 +274,32 @@ def run(
         folder = Path(name)
         known = {name: call for name, call in calls(folder).items() if name in commands}
         whole = {name: undisturbed(call, folder / f"{name}-whole") for name, call in known.items()}
-        out(
-            f"{'':22}{'stopped':>8}{'too late':>10}{'went wrong':>12}"
-            "   seconds until the end: largest wall, largest CPU, median wall"
-        )
-        bad: list[str] = []
-        for what, kinds, wanted in (
-            ("killed", [signal.SIGKILL], kills),
-            ("interrupted", list(_INTERRUPTS), interrupts),
-        ):
-            each = _shares(wanted, len(known))
-            for (name, call), count in zip(known.items(), each, strict=True):
-                found = _stopped(call, folder / f"{name}-{what}", whole[name], kinds, count, stops, seed)
-                times = (
-                    ""
-                    if not found.wall_s
-                    else (
-                        f"{max(found.wall_s):10.2f} {max(found.cpu_s):10.2f} {np.median(found.wall_s):10.2f}"
-                    )
-                )
-                counts = f"{found.stops:8d}{found.past_the_end:10d}{len(found.bad):12d}"
-                out(f"{name:<9} {what:<12}{counts}   {times}")
-                bad += found.bad
+        for name, (files, cpu_s) in whole.items():
+            out(f"{name}: {len(files)} files compared, {cpu_s:.1f} s of CPU undisturbed")
+        out(f"{'':28}{'':>8}{'before':>8}{'after':>7}{'went':>7}{'until it has ended: CPU s':>28}   wall s")
+        heads = f"{'stopped':>8}{'a word':>8}{'all':>7}{'wrong':>7}{'largest':>28}"
+        out(f"{'':28}{heads}   median, largest, above {LONGEST_END_S:g}")
+        total, bad = Found(), []
+        for ways, wanted in ((KILLS, kills), (INTERRUPTS, interrupts)):
+            for (name, call), count in zip(known.items(), _shares(wanted, len(known)), strict=True):
+                able = [way for way in ways if way.reach != "one" or name != "run"]  # which has but itself
+                place = folder / f"{name}-{able[0].number.name}"
+                for way, found in _stopped(call, place, whole[name], able, count, stops, seed).items():
+                    told(out, f"{name}, {way}", found)
+                    for each in dataclasses.fields(Found):
+                        setattr(total, each.name, getattr(total, each.name) + getattr(found, each.name))
+                    bad += found.bad
+        told(out, "all", total)
         for line in bad:
             out(line)
+
+
+def told(out: Print, what: str, found: Found) -> None:
+    counts = f"{found.stops:8d}{found.silent:8d}{found.past_the_end:7d}{len(found.bad):7d}"
+    wall = found.wall_s
+    late = sum(seconds > LONGEST_END_S for seconds in wall)
+    times = f"{max(found.cpu_s):28.2f}   {np.median(wall):.2f}, {max(wall):.2f}, {late}" if wall else ""
+    out(f"{what:<28}{counts}{times}")
 
 
 def _shares(total: int, parts: int) -> list[int]:
@@ -259,19 +310,21 @@ def _stopped(
     call: Sequence[str],
     place: Path,
     whole: tuple[dict[str, bytes], float],
-    kinds: Sequence[int],
+    ways: Sequence[Way],
     count: int,
     longest: int,
     seed: int,
-) -> Found:
+) -> dict[Way, Found]:
     """Chains until so many stops were made."""
-    found, number = Found(), 0
-    while found.stops < count and number < 10 * count:
-        rng = np.random.default_rng([seed, number, len(kinds)])
-        files, cpu_s = whole
-        stops = random_stops(rng, kinds, min(longest, count - found.stops), cpu_s)
+    found = {way: Found() for way in ways}
+    files, cpu_s = whole
+    for number in range(10 * count):
+        made = sum(one.stops for one in found.values())
+        if made >= count:
+            break
+        rng = np.random.default_rng([seed, number, len(ways)])
+        stops = random_stops(rng, ways, made, min(longest, count - made), cpu_s)
         chain(call, place.with_name(f"{place.name}-{number}"), files, stops, found)
-        number += 1
     return found
 
 

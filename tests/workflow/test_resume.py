@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.interruptions import Found, chain, contents, random_stops
+from benchmarks.interruptions import INTERRUPTS, KILLS, Found, chain, contents, random_stops
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
@@ -156,14 +156,35 @@ def test_resume_without_config_uses_the_one_in_the_directory(fast_run):
     assert run_from_files(None, fast_run[0], resume=True).numbers == fast_run[1].numbers
 
 
+def test_c_code_stays_as_it_was_asked_for(fast_run, tmp_path):
+    """Numbers and names of the C code are kept with the run, each until another one is stated."""
+    out = tmp_path / "run"
+    shutil.copytree(fast_run[0], out)
+
+    def written(**stated: str) -> str:
+        run_from_files(None, out, resume=True, c_code=stated)
+        return (out / "controller.h").read_text()
+
+    asked = written(number="float", prefix="hub")
+    assert "float hub_step(" in asked
+    assert written() == asked
+    assert "double hub_step(" in written(number="double")
+    assert "double arm_step(" in written(prefix="arm")
+    assert (written(prefix="controller"), written()) == 2 * ((fast_run[0] / "controller.h").read_text(),)
+    manifest = out / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"double"', '"half"'))
+    with pytest.raises(InputError, match=r"manifest\.json: number must be 'double' or 'float'; got 'half'"):
+        written()
+
+
 def test_stopped_again_and_again_it_ends_with_the_same_files(reference, tmp_path):
     """Kills and interrupts at random moments, continued as the line says: benchmarks/interruptions.py makes
     many, of studies and diagnoses too."""
-    found, kinds = Found(), (signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    stops = random_stops(np.random.default_rng(15), kinds, 6, whole_s=12.0)
+    found = {way: Found() for way in (*KILLS[:2], *INTERRUPTS)}
+    stops = random_stops(np.random.default_rng(15), list(found), 0, len(found), whole_s=12.0)
     chain(["run", "--config", str(FAST_ARM)], tmp_path / "run", contents(reference), stops, found)
-    assert found.bad == []
-    assert found.stops - found.past_the_end >= 4
+    assert [line for one in found.values() for line in one.bad] == []
+    assert sum(one.stops - one.past_the_end for one in found.values()) >= 6
 
 
 def test_a_run_leaves_its_controller(reference):
