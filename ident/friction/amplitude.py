@@ -295,10 +295,11 @@ def _on_poles(
     responses: ComplexArray,
     omega: RealArray,
 ) -> tuple[ResponsePosterior, RealArray]:
-    """Responses (A, K, F) as coefficients (A, K, P) on the poles of both ends of the range and those of the
-    arm, each once, and the form they stand in; taps are those of the draws (K, .) themselves."""
+    """Responses (A, K, F) as coefficients (A, K, P), and the form they stand in: on the poles of both ends of
+    the range and those of the arm as often as they stand there (what is not known of a pole lies along its
+    second); taps are those of the draws (K, .) themselves."""
     own = response.poles
-    parts = (*ends, Poles(np.unique(own.real), np.unique(own.pairs)))
+    parts = (*ends, own)
     poles = Poles(
         np.concatenate([part.real for part in parts]), np.concatenate([part.pairs for part in parts])
     )
