@@ -149,6 +149,26 @@ def test_friction_of_the_shaft_is_taken_off_the_tip_too(
     assert np.median(known.enclosing_radius()[:20]) < 0.8 * np.median(ellipses.enclosing_radius()[:20])
 
 
+def test_where_friction_acts_as_none_the_ellipses_at_an_amplitude_are_those_without_friction(
+    rubbing: tuple[float, list[Record], FrictionFit],
+) -> None:
+    """A limit, for the tip, whose model has a pair of its own beside those of the shaft's."""
+    torque_Nm, _, found = rubbing
+    tip = recorded(torque_Nm, 5, output=1)
+    three = OPTIONS.model_copy(update={"n_pairs": 3})
+    model = identify([found.taken_off(record) for record in tip], three).model
+    behind = other_output_without_friction(tip, found, model)
+    none = np.zeros((1, 4))
+    equivalent = EquivalentFriction(
+        found, np.ones(1), np.array([1.0, 300.0]), none, none, np.zeros((1, 4, 5))
+    )
+    omega = np.geomspace(1.0, 500.0, 100)
+    posterior, _ = at_amplitudes(behind, equivalent, np.random.default_rng(1))
+    ratio = posterior.at(omega).enclosing_radius() / behind.response.at(omega).enclosing_radius()
+    # 400 draws leave 1 / sqrt(800) of a standard deviation open.
+    assert np.all(np.abs(ratio - 1) < 4 / np.sqrt(800))
+
+
 def test_no_friction_is_not_significant() -> None:
     found = fit_friction(recorded(0.0, 5), OPTIONS)
     assert not found.significant
