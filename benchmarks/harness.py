@@ -105,7 +105,7 @@ def _seeds(options: Mapping[str, Any]) -> str:
 
 
 def _commit() -> str:
-    """Short hash of the checkout, with a plus where files differ from it."""
+    """Short hash of the checkout, with a plus where files differ from it, other than results."""
 
     def git(*words: str) -> str:
         return subprocess.run(
@@ -113,7 +113,8 @@ def _commit() -> str:
         ).stdout.strip()
 
     try:
-        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+        changed = git("status", "--porcelain", "-uno", "--", ":/", f":!{RESULTS}")
+        return git("rev-parse", "--short", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 
