@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 from scipy.linalg import cho_factor, cho_solve
+from scipy.signal import czt
 
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
@@ -21,6 +22,9 @@ from plant.simulation import simulate
 # Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
 # of the inverse of the largest angle for the other.
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
+# Frequencies of long records, of which there are as many as samples: how many of them are fitted, the lowest
+# in any case.
+MOST_LINES, BEST_LINES, SLOW_LINES = 6000, 1000, 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +32,7 @@ class Start:
     """A point to descend from: cost with the deviations moved along their linearisation, x (A,), d (P,).
 
     size_ratio: largest RMS, over experiments and outputs, by which the effect changes the model, over noise.
-    change: what the effect adds to the residuals (N,).
+    change: what the effect adds to the residuals (N,), or nothing where it is found anew beside others.
     """
 
     cost: float
@@ -131,6 +135,8 @@ class Screening:
         periodic = candidate.kind.harmonic == "time"
         if periodic:
             lines = np.arange(candidate.axes[1].low, min(60.0, 0.45 / dt), 0.4 / (longest * dt))
+            if len(lines) > MOST_LINES:
+                lines = self._loudest(lines, response, dt)
         else:
             lines = _CYCLES[np.greater_equal(_CYCLES, candidate.axes[1].low)]
         # Circular convolution over twice the longest record: no response reaches around.
@@ -169,8 +175,28 @@ class Screening:
             x = np.array([np.log(np.clip(amplitude, low, high)), line, np.arctan2(b, a)])
             change = a * columns[0] + b * columns[1]
             d = around.deviations + np.clip(step[:P], -1.5, 1.5)
-            found.append(Start(cost, x, d, self._size(change), change.astype(np.float32)))
+            found.append(Start(cost, x, d, self._size(change), np.zeros(0, np.float32)))
         return found
+
+    def _loudest(self, lines: Real, response: Real, dt_s: float) -> Real:
+        """Those of evenly spaced frequencies [Hz] at which a torque would take most from the residuals, its
+        response (T, outputs to a pulse) taken to be settled, and the lowest, at which it is not."""
+        T = len(response)
+        size = next_fast_len(2 * T, real=True)
+        transfer = np.fft.rfft(response, size, axis=0)
+        correlation = np.zeros(T)
+        parts = np.split(self.around.residuals, self._parts)
+        for part in parts:
+            e = np.fft.rfft(part.reshape(-1, response.shape[1]), size, axis=0)
+            correlation += np.fft.irfft(np.sum(e * transfer.conj(), axis=1), size)[:T]
+        turn = 2j * np.pi * dt_s
+        found = np.abs(
+            czt(correlation, len(lines), np.exp(-turn * (lines[1] - lines[0])), np.exp(turn * lines[0]))
+        )
+        power = np.interp(lines, np.fft.rfftfreq(size, dt_s), np.sum(np.abs(transfer) ** 2, axis=1))
+        gain = found**2 / power
+        gain[:SLOW_LINES] = np.inf
+        return lines[np.sort(np.argsort(gain)[-BEST_LINES:])]
 
 
 class _Around:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from diagnosis.evidence import screening as screening_module
 from diagnosis.evidence.screening import Screening
 from diagnosis.fit.fit import fit
 from diagnosis.fit.residual import ResidualModel
@@ -60,6 +61,26 @@ def test_the_minimum_leaves_white_noise(ends):
     assert best.converged
     # White noise leaves n +- sqrt(2 n), three of them; ten fitted values take ten.
     assert abs(best.cost - (n - 10)) < 3 * np.sqrt(2 * n) + 10
+
+
+@pytest.mark.parametrize("Hz", [0.1, 7.3, 33.0])
+def test_few_of_many_frequencies_have_the_best_among_them(tmp_path, monkeypatch, Hz):
+    """Of a long record only the most promising are fitted; here of a short one, to compare with all."""
+    rng = np.random.default_rng(3)
+    sine = {"name": "periodic_disturbance", "amplitude_Nm": 0.1, "frequency_Hz": Hz, "phase_rad": 1.0}
+    friction = {"name": "coulomb_friction", "torque_Nm": 0.01}
+    records = [(role, [sine, friction], 8, 0.25) for role in ("estimation", "held_out")]
+    case = simulated_case(tmp_path, draw_rig(rng), records, rng)
+    model = ResidualModel(case)
+    screening = Screening(model, fit(model, (), (), np.zeros(model.nominal.count)))
+    (space,) = [c for c in case.machine.candidates(case.experiments) if c.effect == sine["name"]]
+    everywhere = screening.starts(space)
+    for name, few in (("MOST_LINES", 10), ("BEST_LINES", 40), ("SLOW_LINES", 10)):
+        monkeypatch.setattr(screening_module, name, few)
+    assert len(everywhere) > 200
+    best, *others = screening.starts(space)
+    assert len(others) == 39
+    assert (best.cost, best.coordinates[1]) == (everywhere[0].cost, everywhere[0].coordinates[1])
 
 
 # On seed 6 a thousandth of the gap changes a record by 0.6 noise deviations: quotients over steps of half a
