@@ -19,7 +19,7 @@ def main() -> int:
         code = command()
         interrupts.ignore()  # all is done and said
     except KeyboardInterrupt:  # while it was loaded
-        sys.stderr.write("flexlink: interrupted\n")
+        sys.stderr.write(f"flexlink: {interrupts.words()}\n")
         code = interrupts.exit_code()
     if interrupts.came():
         # CPython ends itself with SIGINT once a KeyboardInterrupt passed through exec("..."), handled or not.

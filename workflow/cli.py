@@ -65,6 +65,15 @@ Resume = Annotated[
 ]
 Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
+TimeLimit = Annotated[
+    float | None,
+    typer.Option(
+        min=1e-3,
+        metavar="SECONDS",
+        help="End after so long as if interrupted, with exit code 142; what is done is kept for --resume, "
+        "where the command has it.",
+    ),
+]
 CPrefix = Annotated[
     str | None,
     typer.Option(
@@ -116,10 +125,12 @@ def run(
     replace: Replace = False,
     c_prefix: CPrefix = None,
     c_float: CFloat = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
+    interrupts.limit(time_limit)
     need(config)
     from workflow.console import TerminalProgress
 
@@ -335,10 +346,12 @@ def identify(
     out: Annotated[
         Path | None, typer.Option(help="Write model and posterior here (npz), for `flexlink design`.")
     ] = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
+    interrupts.limit(time_limit)
     need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
     from workflow.commands.identify import identify_logs
@@ -420,10 +433,12 @@ def design(
     seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
     c_prefix: CPrefix = None,
     c_float: CFloat = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
+    interrupts.limit(time_limit)
     need(*source, specification)
     from workflow.console import TerminalProgress
 
@@ -473,10 +488,12 @@ def study(
     ] = None,
     resume: Resume = False,
     replace: Replace = False,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
+    interrupts.limit(time_limit)
     need(config)
     from workflow.console import TerminalProgress
 
@@ -679,6 +696,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         message, code = _explain(error)
         return _complain(cut(one_line(message), LONGEST_LINE), code)
+    finally:
+        interrupts.no_limit()
 
 
 def _no_more_output() -> None:
@@ -720,7 +739,7 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
             again += ["--out", str(out)]
         if out is not None and any((out / name).is_file() for name in _MANIFESTS):
             hint = f"; {shlex.join(['flexlink', *again, '--resume'])} continues"
-    return _complain(f"interrupted{hint}", interrupts.exit_code())
+    return _complain(f"{interrupts.words()}{hint}", interrupts.exit_code())
 
 
 def _warn(message: Warning | str, *about: object, **more: object) -> None:

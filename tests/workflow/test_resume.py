@@ -100,6 +100,14 @@ def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path, number):
     assert said.strip().endswith(f"flexlink run --config {FAST_ARM} --out {out} --resume continues")
 
 
+def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path):
+    out = tmp_path / "run"
+    called = ("run", "--config", FAST_ARM, "--out", out, "--time-limit", "4")
+    said = finish(start_flexlink(*called), 128 + signal.SIGALRM)
+    again = f"; flexlink {' '.join(map(str, called))} --resume continues" if out.exists() else ""
+    assert said == f"flexlink: the time limit is reached{again}\n"
+
+
 @pytest.fixture
 def plain_page(monkeypatch):
     """Resuming is about numbers: an empty page saves the seconds that drawing takes."""

@@ -1,5 +1,5 @@
-"""Ctrl-C, SIGTERM and SIGHUP that no library can swallow: remembered when they come, asked about before a
-result is kept."""
+"""Ctrl-C, SIGTERM, SIGHUP and the end of a time limit, that no library can swallow: remembered when they
+come, asked about before a result is kept."""
 
 from __future__ import annotations
 
@@ -16,6 +16,20 @@ def watch() -> None:
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _remember)
+
+
+def limit(seconds: float | None) -> None:
+    """Interrupt when so much time has passed, if any is given; only in the main thread."""
+    if seconds is not None:
+        signal.signal(signal.SIGALRM, _remember)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def no_limit() -> None:
+    """End the limit of this command; an alarm of anybody else's stays."""
+    if signal.getsignal(signal.SIGALRM) is _remember:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
 
 def ignore() -> None:
@@ -37,8 +51,13 @@ def came() -> bool:
 
 
 def exit_code() -> int:
-    """128 + the signal, as shells expect: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
+    """128 + the signal, as shells expect: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP, 142 an alarm."""
     return 128 + (_came or signal.SIGINT)
+
+
+def words() -> str:
+    """What has ended the command."""
+    return "the time limit is reached" if _came == signal.SIGALRM else "interrupted"
 
 
 def _remember(number: int, frame: FrameType | None) -> None:
