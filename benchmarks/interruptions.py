@@ -94,8 +94,10 @@ class Command:
     """`flexlink` in a session of its own, and the CPU time of all its processes."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
-        # A shell that runs this in the background told it to ignore interrupts, which commands inherit.
+        # A shell that runs this in the background told it to ignore interrupts, nohup to ignore the end of
+        # the terminal; commands inherit that.
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "workflow", *arguments],
             cwd=ROOT,
@@ -281,6 +283,8 @@ def run(
         out(f"{'':28}{heads}   median, largest, above {LONGEST_END_S:g}")
         total, bad = Found(), []
         for ways, wanted in ((KILLS, kills), (INTERRUPTS, interrupts)):
+            if not wanted:
+                continue
             for (name, call), count in zip(known.items(), _shares(wanted, len(known)), strict=True):
                 able = [way for way in ways if way.reach != "one" or name != "run"]  # which has but itself
                 place = folder / f"{name}-{able[0].number.name}"

@@ -1,8 +1,10 @@
 """Time and memory over the size of what is given: one command in a process of its own for each size.
 
 Identification: one log of white-noise voltage through a lag and a light mode, order given; then several logs
-of one length. Study: points of the fast arm of the tests. Diagnosis: short cases. CPU seconds of all its
-processes, and the largest memory that one of them ever had. A size of 0 is left out.
+of one length. Study: points of the fast arm of the tests, one start each on coarse grids and without the
+bound over all controllers, so that 500 take minutes. Diagnosis: cases without a gap, of four records of 240
+samples, and one of six long records; controllers are not compared. CPU seconds of all its processes, and the
+largest memory that one of them ever had. A size of 0 is left out.
 """
 
 from __future__ import annotations
@@ -16,10 +18,20 @@ import scipy.signal
 
 from benchmarks.harness import Print, main
 from benchmarks.interruptions import Command
-from tests.workflow.diagnosis_examples import FRICTION, write_case
+from tests.workflow.diagnosis_examples import write_case
 from tests.workflow.study_examples import TWO_POINTS
 
 DT_S = 0.005
+CHEAP_POINTS = TWO_POINTS.replace(
+    "[changes]",
+    """[changes]
+"achievable_performance.compute" = false
+"closed_loop.sensitivity" = false
+"synthesis.starts" = 1
+"synthesis.dense_points" = 500
+"synthesis.grid_points" = 30
+"certificate.joint_draws" = 0""",
+)
 
 
 def write_log(path: Path, samples: int, seed: int) -> Path:
@@ -56,30 +68,36 @@ def run(
     samples: tuple[int, ...] = (10_000, 100_000, 1_000_000, 10_000_000),
     records: tuple[int, ...] = (1, 5, 50),
     record_samples: int = 20_000,
-    points: tuple[int, ...] = (2, 20, 500),
+    points: tuple[int, ...] = (2, 20, 100, 500),
     cases: tuple[int, ...] = (1, 10, 100),
+    case_samples: tuple[int, ...] = (600, 6_000, 60_000),
 ) -> None:
     out(f"{'':40}{'size':>10}{'CPU s':>10}{'MiB':>10}{'CPU ms each':>14}")
     roles = ("--input", "u_V", "--output", "y_rad", "--time", "t_s", "--real", 1, "--pairs", 1, "--delay", 0)
     with tempfile.TemporaryDirectory(prefix="flexlink-") as name:
         folder = Path(name)
-        used_by("identify", write_log(folder / "first.npz", 5000, 0), *roles)  # compiles
-        for size in samples:
+        if any(samples) or any(records):
+            used_by("identify", write_log(folder / "first.npz", 5000, 0), *roles)  # compiles
+        for size in filter(None, samples):
             log = write_log(folder / "log.npz", size, 1)
             told(out, "identification, samples of one record", size, used_by("identify", log, *roles))
         logs = [write_log(folder / f"{k}.npz", record_samples, k) for k in range(max(records, default=0))]
-        for size in records:
+        for size in filter(None, records):
             found = used_by("identify", *logs[:size], *roles)
             told(out, f"identification, records of {record_samples}", size, found)
         for size in filter(None, points):
             values = np.linspace(1.0, 1.5, size).round(4).tolist()
-            (folder / "study.toml").write_text(TWO_POINTS.replace("[1.0, 1.5]", str(values)))
+            (folder / "study.toml").write_text(CHEAP_POINTS.replace("[1.0, 1.5]", str(values)))
             call = ("study", "--config", folder / "study.toml", "--out", folder / f"study{size}", "--jobs", 1)
             told(out, "study, points", size, used_by(*call))
-        places = [write_case(folder / f"case{k}", FRICTION, seed=k) for k in range(max(cases, default=0))]
+        places = [write_case(folder / f"case{k}", seed=k) for k in range(max(cases, default=0))]
         for size in filter(None, cases):
             more = ("--out", folder / f"out{size}", "--no-controller", "--jobs", 1)
             told(out, "diagnosis, cases", size, used_by("diagnose", *places[:size], *more))
+        for size in filter(None, case_samples):
+            place = write_case(folder / f"long{size}", records=6, samples=size)
+            more = ("--out", folder / f"outlong{size}", "--no-controller", "--jobs", 1)
+            told(out, "diagnosis, samples of each of 6 records", size, used_by("diagnose", place, *more))
 
 
 if __name__ == "__main__":

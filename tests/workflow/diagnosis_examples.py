@@ -26,17 +26,20 @@ def small_rig() -> Rig:
     return paper_link().perturbed({"sensors.hub_angle_noise_rad": 1e-3, "sensors.tip_noise_m": 1e-3})
 
 
-def write_case(folder: Path, *effects: dict[str, float | str], seed: int = 1) -> Path:
-    """Four short records of the paper's link with these effects, the last held out."""
+def write_case(
+    folder: Path, *effects: dict[str, float | str], seed: int = 1, records: int = 4, samples: int = _SAMPLES
+) -> Path:
+    """Records of the paper's link with these effects, the last held out; by default four short ones."""
     rig = small_rig()
     (folder / "experiments").mkdir(parents=True)
     (folder / "rig.toml").write_text(rig.to_toml())
     tolerances = '\n[tolerances]\n"hub.inertia_kg_m2" = 0.05\n"motor.resistance_ohm" = 0.03\n'
     (folder / "rig_uncertain.toml").write_text(rig.to_toml() + tolerances)
     lines = [f'case = "{folder.name}"']
-    for number, role in enumerate(("estimation", "estimation", "estimation", "held_out"), 1):
+    for number in range(1, records + 1):
+        role = "estimation" if number < records else "held_out"
         rng = np.random.default_rng([seed, number])
-        voltage = (2.0 + number) * np.sign(rng.standard_normal(_SAMPLES // 8).repeat(8))
+        voltage = (2.0 + number) * np.sign(rng.standard_normal(samples // 8).repeat(8))
         run = simulate(rig, voltage, parse_effects(effects), rng=rng)
         table = np.column_stack([run.time_s, voltage, run.output])
         name = f"experiments/{number:02d}_prbs.csv"
@@ -49,7 +52,7 @@ def write_case(folder: Path, *effects: dict[str, float | str], seed: int = 1) ->
             fmt="%.9g",
         )
         lines += ["", "[[experiments]]", f'file = "{name}"', f'role = "{role}"', 'kind = "prbs"']
-        lines += [f"samples = {_SAMPLES}", "closed_loop = false"]
+        lines += [f"samples = {samples}", "closed_loop = false"]
     (folder / "case.toml").write_text("\n".join(lines) + "\n")
     return folder
 
