@@ -73,7 +73,7 @@ def amplitude_finding(
 
     Intervals by resampling half-second blocks of both; they do not know that another sequence excites the gap
     differently, so a quarter is added on either side before anything but proportion is claimed. None without
-    two such experiments or when either of them shows no gap beyond noise.
+    two such experiments, each of two blocks at least, or when either of them shows no gap beyond noise.
     """
     pairs = [
         (pooled_rms(high.voltage_V) / pooled_rms(low.voltage_V), low, high)
@@ -88,6 +88,8 @@ def amplitude_finding(
         energy = np.sum(np.square(residuals[experiment.name]), axis=1)
         length = max(round(_BLOCK_S / case.rig.sampling.dt_s), 1)
         blocks = energy[: energy.size // length * length].reshape(-1, length).mean(axis=1)
+        if blocks.size < 2:
+            return None
         index = rng.integers(0, blocks.size, (_DRAWS, blocks.size))
         gaps.append(float(energy.mean()) - len(case.outputs))
         draws.append(blocks[index].mean(axis=1) - len(case.outputs))

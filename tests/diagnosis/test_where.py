@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.regimes import motions
 from diagnosis.where.where import subsystem_mass, where
 from diagnosis.where.where_energy import band_gaps, sensor_gaps
-from diagnosis.where.where_trends import common_findings
+from diagnosis.where.where_trends import amplitude_finding, common_findings
 from plant import EFFECTS, multisine, multisine_lines, simulate
 from plant.effects.joint import CoulombFriction, HardeningSpring, PeriodicDisturbance
 from plant.effects.link import LinkStiffness, TipPayload
@@ -378,3 +379,24 @@ def test_more_noise_than_stated_is_called_that():
     tip = found.sensors[1].gap
     # 1.5^2 - 1 beyond the noise
     assert tip.gap_rms == pytest.approx(np.sqrt(1.25), rel=0.1)
+
+
+@pytest.mark.parametrize(("samples", "said"), [(90, False), (150, False), (400, True)])
+def test_of_records_shorter_than_a_second_no_growth_with_the_input_is_said(samples, said):
+    """Half-second blocks are resampled: of none, or one, there is no interval."""
+    rng = np.random.default_rng(0)
+
+    def record(name, size):
+        voltage = size * np.ones(samples)
+        return SimpleNamespace(name=name, kind="prbs", closed_loop=False, voltage_V=voltage)
+
+    sampling = SimpleNamespace(dt_s=0.005)
+    case = SimpleNamespace(
+        experiments=(record("low", 1.0), record("high", 3.0)),
+        outputs=("hub_angle_rad",),
+        rig=SimpleNamespace(sampling=sampling),
+    )
+    residuals = {name: size * rng.standard_normal((samples, 1)) for name, size in (("low", 3), ("high", 9))}
+    found = amplitude_finding(case, residuals, 0.05, rng)
+    assert (found is not None) == said
+    assert found is None or np.all(np.isfinite(found.interval))
