@@ -465,13 +465,18 @@ def report(
         list[PictureFile] | None,
         typer.Option(help="Further kind of file for every picture in figures/, beside SVG; may be repeated."),
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Write report.html of a run directory anew and print its table."""
-    from workflow.commands.run import rebuild_report
-    from workflow.engine.run_directory import RunDirectory
+    from workflow.console import TerminalProgress
 
-    summary = rebuild_report(RunDirectory.open(directory), [kind.value for kind in pictures or ()])
+    with TerminalProgress(quiet=quiet) as progress:
+        from workflow.commands.run import rebuild_report
+        from workflow.engine.run_directory import RunDirectory
+
+        kinds = [kind.value for kind in pictures or ()]
+        summary = rebuild_report(RunDirectory.open(directory), kinds, progress)
     _show(summary, as_json)
 
 

@@ -62,7 +62,9 @@ def run_from_files(
     )
 
 
-def rebuild_report(run: RunDirectory, also: Iterable[str] = ()) -> RunSummary:
+def rebuild_report(
+    run: RunDirectory, also: Iterable[str] = (), progress: Progress | None = None
+) -> RunSummary:
     """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing.
 
     also: kinds of file for its pictures beside SVG, pdf or png.
@@ -70,4 +72,4 @@ def rebuild_report(run: RunDirectory, also: Iterable[str] = ()) -> RunSummary:
     from workflow.report.stage import REPORT, write_page
     from workflow.tasks.pipeline import rebuild_page
 
-    return rebuild_page(run, dataclasses.replace(REPORT, run=partial(write_page, also=also)))
+    return rebuild_page(run, dataclasses.replace(REPORT, run=partial(write_page, also=also)), progress)

@@ -95,12 +95,14 @@ def run_pipeline(
     return summary
 
 
-def rebuild_page(run: RunDirectory, page: Stage) -> RunSummary:
+def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
     """Perform the last stage anew on a finished run. Raises InputError when a stage is missing."""
     config = config_of(run)
     results = RunResults(run)
+    progress = progress or Progress()
+    progress.plan([(page.name, page.expected_s)])
     with run.locked():
-        _perform(page, config, results, Progress(), {}, None, always=True)
+        _perform(page, config, results, progress, {}, None, always=True)
     return summarise(results, config)
 
 
