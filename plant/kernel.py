@@ -6,7 +6,7 @@ One loop serves records (T samples) and closed loops (one sample a call), so bot
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,10 @@ _F = TypeVar("_F", bound=Callable[..., object])
 FRICTION, CONTACT = 0, 1  # elements that switch
 _NOTHING = 1e-100
 _SLACK_RAD = 1e-13
+# Nodes of a step; of Python's own integers numba compiles a version of the called function for each value.
+_AT_START: Any = np.int64(0)
+_IN_THE_MIDDLE: Any = np.int64(1)
+_AT_END: Any = np.int64(2)
 
 
 def _compiled(function: _F) -> _F:
@@ -151,7 +155,17 @@ def _add_smooth_forces(
         for m in range(held.size):
             total += g[n + m, column] * held[m]
         free[column] = total
-    _smooth_forces(0, 0, position, force, mode, channel_kind, channel, static_moment, geometric_stiffness)
+    _smooth_forces(
+        _AT_START,
+        _AT_START,
+        position,
+        force,
+        mode,
+        channel_kind,
+        channel,
+        static_moment,
+        geometric_stiffness,
+    )
     for j in range(n_channels):
         force[1, j], force[2, j] = force[0, j], force[0, j]
     # The sweeps contract by h |df/dv| / J, which `plant.plan` keeps below 0.3.
@@ -169,7 +183,17 @@ def _add_smooth_forces(
                 position[1 + later, j] = total
         if sweep > 0 and change <= 1e-9 * size:
             break
-        _smooth_forces(1, 2, position, force, mode, channel_kind, channel, static_moment, geometric_stiffness)
+        _smooth_forces(
+            _IN_THE_MIDDLE,
+            _AT_END,
+            position,
+            force,
+            mode,
+            channel_kind,
+            channel,
+            static_moment,
+            geometric_stiffness,
+        )
     for node in range(3):
         for c in range(n_channels):
             value, row = force[node, c], first + node * n_channels + c

@@ -8,11 +8,13 @@ descent cannot leave.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
+from numba.extending import register_jitable
 
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
@@ -65,6 +67,10 @@ class SearchSpace:
         """Points and box as compiled code takes them (`ident.data.arrays.kernel_array`)."""
         return kernel_array(units), self.n_real, self.low.copy(), self.high.copy()
 
+    def _at(self, units: RealArray) -> RealArray:
+        """Coordinates of one point (D,), or of as many as there are columns (D, E)."""
+        return np.asarray(_coordinates_of_point(units, self.n_real, self.low, self.high))
+
     def blocks(self, unit: RealArray) -> RealArray:
         """Cascade blocks (R + P, 4) of a point of the unit cube."""
         return np.asarray(blocks_of_point(*self.kernel_arguments(unit), self.raw))
@@ -73,7 +79,7 @@ class SearchSpace:
         """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =
         0.95."""
         if not self.raw:
-            point = np.asarray(_coordinates_of_point(*self.kernel_arguments(unit)))
+            point = self._at(unit)
             real, first, second = point[: self.n_real], point[self.n_real :: 2], point[self.n_real + 1 :: 2]
             omega, zeta = 10.0**first, 10.0**second
             return Poles(1 - 10.0**real, np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
@@ -103,7 +109,7 @@ class SearchSpace:
 
     def coordinates(self, units: RealArray) -> RealArray:
         """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s."""
-        points = np.asarray(_coordinates_of_points(*self.kernel_arguments(units)))
+        points = self._at(units.T).T
         if not self.raw:
             points[:, self.n_real :: 2] -= np.log10(self.dt_s)
         return points
@@ -137,29 +143,19 @@ def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: 
     return SearchSpace(n_real, n_pairs, np.array(low), np.array(high), False, dt_s)
 
 
-@numba.njit(cache=True)
+@register_jitable(inline="always")
 def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
-    point = np.empty(unit.size)
+    point = np.empty_like(unit)
     floor = low[0]
     for i in range(n_real):
         floor = floor + (high[0] - floor) * unit[i]
         point[i] = floor
     floor = low[1]
-    for i in range(n_real, unit.size, 2):
+    for i in range(n_real, unit.shape[0], 2):
         floor = floor + (high[1] - floor) * unit[i]
         point[i] = floor
         point[i + 1] = low[2] + (high[2] - low[2]) * unit[i + 1]
     return point
-
-
-@numba.njit(cache=True)
-def _coordinates_of_points(units: Any, n_real: int, low: Any, high: Any) -> Any:
-    points = np.empty_like(units)
-    for i in range(units.shape[0]):
-        point = _coordinates_of_point(units[i], n_real, low, high)
-        for j in range(point.size):
-            points[i, j] = point[j]
-    return points
 
 
 @numba.njit(cache=True)
@@ -171,22 +167,22 @@ def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> A
     for i in range(n_real):
         distance = 1.0 - point[i] if raw else 10.0 ** point[i]
         blocks[i, 0] = 1.0 - distance
-        blocks[i, 1] = np.sqrt(distance * (2.0 - distance))
+        blocks[i, 1] = math.sqrt(distance * (2.0 - distance))
     for i in range(n_real, blocks.shape[0]):
         first, second = point[2 * i - n_real], point[2 * i - n_real + 1]
         if raw:
             beta, gamma = first, second
-            sb = np.sqrt((1 - beta) * (1 + beta))
+            sb = math.sqrt((1 - beta) * (1 + beta))
             one_minus_gamma = 1 - gamma
         else:
             omega, zeta = 10.0**first, 10.0**second
-            decay, angle = zeta * omega, omega * np.sqrt(1 - zeta * zeta)
-            gamma = np.exp(-2 * decay)
-            one_minus_gamma = -np.expm1(-2 * decay)
-            beta = 2 * np.exp(-decay) * np.cos(angle) / (1 + gamma)
-            sb = np.sqrt(one_minus_gamma**2 + 4 * gamma * np.sin(angle) ** 2) / (1 + gamma)
+            decay, angle = zeta * omega, omega * math.sqrt(1 - zeta * zeta)
+            gamma = math.exp(-2 * decay)
+            one_minus_gamma = -math.expm1(-2 * decay)
+            beta = 2 * math.exp(-decay) * math.cos(angle) / (1 + gamma)
+            sb = math.sqrt(one_minus_gamma**2 + 4 * gamma * math.sin(angle) ** 2) / (1 + gamma)
         blocks[i, 0] = gamma
         blocks[i, 1] = beta
-        blocks[i, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
+        blocks[i, 2] = math.sqrt(one_minus_gamma * (1 + gamma))
         blocks[i, 3] = sb
     return blocks

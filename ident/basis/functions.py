@@ -11,6 +11,7 @@ Order of the functions: real poles first, then two per pair.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numba
@@ -49,7 +50,7 @@ def _blocks(real: Any, pairs: Any) -> Any:
     blocks = np.zeros((real.size + pairs.size, 4))
     for i in range(real.size):
         blocks[i, 0] = real[i]
-        blocks[i, 1] = np.sqrt((1 - real[i]) * (1 + real[i]))
+        blocks[i, 1] = math.sqrt((1 - real[i]) * (1 + real[i]))
     for i in range(pairs.size):
         re, im = pairs[i].real, pairs[i].imag
         gamma = re**2 + im**2
@@ -58,8 +59,8 @@ def _blocks(real: Any, pairs: Any) -> Any:
         one_minus_gamma = max((1 - abs(re)) * (1 + abs(re)) - im**2, 5e-17)
         blocks[real.size + i, 0] = gamma
         blocks[real.size + i, 1] = 2 * re / (1 + gamma)
-        blocks[real.size + i, 2] = np.sqrt(one_minus_gamma * (1 + gamma))
-        blocks[real.size + i, 3] = np.sqrt(one_minus_gamma**2 + 4 * im**2) / (1 + gamma)
+        blocks[real.size + i, 2] = math.sqrt(one_minus_gamma * (1 + gamma))
+        blocks[real.size + i, 3] = math.sqrt(one_minus_gamma**2 + 4 * im**2) / (1 + gamma)
     return blocks
 
 

@@ -24,6 +24,10 @@ _RANK_TOLERANCE = 1e-11
 # Least square of a column's part outside the columns before it, relative to its own, for a linearisation by
 # products: the error of the inverse is about 1e-16 over this, before refinement.
 _LEAST_PIVOT = 1e-8
+# numpy's scalars: of Python's own numba compiles a version of the called function for each value.
+_START: Any = np.int64(0)
+_LOWER: Any = np.bool_(True)
+_ALL: Any = np.bool_(False)
 
 
 @numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
@@ -175,14 +179,14 @@ def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) 
             run_cascade(blocks, n_real, signals[i], rows, i * order, starts[r], starts[r + 1])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
     """Free responses of a cascade over the longest record (B, T)."""
     longest = 0
     for r in range(starts.size - 1):
         longest = max(longest, starts[r + 1] - starts[r])
     rows = np.empty((2 * blocks.shape[0] - n_real, longest))
-    run_cascade_free(blocks, n_real, rows, 0, longest)
+    run_cascade_free(blocks, n_real, rows, _START, longest)
     return rows
 
 
@@ -219,8 +223,8 @@ def cost_of_point(
     phi = np.empty((n_inputs * order, n_total))
     driven_rows(blocks, n_real, drive.copy(), starts, phi)
     gram, on_frozen = np.zeros((m, m)), np.empty((m, n_frozen + 1))
-    _products(phi, phi, 0, n_total, True, 0, gram[first:, first:])
-    _products(phi, frozen, 0, n_total, False, 0, on_frozen[first:, :])
+    _products(phi, phi, _START, n_total, _LOWER, _START, gram[first:, first:])
+    _products(phi, frozen, _START, n_total, _ALL, _START, on_frozen[first:, :])
     on_local = np.empty((phi.shape[0], local_q.shape[0]))
     if free:
         response = _free_rows(blocks, n_real, starts)
@@ -228,27 +232,27 @@ def cost_of_point(
         free_on_local = np.empty((order, local_q.shape[0]))
     for r in range(n_records):
         lo, hi = starts[r], starts[r + 1]
-        _products(phi, local_q, lo, hi, False, 0, on_local[:, :])
-        _subtract_squares(gram[first:, first:], on_local[:, :], 0)
+        _products(phi, local_q, lo, hi, _ALL, _START, on_local[:, :])
+        _subtract_squares(gram[first:, first:], on_local[:, :], _START)
         if free:
             at = r * order
             for i in range(order):
                 _copy(placed[i, lo:hi], response[i, : hi - lo])
-            _products(placed, local_q, lo, hi, False, 0, free_on_local[:, :])
-            _products(placed, placed, lo, hi, True, 0, gram[at : at + order, at : at + order])
-            _subtract_squares(gram[at : at + order, at : at + order], free_on_local[:, :], 0)
-            _products(placed, frozen, lo, hi, False, 0, on_frozen[at : at + order, :])
-            _products(phi, placed, lo, hi, False, 0, gram[first:, at : at + order])
+            _products(placed, local_q, lo, hi, _ALL, _START, free_on_local[:, :])
+            _products(placed, placed, lo, hi, _LOWER, _START, gram[at : at + order, at : at + order])
+            _subtract_squares(gram[at : at + order, at : at + order], free_on_local[:, :], _START)
+            _products(placed, frozen, lo, hi, _ALL, _START, on_frozen[at : at + order, :])
+            _products(phi, placed, lo, hi, _ALL, _START, gram[first:, at : at + order])
             for i in range(phi.shape[0]):
                 for j in range(order):
                     for q in range(local_q.shape[0]):
                         gram[first + i, at + j] -= on_local[i, q] * free_on_local[j, q]
-    _subtract_squares(gram[:, :], on_frozen[:, :n_frozen], 0)
+    _subtract_squares(gram[:, :], on_frozen[:, :n_frozen], _START)
     residual = frozen[n_frozen]
-    return float(_dot(residual, residual, 0, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
+    return float(_dot(residual, residual, _START, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> Any:
     """Polynomials and free responses (L, N), orthonormal in each record (modified Gram-Schmidt, twice)."""
     n_known = polynomials_q.shape[0]
@@ -261,11 +265,11 @@ def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> An
         for i in range(n_known, rows.shape[0]):
             part = rows[i, lo:hi]
             _copy(part, response[i - n_known, : hi - lo])
-            before = _dot(part, part, 0, part.size)
+            before = _dot(part, part, _START, part.size)
             for _ in range(2):
                 for j in range(i):
                     _subtract(rows[i], _dot(rows[j], rows[i], lo, hi), rows[j], lo, hi)
-            size = _dot(part, part, 0, part.size)
+            size = _dot(part, part, _START, part.size)
             factor = 1 / np.sqrt(size) if size > _RANK_TOLERANCE**2 * before else 0.0
             for k in range(part.size):
                 part[k] *= factor
@@ -284,10 +288,10 @@ def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
 def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_local: Any, gram: Any) -> None:
     """Products of rows first .. with all rows before them, local columns taken out of both."""
     n_local = local_q.shape[0]
-    _products(rows, rows, 0, rows.shape[1], True, first, gram[:, :])
+    _products(rows, rows, _START, rows.shape[1], _LOWER, first, gram[:, :])
     for r in range(starts.size - 1):
         here = on_local[:, r * n_local : (r + 1) * n_local]
-        _products(rows, local_q, starts[r], starts[r + 1], False, first, here)
+        _products(rows, local_q, starts[r], starts[r + 1], _ALL, first, here)
     _subtract_squares(gram[:, :], on_local[: rows.shape[0], :], first)
 
 
@@ -333,17 +337,17 @@ def linearise(
             _copy(rows[n_inputs * n + i], u[i])
     gram = np.empty((rows.shape[0], rows.shape[0]))
     on_local = np.empty((rows.shape[0], local_q.shape[0] * (starts.size - 1)))
-    _off_local_products(rows[:n_columns], 0, local_q, starts, on_local, gram)
+    _off_local_products(rows[:n_columns], _START, local_q, starts, on_local, gram)
     if not factorise(gram, n_columns, _LEAST_PIVOT):
         return -1.0
     theta = np.empty(n_columns)
     for i in range(n_columns):
-        theta[i] = _dot(rows[i], output, 0, n_total)
+        theta[i] = _dot(rows[i], output, _START, n_total)
     forward(gram, n_columns, theta)
     backward(gram, n_columns, theta)
     residual = output.copy()
     for i in range(n_columns):
-        _subtract(residual, theta[i], rows[i], 0, n_total)
+        _subtract(residual, theta[i], rows[i], _START, n_total)
     fitted = np.empty((1, n_total))
     for k in range(n_total):
         fitted[0, k] = output[k] - residual[k]
@@ -355,9 +359,9 @@ def linearise(
             fitted[0, k] = y[k] - residual[k]
     on_residual = np.empty(rows.shape[0])
     for i in range(n_columns):
-        on_residual[i] = _dot(rows[i], residual, 0, n_total)
+        on_residual[i] = _dot(rows[i], residual, _START, n_total)
     forward(gram, n_columns, on_residual)
-    rss = _dot(residual, residual, 0, n_total)
+    rss = _dot(residual, residual, _START, n_total)
     for q in range(n_columns):
         rss -= on_residual[q] ** 2
     if not rss < below:
@@ -372,7 +376,7 @@ def linearise(
     for i in range(n):
         row = gram[n_columns + i]
         forward(gram, n_columns, row)
-        gradient[i] = _dot(rows[n_columns + i], residual, 0, n_total)
+        gradient[i] = _dot(rows[n_columns + i], residual, _START, n_total)
         for q in range(n_columns):
             gradient[i] -= row[q] * on_residual[q]
         for j in range(i + 1):

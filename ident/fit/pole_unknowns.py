@@ -4,6 +4,8 @@ exp(-s +- j f); their bounds, the chain rule from block states to unknowns, and 
 
 from __future__ import annotations
 
+import cmath
+import math
 from typing import Any
 
 import numba
@@ -14,10 +16,12 @@ from ident.fit.kernels import backward, factorise, forward, schur_drop
 
 # Order of the numbers in an array of bounds (see `ident.fit.refinement.Bounds`).
 _DISTANCE_MIN, _DISTANCE_MAX, _OMEGA_MIN, _OMEGA_MAX, _ZETA_MIN, _ZETA_MAX, _S_MIN = range(7)
+# Pieces of the three functions at the end: as functions of their own they would all be compiled twice.
+_inlined = numba.njit(cache=True, inline="always")
 _CLOSE = 1e-7  # poles pass through exp and log on their way to a bound
 
 
-@numba.njit(cache=True)
+@_inlined
 def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
     """The unknowns (1 - a; s, f) inside the bounds; frequency and damping are clipped, then s and f
     formed."""
@@ -26,15 +30,15 @@ def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
         inside[i] = min(max(x[i], bounds[_DISTANCE_MIN]), bounds[_DISTANCE_MAX])
     for i in range(n_free_real, x.size, 2):
         s, f = max(x[i], bounds[_S_MIN]), max(x[i + 1], 1e-12)
-        omega = np.hypot(s, f)
+        omega = math.hypot(s, f)
         zeta = min(max(s / omega, bounds[_ZETA_MIN]), bounds[_ZETA_MAX])
         omega = min(max(omega, bounds[_OMEGA_MIN]), bounds[_OMEGA_MAX])
         inside[i] = max(zeta * omega, bounds[_S_MIN])
-        inside[i + 1] = min(omega * np.sqrt(1 - zeta * zeta), 0.995 * np.pi)
+        inside[i + 1] = min(omega * math.sqrt(1 - zeta * zeta), 0.995 * np.pi)
     return inside
 
 
-@numba.njit(cache=True)
+@_inlined
 def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
     """Unknowns on a bound that would be driven out of it (a step goes along +gradient = S^T r)."""
     held = np.zeros(x.size, dtype=np.bool_)
@@ -45,7 +49,7 @@ def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
         else:
             held[i] = x[i] >= bounds[_DISTANCE_MAX] * high
     for i in range(n_free_real, x.size, 2):
-        omega = np.hypot(x[i], x[i + 1])
+        omega = math.hypot(x[i], x[i + 1])
         zeta = x[i] / omega
         if gradient[i] < 0:
             held[i] = x[i] <= bounds[_S_MIN] * low or zeta <= bounds[_ZETA_MIN] * low
@@ -58,7 +62,7 @@ def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
     return held
 
 
-@numba.njit(cache=True)
+@_inlined
 def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
     """(B, P): sensitivity to each free unknown as a combination of the block states driven by the fitted
     output.
@@ -83,7 +87,7 @@ def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> 
     return chain
 
 
-@numba.njit(cache=True)
+@_inlined
 def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns."""
     n, m = chain.shape
@@ -103,7 +107,7 @@ def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
     return system, slope
 
 
-@numba.njit(cache=True)
+@_inlined
 def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
     """1 - a of the free real poles, then s, f of each free pair."""
     n_free_real = real.size - n_fixed_real
@@ -111,13 +115,13 @@ def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int
     for i in range(n_free_real):
         x[i] = 1 - real[n_fixed_real + i]
     for j in range(n_fixed_pairs, pairs.size):
-        log = np.log(pairs[j])
+        log = cmath.log(pairs[j])
         x[n_free_real + 2 * (j - n_fixed_pairs)] = -log.real
         x[n_free_real + 2 * (j - n_fixed_pairs) + 1] = log.imag
     return x
 
 
-@numba.njit(cache=True)
+@_inlined
 def set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> None:
     n_free_real = real.size - n_fixed_real
     for i in range(n_free_real):
@@ -125,7 +129,16 @@ def set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: i
     for j in range(n_fixed_pairs, pairs.size):
         s = x[n_free_real + 2 * (j - n_fixed_pairs)]
         f = x[n_free_real + 2 * (j - n_fixed_pairs) + 1]
-        pairs[j] = np.exp(-s) * complex(np.cos(f), np.sin(f))
+        pairs[j] = math.exp(-s) * complex(math.cos(f), math.sin(f))
+
+
+@numba.njit(cache=True)
+def start(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int, bounds: Any) -> Any:
+    """The unknowns of the poles, brought inside the bounds, and the poles with them."""
+    x = free_parameters(real, pairs, n_fixed_real, n_fixed_pairs)
+    x = clip_parameters(x, real.size - n_fixed_real, bounds)
+    set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
+    return x
 
 
 @numba.njit(cache=True)
@@ -148,7 +161,7 @@ def scaled_system(
             m += 1
     system, scale, slope = np.empty((m, m)), np.empty(m), np.empty(m)
     for i in range(m):
-        scale[i] = np.sqrt(max(full_system[free[i], free[i]], 1e-300))
+        scale[i] = math.sqrt(max(full_system[free[i], free[i]], 1e-300))
         slope[i] = full_slope[free[i]] / scale[i]
         for j in range(i + 1):
             system[i, j] = full_system[free[i], free[j]] / (scale[i] * scale[j])
@@ -158,9 +171,22 @@ def scaled_system(
 
 @numba.njit(cache=True)
 def damped_step(
-    x: Any, n_free_real: int, bounds: Any, system: Any, slope: Any, scale: Any, free: Any, damping: float
+    x: Any,
+    n_fixed_real: int,
+    n_fixed_pairs: int,
+    bounds: Any,
+    system: Any,
+    slope: Any,
+    scale: Any,
+    free: Any,
+    damping: float,
+    real: Any,
+    pairs: Any,
 ) -> Any:
-    """The unknowns after one step, inside the bounds, and the fall of J it promises (0: no step possible)."""
+    """The unknowns after one step, inside the bounds, and the fall of J it promises (0: no step possible).
+
+    Fills the free ones of the poles real and pairs.
+    """
     m = free.size
     factor = system.copy()
     for i in range(m):
@@ -178,4 +204,6 @@ def damped_step(
         for j in range(m):
             along -= system[i, j] * step[j]
         promised += step[i] * along
-    return clip_parameters(trial, n_free_real, bounds), promised
+    trial = clip_parameters(trial, real.size - n_fixed_real, bounds)
+    set_poles(trial, real, pairs, n_fixed_real, n_fixed_pairs)
+    return trial, promised

@@ -20,14 +20,7 @@ from ident.basis.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.basis.options import IdentOptions
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import RealArray
-from ident.fit.pole_unknowns import (
-    chain_rule,
-    clip_parameters,
-    damped_step,
-    free_parameters,
-    scaled_system,
-    set_poles,
-)
+from ident.fit.pole_unknowns import chain_rule, damped_step, scaled_system, start
 from ident.fit.problem import Linearisation, Linearised
 
 # Damping of the first step in units of the scaled normal matrix. From afar a full step mostly leads too far:
@@ -110,9 +103,7 @@ def refine(
     """
     real, pairs = poles.writable()
     n_fixed, limits = fixed.counts, bounds.array
-    n_free_real = real.size - n_fixed[0]
-    x = clip_parameters(free_parameters(real, pairs, *n_fixed), n_free_real, limits)
-    set_poles(x, real, pairs, *n_fixed)
+    x = start(real, pairs, *n_fixed, limits)
     here = problem.linearise(real, pairs)
     trial_real, trial_pairs = real.copy(), pairs.copy()
     # Residuals at rounding level relative to the output: nothing left to gain.
@@ -125,10 +116,11 @@ def refine(
         if here.rss <= floor or promised <= tolerance * here.rss:
             return Refined(Poles(real, pairs), here.rss, iteration, True)
         while True:
-            trial_x, gain = damped_step(x, n_free_real, limits, system, slope, scale, free, damping)
+            trial_x, gain = damped_step(
+                x, *n_fixed, limits, system, slope, scale, free, damping, trial_real, trial_pairs
+            )
             ratio = 0.0
             if gain > 0:
-                set_poles(trial_x, trial_real, trial_pairs, *n_fixed)
                 trial = problem.linearise(trial_real, trial_pairs, here.rss)
                 ratio = (here.rss - trial.rss) / gain
                 if ratio > 1e-4:

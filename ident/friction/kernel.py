@@ -95,7 +95,8 @@ def advance(
                 speed += (weights[j] * (rates[j] * tried[j] + pushed)).real
             still = excess == 0 or abs(speed) > _OVER * fall
             if (new - position) * deflection > 0 and speed * deflection > 0 and still:
-                state[:] = tried
+                for j in range(n):  # state[:] = tried compiles for two seconds
+                    state[j] = tried[j]
                 position = new
                 total += _STEPS * force
                 moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * _ALL)

@@ -62,7 +62,8 @@ def loop_through(
             later[i] = law[i, order] * error + law[i, order + 1] * (u - wanted)
             for j in range(order):
                 later[i] += law[i, j] * x[j]
-        x[:] = later
+        for i in range(order):
+            x[i] = later[i]
         last = u
         if steps[1] > 0:
             u = steps[1] * np.round(u / steps[1])

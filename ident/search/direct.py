@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import nlopt
-import numba
 import numpy as np
 
 from ident.basis.options import Algorithm
-from ident.data.arrays import RealArray, kernel_array
+from ident.data.arrays import RealArray
 
 
 def minimise(
@@ -49,23 +47,9 @@ def minimise(
 def best_apart(points: RealArray, costs: RealArray, count: int, apart: float = 0.15) -> RealArray:
     """Up to `count` of the best points (C, D), each at least `apart` from the better ones chosen before
     it."""
-    return np.asarray(points[_greedy(kernel_array(points), np.argsort(costs, kind="stable"), count, apart)])
-
-
-@numba.njit(cache=True)
-def _greedy(points: Any, order: Any, count: int, apart: float) -> Any:
-    chosen = np.empty(count, dtype=np.int64)
-    n_chosen = 0
-    for i in order:
-        near = False
-        for c in chosen[:n_chosen]:
-            distance = 0.0
-            for j in range(points.shape[1]):
-                distance += (points[i, j] - points[c, j]) ** 2
-            near = near or distance < apart * apart
-        if not near:
-            chosen[n_chosen] = i
-            n_chosen += 1
-            if n_chosen == count:
-                break
-    return chosen[:n_chosen]
+    left = points[np.argsort(costs, kind="stable")]
+    chosen: list[RealArray] = []
+    while len(left) and len(chosen) < count:
+        chosen.append(left[0])
+        left = left[~(np.sum((left - left[0]) ** 2, axis=1) < apart * apart)]
+    return np.array(chosen).reshape(-1, points.shape[1])

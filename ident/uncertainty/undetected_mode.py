@@ -185,8 +185,11 @@ def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
     by sample: neighbours in memory, which the processor takes four or eight at a time.
     """
     n_pairs = parameters.shape[0]
-    gb, gs = parameters[:, 0] * parameters[:, 1], parameters[:, 0] * parameters[:, 3]
-    beta, sg, sb = parameters[:, 1].copy(), parameters[:, 2].copy(), parameters[:, 3].copy()
+    numbers = np.empty((5, n_pairs))
+    gb, gs, beta, sg, sb = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    for i in range(n_pairs):
+        gamma, beta[i], sg[i], sb[i] = parameters[i, 0], parameters[i, 1], parameters[i, 2], parameters[i, 3]
+        gb[i], gs[i] = gamma * beta[i], gamma * sb[i]
     out1, out2 = np.empty((signal.size, n_pairs)), np.empty((signal.size, n_pairs))
     a, b = states[0], states[1]
     for k in range(signal.size):
