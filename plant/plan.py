@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+from scipy.linalg import eigh, expm
 
 from plant.kernel import CONTACT, FRICTION, run
 from plant.machine import GRAVITY, SINE, STRIBECK, Machine
@@ -335,7 +335,8 @@ class _Builder:
         return _ACCELEROMETER_RAD_S**2 * row
 
     def start_columns(self, free: Real) -> Real:
-        """See `Plan`: base at rest in its middle, motor side and link root turned with the hub.
+        """See `Plan`: base at rest in its middle, motor side and link root turned with the hub; modes of the
+        link with the hub held.
 
         free (N, N): state matrix with everything that slips slipping.
         """
@@ -345,6 +346,8 @@ class _Builder:
         if self.machine.joint.base is not None:
             turned[1] = 0.0
         modes = np.eye(n)[:, eq.first_mode :]
+        if self.machine.joint.compliance is not None:
+            modes = self._modes_with_root()
         columns = np.zeros((self.n, 3 + 2 * modes.shape[1]))
         columns[:n, 0] = columns[n : 2 * n, 1] = turned
         columns[:n, 3 : 3 + modes.shape[1]] = columns[n : 2 * n, 3 + modes.shape[1] :] = modes
@@ -364,6 +367,17 @@ class _Builder:
             columns[self.accelerometer] = self._position(eq.tip) @ columns - behind
             columns[self.accelerometer + 1] = speed
         return columns
+
+    def _modes_with_root(self) -> Real:
+        """(n, M + 1): behind a held hub a link swings with its root, where the joint gives way."""
+        eq, free = self.equations, slice(self.equations.first_mode - 1, None)
+        shapes = eigh(eq.stiffness[free, free], eq.mass[free, free])[1]
+        # Every one by the sign of the mode it would be with a rigid joint.
+        signs = np.sign(eq.tip[free] @ shapes)
+        signs[:-1] *= np.sign(eq.modes.tip)
+        modes = np.zeros((eq.mass.shape[0], shapes.shape[1]))
+        modes[free] = shapes * signs
+        return modes
 
     def initial_state(self) -> Real:
         x = np.zeros(self.n)

@@ -24,6 +24,7 @@ FARTHEST = 5.0
 _DEVIATION_STEP, _SMALLEST_STEP = 1e-3, 1e-4
 _LARGEST_STEP, _LARGEST_MOVE = 2.0, 1.5
 _AGAIN = (2, 5, 8, 11)
+_STATE_ITERATIONS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +190,38 @@ def descend(
     assert columns is not None
     jacobian = np.column_stack([nominal_jacobian, by_effects])
     return Descent(tuple(candidates), d, x, start, e, jacobian, columns, loss, prior, converged)
+
+
+def best_move(records: Records, part: slice, columns: Real, e: Real, state: Real) -> Real:
+    """(S,) from the state at the start of a record to the one that leaves least of its coefficients e (T Y,),
+    these being linear in it; columns (T Y, S), part: where they stand among those of all records.
+
+    Far from it the loss is flat, and weights of what is left there lead to it in many small steps: they are
+    taken on the energies of the bands, and once more from where all bands weigh as their floors do.
+    """
+    levels, spread = records.levels, records.state_spread
+    band = levels.band[part]
+    bands = slice(int(band.min()), int(band.max()) + 1)
+    rows = np.column_stack([columns, e])
+    energies = np.array([own.T @ own for b in range(bands.start, bands.stop) for own in [rows[band == b]]])
+    counted, floor = levels.counted[bands], levels.floor[bands]
+
+    def left(move: Real) -> Real:
+        whole = np.append(move, 1.0)
+        return np.asarray(np.maximum(energies @ whole @ whole, 0.0))
+
+    def loss(move: Real) -> float:
+        return levels.loss_of(left(move), bands) + 0.5 * float(np.sum(((state + move) / spread) ** 2))
+
+    found: list[Real] = []
+    for weights in (counted / (left(np.zeros(state.size)) + floor), 1 / floor):
+        for _ in range(_STATE_ITERATIONS):
+            weighted = np.tensordot(weights, energies, 1)
+            H, g = weighted[:-1, :-1] + np.diag(1 / spread**2), weighted[:-1, -1] + state / spread**2
+            move = np.asarray(-np.linalg.solve(H, g))
+            weights = counted / (left(move) + floor)
+        found.append(move)
+    return min(found, key=loss)
 
 
 def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[float, Real]:

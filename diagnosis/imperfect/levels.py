@@ -70,9 +70,13 @@ class Levels:
     def energy(self, e: Real) -> Real:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 
+    def loss_of(self, energy: Real, bands: slice = slice(None)) -> float:
+        """-log likelihood of the energies (.,) of these bands."""
+        return 0.5 * float(self.counted[bands] @ np.log1p(energy / self.floor[bands]))
+
     def loss(self, e: Real) -> float:
         """-log likelihood of coefficients (N,), up to a constant of the records."""
-        return 0.5 * float(self.counted @ np.log1p(self.energy(e) / self.floor))
+        return self.loss_of(self.energy(e))
 
     def weights(self, e: Real) -> Real:
         """(N,) w with grad(loss) = w e: the reciprocal variances that e itself shows."""

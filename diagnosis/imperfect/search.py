@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.evidence.look_alikes import look_alike
-from diagnosis.imperfect.descent import Descent, descend, loss_at, occam
+from diagnosis.imperfect.descent import Descent, best_move, descend, loss_at, occam
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.imperfect.starts import Point, beside, points_of
 from diagnosis.machine.case import Case
@@ -94,7 +94,8 @@ class Search:
         """
         weighing = self.case.machine.weighing
         P = self.records.nominal.count
-        nominal = descend(self.records, (), np.zeros(P), np.zeros(0), self.records.at_rest(), iterations=12)
+        start, _ = self._started(self.records, np.zeros(P), (), self.records.at_rest())
+        nominal = descend(self.records, (), np.zeros(P), np.zeros(0), start, iterations=12)
         self.add(nominal)
         self._alone()
         self._containing(self.found)
@@ -323,20 +324,16 @@ class Search:
             per_zero = self.case.machine.unknown_start.state_per_zero
             start = start.with_zeros(fitted.zeros, per_zero)
         e = held.coefficients(d, effects, start)
-        S = start.states.shape[1]
-        if not S:
+        if not start.states.shape[1]:
             return start, e
         loss, _ = loss_at(held, e, d, start)
         columns = held.start_columns(d, effects, start)
-        free = 1 / held.state_spread**2
         for _ in range(_HELD_OUT_STEPS):
-            weights = held.levels.weights(e)
-            step = np.zeros((len(held.parts), S))
-            for r, (part, own) in enumerate(zip(held.parts, columns.states, strict=True)):
-                weighted = own * weights[part, None]
-                gradient = weighted.T @ e[part] + free * start.states[r]
-                step[r] = -np.linalg.solve(own.T @ weighted + np.diag(free), gradient)
-            moved = Start(start.states + step, start.zeros)
+            moves = [
+                best_move(held, part, own, e[part], states)
+                for part, own, states in zip(held.parts, columns.states, start.states, strict=True)
+            ]
+            moved = Start(start.states + moves, start.zeros)
             e2 = held.coefficients(d, effects, moved)
             loss2, _ = loss_at(held, e2, d, moved)
             if not loss2 < loss - 0.2:

@@ -155,20 +155,16 @@ def _judged(
         rests = {
             name: search.without(reduced, k)
             if fit and len(reduced.names) > 1
-            else best.get(_less(reduced, name))
+            else _best_without(best, reduced, name)
             for k, name in enumerate(reduced.names)
         }
-        within = [
-            _part(search, reduced, name, rest or search.base, parts.get(name), listed)
-            for name, rest in rests.items()
-        ]
+        within = [_part(search, reduced, name, rest, parts.get(name), listed) for name, rest in rests.items()]
         parts |= {part.name: part for part in within}
         least = min(within, key=lambda part: (part.matters, part.share))
-        smaller = rests[least.name]
-        if least.matters >= 0.5 or smaller is None:
+        if least.matters >= 0.5 or len(rests[least.name].names) < len(reduced.names) - 1:
             break
         # Two effects that can replace each other would both seem to carry nothing: the lesser goes first.
-        reduced = smaller
+        reduced = rests[least.name]
     at_edge = any(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
@@ -180,9 +176,15 @@ def _judged(
     return Judged(explanation, named, score_of(explanation, listed, model_error), complete)
 
 
-def _less(explanation: Explanation, name: str) -> tuple[str, ...]:
-    """Key of the set without this effect."""
-    return tuple(sorted(n for n in explanation.names if n != name))
+def _best_without(
+    best: Mapping[tuple[str, ...], Explanation], explanation: Explanation, name: str
+) -> Explanation:
+    """The set without this effect; where nobody fitted that, the best of its parts."""
+    rest = {n for n in explanation.names if n != name}
+    return max(
+        (e for key, e in best.items() if rest.issuperset(key)),
+        key=lambda e: (len(e.names) == len(rest), e.evidence),
+    )
 
 
 def _part(

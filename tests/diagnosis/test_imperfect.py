@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from diagnosis import Case, Experiment, diagnose
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent, descend
+from diagnosis.imperfect.descent import Descent, best_move, descend
 from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
@@ -59,6 +60,24 @@ def test_a_share_of_a_band_counts_the_same_at_any_size_above_its_floor():
     # Below what does not interest nothing is gained.
     floor = np.sqrt(levels.floor.sum() / e.size)
     assert levels.loss(1e-3 * floor * e) < 1e-3 * gains[0]
+
+
+def test_a_state_far_from_the_guess_is_found_in_one_move():
+    """Where the loss is flat: beside what it leaves there, the present residuals are large in every band."""
+    rng = np.random.default_rng(5)
+    case = _case(rng)
+    records, part = Records(case, case.estimation), slice(0, 800)
+    shapes = [np.ones(400), np.arange(400) / 400, *np.cos(np.outer([0.3, 0.7, 0.31, 0.71], np.arange(400)))]
+    columns = np.column_stack([coefficients(np.column_stack([s, 2 * s])) for s in shapes])
+    true = np.array([0.3, -2.0, 0.4, -0.2, 3.0, -2.0])
+    e = columns @ true + coefficients(1e-3 * rng.standard_normal((400, 2)))
+    move = best_move(records, part, columns, e, np.zeros(6))
+    at_the_end = records.levels.loss(e + columns @ move)
+    assert at_the_end < records.levels.loss(e - columns @ true) + 1
+    near = minimize(
+        lambda s: records.levels.loss(e + columns @ s) + 0.5 * np.sum((s / records.state_spread) ** 2), -true
+    )
+    assert at_the_end < near.fun + 0.1
 
 
 def test_a_drift_stays_in_the_lowest_octaves():

@@ -32,6 +32,22 @@ def test_a_swinging_start_follows_the_matrix_exponential() -> None:
         x = step @ x
 
 
+@pytest.mark.parametrize("mode", [0, 1])
+def test_behind_a_soft_joint_a_mode_is_one_that_link_and_root_swing_in_together(mode: int) -> None:
+    """With the hub held by its inertia the tip swings at one frequency: y[k+1] + y[k-1] = 2 cos(w) y[k]."""
+    held = {"hub.inertia_kg_m2": 1e9, "link.kelvin_voigt_s": 1e-12}
+    joint = parse_effect({"name": "joint_compliance", "stiffness_Nm_rad": 30.0, "damping_Nms": 0.0})
+    simulator = Simulator(paper_link().perturbed(held), [joint], n_modes=N_MODES, dt_s=2e-3)
+    shape = np.eye(2)[mode]
+    for start in (Start(deflections=0.01 * shape, rates=np.zeros(2)), Start(0, 0, np.zeros(2), shape)):
+        y = simulator.run(np.zeros(400), start=start).tip_true_m
+        both = y[2:] + y[:-2]
+        cosine = (both @ y[1:-1]) / (y[1:-1] @ y[1:-1]) / 2
+        assert np.max(np.abs(both - 2 * cosine * y[1:-1])) < 1e-6 * np.max(np.abs(y))
+    rigid = Simulator(paper_link().perturbed(held), n_modes=N_MODES).run(np.zeros(2), start=start).tip_true_m
+    assert np.sign(rigid[1] - rigid[0]) == np.sign(y[1] - y[0])
+
+
 def test_dry_friction_holds_where_it_starts() -> None:
     friction = parse_effect({"name": "coulomb_friction", "torque_Nm": 0.1})
     record = Simulator(paper_link(), [friction]).run(np.zeros(100), start=Start(hub_angle_rad=1.3))
