@@ -1,7 +1,7 @@
 """Time and memory over the size of what is given: one command in a process of its own for each size.
 
 Identification: one log of white-noise voltage through a lag and a light mode, order given; then several logs
-of one length. Study: points of the fast arm of the tests, one start each on coarse grids and without the
+of one length. Study: points of the fast arm of the tests, order 1, one start on coarse grids, without the
 bound over all controllers, so that 500 take minutes. Diagnosis: cases without a gap, of four records of 240
 samples, and one of six long records; controllers are not compared. CPU seconds of all its processes, and the
 largest memory that one of them ever had. A size of 0 is left out.
@@ -27,6 +27,7 @@ CHEAP_POINTS = TWO_POINTS.replace(
     """[changes]
 "achievable_performance.compute" = false
 "closed_loop.sensitivity" = false
+"specification.controller_order" = 1
 "synthesis.starts" = 1
 "synthesis.dense_points" = 500
 "synthesis.grid_points" = 30
