@@ -1,4 +1,4 @@
-"""Interrupts (SIGINT, SIGTERM, SIGHUP) that compiled code swallows, and processes that must not see them."""
+"""Interrupts (signals, the end of a time limit) that compiled code swallows, and processes that see none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 
 
 @contextmanager

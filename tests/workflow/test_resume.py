@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,7 @@ import pytest
 
 from benchmarks.interruptions import INTERRUPTS, KILLS, Found, chain, contents, random_stops
 from control_design.controllers.controller import Controller
-from tests.workflow.command import FAST_ARM, finish, kill, start_flexlink, wait_until
+from tests.workflow.command import FAST_ARM, ROOT, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
 from workflow.config.run_config import load_config
 from workflow.engine import storage
@@ -98,6 +100,31 @@ def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path, number):
     said = finish(process, 128 + number)
     assert time.monotonic() - sent_s < 5.0  # two seconds on a machine that is not shared
     assert said.strip().endswith(f"flexlink run --config {FAST_ARM} --out {out} --resume continues")
+
+
+_CLEANING_UP = """
+import os, signal, sys, time
+from workflow.engine import interrupts
+
+class Left:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        for _ in range(1000):
+            pass
+
+interrupts.watch()
+try:
+    Left()
+    time.sleep(20)
+except KeyboardInterrupt:
+    sys.exit(interrupts.exit_code())
+"""
+
+
+def test_an_interrupt_while_python_cleans_up_does_not_go_under():
+    """There Python prints the exception and goes on."""
+    ended = subprocess.run([sys.executable, "-c", _CLEANING_UP], cwd=ROOT, capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGTERM, b"")
 
 
 def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path):

@@ -4,6 +4,7 @@ come, asked about before a result is kept."""
 from __future__ import annotations
 
 import signal
+import sys
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -16,6 +17,7 @@ def watch() -> None:
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _remember)
+    sys.unraisablehook = _again
 
 
 def limit(seconds: float | None) -> None:
@@ -62,5 +64,18 @@ def words() -> str:
 
 def _remember(number: int, frame: FrameType | None) -> None:
     global _came
-    _came = number
+    _came = _came or number
     raise KeyboardInterrupt
+
+
+_AGAIN_S = 0.02
+
+
+def _again(event: sys.UnraisableHookArgs) -> None:
+    """An interrupt that came while Python was cleaning up or in a callback of a library, where it goes under
+    with two lines on standard error, comes again a moment later."""
+    if not issubclass(event.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(event)
+    elif _came is not None:
+        signal.signal(signal.SIGALRM, _remember)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
