@@ -21,10 +21,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
-from workflow.figures.reading import marked
+from workflow.figures.reading import marked, without_minor_ticks
 
 MEASURED = "#6b6b6b"  # what sensors said
 MODEL = "#0072B2"  # identified model, open loop
@@ -169,15 +169,9 @@ def _settle(figure: Figure) -> None:
     """
     engine = figure.get_layout_engine()
     if engine is not None:
-        # Minor ticks have no words and are shorter than the others, but would be measured twelve times.
         # Drawing everything, as draw_without_rendering does, would take as long again.
-        every = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
-        minor = [(axis, axis.get_minor_locator()) for axis in every]
-        for axis in every:
-            axis.set_minor_locator(NullLocator())
-        engine.execute(figure)
-        for axis, locator in minor:
-            axis.set_minor_locator(locator)
+        with without_minor_ticks(figure):
+            engine.execute(figure)
     figure.set_layout_engine("none")
     figure.align_ylabels()  # only now: the solver would ask every label of a column for every other one
     for axes in figure.axes:
