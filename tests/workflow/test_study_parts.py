@@ -273,6 +273,9 @@ def test_the_process_that_others_are_forked_off_may_die_too(monkeypatch):
     with closing(LocalProcesses(1, preload=["workflow.study.task"])) as processes:
         found = processes.run([task] * 3)
         assert "code of the worker" in next(found)[1].reason
+        # It does not see interrupts from the keyboard, not while it loads either.
+        status = Path(f"/proc/{forkserver._forkserver._forkserver_pid}/status").read_text()
+        assert int(status.partition("SigBlk:")[2].split()[0], 16) & 1 << (signal.SIGINT - 1)
         os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)
         assert "code of the worker" in next(found)[1].reason
         ensure_running = forkserver._forkserver.ensure_running

@@ -17,11 +17,13 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
 
+from control_design.synthesis.interrupts import interrupts_wait
 from workflow.engine.errors import InputError, StageError, one_line
 from workflow.engine.threads import one_thread_each
 
@@ -155,6 +157,10 @@ def _begin(process: BaseProcess) -> None:
     """Start it, where the process that all are forked off dies meanwhile off a new one. Raises StageError."""
     for _ in range(MOST_ATTEMPTS):
         try:
+            if sys.platform.startswith("linux"):
+                # It loads for seconds and would tell of an interrupt from the keyboard with a traceback.
+                with interrupts_wait():
+                    forkserver.ensure_running()
             return process.start()
         except (EOFError, ConnectionError):
             time.sleep(0.5)  # until the dead one is known to be dead
