@@ -34,6 +34,11 @@ class Answer:
         return json.loads(self.out)
 
 
+# Of tests in the background of a shell, or behind nohup, commands would inherit that these are ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 def start_flexlink(
     *arguments: object, stdout: IO[bytes] | int = subprocess.PIPE, threads: int = 1
 ) -> subprocess.Popen[bytes]:

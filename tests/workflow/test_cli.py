@@ -470,7 +470,7 @@ def test_a_full_disk_leaves_no_half_of_the_experiments(refused, monkeypatch, tmp
 
 
 def test_reader_that_leaves_early_is_no_error(fast_run):
-    with start_flexlink("report", fast_run[0]) as process:
+    with start_flexlink("report", fast_run[0], "--quiet") as process:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 0
@@ -478,7 +478,7 @@ def test_reader_that_leaves_early_is_no_error(fast_run):
 
 def test_output_that_cannot_be_written_is_one_line(fast_run):
     with open("/dev/full", "wb") as full:
-        process = start_flexlink("report", fast_run[0], "--json", stdout=full)
+        process = start_flexlink("report", fast_run[0], "--json", "--quiet", stdout=full)
         _, err = process.communicate()
     assert process.returncode == 2
     assert err.decode() == "flexlink: cannot write the output: No space left on device\n"
