@@ -245,7 +245,7 @@ def chain(
 def _continued(code: int, error: str, number: int, first: Sequence[str], out: Path) -> tuple[list[str], str]:
     """What the user is told to call, and what is wrong with what was said."""
     if code != 128 + number or error.count("\n") != 1:
-        return [*first, "--resume"], f"exit {code}: {error.strip()[-400:]!r}"
+        return [*first, "--resume"], f"exit {code}: {error.strip()[-2000:]!r}"
     if not out.exists() and error == "flexlink: interrupted\n":
         return list(first), ""
     wanted = f"flexlink: interrupted; {shlex.join(['flexlink', *first, '--resume'])} continues\n"
@@ -281,21 +281,18 @@ def run(
         out(f"{'':28}{'':>8}{'before':>8}{'after':>7}{'went':>7}{'until it has ended: CPU s':>28}   wall s")
         heads = f"{'stopped':>8}{'a word':>8}{'all':>7}{'wrong':>7}{'largest':>28}"
         out(f"{'':28}{heads}   median, largest, above {LONGEST_END_S:g}")
-        total, bad = Found(), []
+        total = Found()
         for ways, wanted in ((KILLS, kills), (INTERRUPTS, interrupts)):
             if not wanted:
                 continue
             for (name, call), count in zip(known.items(), _shares(wanted, len(known)), strict=True):
                 able = [way for way in ways if way.reach != "one" or name != "run"]  # which has but itself
                 place = folder / f"{name}-{able[0].number.name}"
-                for way, found in _stopped(call, place, whole[name], able, count, stops, seed).items():
+                for way, found in _stopped(out, call, place, whole[name], able, count, stops, seed).items():
                     told(out, f"{name}, {way}", found)
                     for each in dataclasses.fields(Found):
                         setattr(total, each.name, getattr(total, each.name) + getattr(found, each.name))
-                    bad += found.bad
         told(out, "all", total)
-        for line in bad:
-            out(line)
 
 
 def told(out: Print, what: str, found: Found) -> None:
@@ -311,6 +308,7 @@ def _shares(total: int, parts: int) -> list[int]:
 
 
 def _stopped(
+    out: Print,
     call: Sequence[str],
     place: Path,
     whole: tuple[dict[str, bytes], float],
@@ -319,7 +317,7 @@ def _stopped(
     longest: int,
     seed: int,
 ) -> dict[Way, Found]:
-    """Chains until so many stops were made."""
+    """Chains until so many stops were made; what went wrong is told after each."""
     found = {way: Found() for way in ways}
     files, cpu_s = whole
     for number in range(10 * count):
@@ -328,7 +326,11 @@ def _stopped(
             break
         rng = np.random.default_rng([seed, number, len(ways)])
         stops = random_stops(rng, ways, made, min(longest, count - made), cpu_s)
+        told_before = {way: len(one.bad) for way, one in found.items()}
         chain(call, place.with_name(f"{place.name}-{number}"), files, stops, found)
+        for way, one in found.items():
+            for line in one.bad[told_before[way] :]:
+                out(line)
     return found
 
 
