@@ -13,12 +13,12 @@ from workflow.engine import interrupts
 def main() -> int:
     """The command line, from loading it to its end: an interrupt is one line at any moment."""
     try:
-        interrupts.watch()
-        from workflow.cli import main as command  # half a second
+        interrupts.watch(later=True)
+        from workflow.cli import main as command  # half a second, then it knows what continues
 
         code = command()
         interrupts.ignore()  # all is done and said
-    except KeyboardInterrupt:  # while it was loaded
+    except KeyboardInterrupt:  # just now
         sys.stderr.write(f"flexlink: {interrupts.words()}\n")
         code = interrupts.exit_code()
     if interrupts.came():

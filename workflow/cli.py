@@ -682,6 +682,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not arguments:
         arguments = ["--help"]
     try:
+        if argv is None:
+            interrupts.watch()
+        interrupts.check()
         _plug_in(arguments)
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         sys.stdout.flush()

@@ -127,6 +127,31 @@ def test_an_interrupt_while_python_cleans_up_does_not_go_under():
     assert (ended.returncode, ended.stderr) == (128 + signal.SIGTERM, b"")
 
 
+_WHILE_LOADING = """
+import signal, sys
+from workflow.__main__ import main
+from workflow.engine import interrupts
+
+watch = interrupts.watch
+
+def interrupted(**how):
+    interrupts.watch = watch
+    watch(**how)
+    signal.raise_signal(signal.SIGTERM)
+
+interrupts.watch = interrupted
+sys.exit(main())
+"""
+
+
+def test_an_interrupt_while_the_command_loads_says_how_to_go_on(fast_run):
+    called = ("run", "--out", str(fast_run[0]), "--resume")
+    command = [sys.executable, "-c", _WHILE_LOADING, *called]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    said = f"flexlink: interrupted; flexlink {' '.join(called)} continues\n"
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGTERM, said)
+
+
 def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path):
     out = tmp_path / "run"
     called = ("run", "--config", FAST_ARM, "--out", out, "--time-limit", "4")

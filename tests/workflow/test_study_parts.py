@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import tomllib
 from contextlib import closing
@@ -287,6 +288,41 @@ def test_the_process_that_others_are_forked_off_may_die_too(monkeypatch):
 
         monkeypatch.setattr(forkserver._forkserver, "ensure_running", dead_at_once)
         assert "code of the worker" in next(found)[1].reason
+
+
+_INTERRUPTED = """
+import signal, sys
+from workflow.engine import interrupts
+from workflow.engine.executor import LocalProcesses
+
+class Large:
+    def __init__(self):
+        self.content = bytes(10**6)  # more than a pipe holds: sending it waits until a process reads
+
+if __name__ == "__main__":
+    interrupts.watch()
+    interrupts.limit(0.5)
+    try:
+        list(LocalProcesses(1, preload=["loads_long"]).run([Large()]))
+    except KeyboardInterrupt:
+        sys.exit(interrupts.exit_code())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked off another one on Linux only")
+def test_an_interrupt_while_a_process_begins_is_no_traceback(tmp_path):
+    script = tmp_path / "interrupted.py"
+    script.write_text(_INTERRUPTED)
+    (tmp_path / "loads_long.py").write_text("import time; time.sleep(2)")
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    ended = subprocess.run(
+        [sys.executable, str(script)],
+        capture_output=True,
+        timeout=60,
+        env=os.environ | {"PYTHONPATH": path},
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGALRM, b"")
 
 
 SEARCH = (

@@ -89,7 +89,9 @@ class LocalProcesses:
             # Forked off a process that has loaded the libraries (seconds) and done nothing else; first
             # flexlink, which sees to it that a plant.py in the current folder is not taken for ours.
             self._context = multiprocessing.get_context("forkserver")
-            self._context.set_forkserver_preload(["flexlink", __name__, *preload])
+            self._context.set_forkserver_preload(
+                ["flexlink", "workflow.engine.forked_off", __name__, *preload]
+            )
         else:
             self._context = multiprocessing.get_context("spawn")
         self._running: dict[Connection, tuple[int, BaseProcess]] = {}

@@ -12,11 +12,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _came: int | None = None
 
 
-def watch() -> None:
-    """Remember an interrupt besides raising KeyboardInterrupt; what is ignored (nohup) stays so."""
+def watch(*, later: bool = False) -> None:
+    """Remember an interrupt besides raising KeyboardInterrupt, or with `later` leave that to `check`; what is
+    ignored (nohup) stays so."""
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _remember)
+            signal.signal(number, _keep if later else _remember)
     sys.unraisablehook = _again
 
 
@@ -41,8 +42,8 @@ def ignore() -> None:
 
 
 def check() -> None:
-    """Raises KeyboardInterrupt if one came and went under in compiled code that calls back into Python: what
-    such a library returns then is a solution of nothing."""
+    """Raises KeyboardInterrupt if one came while commands were loaded, or went under in compiled code that
+    calls back into Python: what such a library returns then is a solution of nothing."""
     if _came is not None:
         raise KeyboardInterrupt
 
@@ -62,9 +63,13 @@ def words() -> str:
     return "the time limit is reached" if _came == signal.SIGALRM else "interrupted"
 
 
-def _remember(number: int, frame: FrameType | None) -> None:
+def _keep(number: int, frame: FrameType | None) -> None:
     global _came
     _came = _came or number
+
+
+def _remember(number: int, frame: FrameType | None) -> None:
+    _keep(number, frame)
     raise KeyboardInterrupt
 
 
