@@ -10,13 +10,14 @@ from typing import Annotated
 
 import typer
 
-from workflow.cli import Json, Quiet, print_json
+from workflow.cli import Json, Quiet, TimeLimit, print_json
 
 
 def paper(
     out: Annotated[Path, typer.Option(help="Directory for page, figures and table; new or empty.")],
     seed: Annotated[int, typer.Option(min=0, help="Root of all inputs and noise.")] = 2006,
     replace: Annotated[bool, typer.Option("--replace", help="Exchange an earlier page in --out.")] = False,
+    time_limit: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
     """Redraw the figures of Ziaei & Wang 2006.
@@ -56,6 +57,7 @@ def blind(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run in --out; completed cases are reused.")
     ] = False,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:

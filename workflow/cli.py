@@ -43,7 +43,7 @@ from workflow.engine.threads import one_thread
 if TYPE_CHECKING:
     from workflow.tasks.summary import RunSummary
 
-_MANIFESTS = ("manifest.json", "study.json", "diagnose.json")  # of what can be continued
+_MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
 
 app = typer.Typer(
     name="flexlink",
@@ -65,10 +65,18 @@ Resume = Annotated[
 ]
 Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
-TimeLimit = Annotated[
+
+
+def _limit(seconds: float | None) -> float | None:
+    interrupts.limit(seconds)
+    return seconds
+
+
+TimeLimit = Annotated[  # a command has but to name it
     float | None,
     typer.Option(
         min=1e-3,
+        callback=_limit,
         metavar="SECONDS",
         help="End after so long as if interrupted, with exit code 142; what is done is kept for --resume, "
         "where the command has it.",
@@ -130,7 +138,6 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
-    interrupts.limit(time_limit)
     need(config)
     from workflow.console import TerminalProgress
 
@@ -156,6 +163,7 @@ def simulate(
         Path | None,
         typer.Option(help="TOML file with [source] kind = 'simulated'; without it the default arm."),
     ] = None,
+    time_limit: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
     """Simulate the experiments of a configuration and write them as CSV."""
@@ -192,6 +200,7 @@ def excite(
     periods: Annotated[int, typer.Option(min=1, help="Whole periods of a record.")] = 2,
     lead_in: Annotated[float, typer.Option(min=0, help="From rest to steady state [s].")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random phases and lines.")] = 2006,
+    time_limit: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
     """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
@@ -223,6 +232,7 @@ def look(
     ] = None,
     time_unit: Annotated[str | None, typer.Option(help="Unit of the time column, as in identify.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write a page here (HTML, one file).")] = None,
+    time_limit: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
     """Columns, units, sampling (period, jitter, missing rows), ranges, clipping and quantisation of a log."""
@@ -351,7 +361,6 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
-    interrupts.limit(time_limit)
     need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
     from workflow.commands.identify import identify_logs
@@ -438,7 +447,6 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
-    interrupts.limit(time_limit)
     need(*source, specification)
     from workflow.console import TerminalProgress
 
@@ -465,6 +473,7 @@ def report(
         list[PictureFile] | None,
         typer.Option(help="Further kind of file for every picture in figures/, beside SVG; may be repeated."),
     ] = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -498,7 +507,6 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
-    interrupts.limit(time_limit)
     need(config)
     from workflow.console import TerminalProgress
 

@@ -9,6 +9,8 @@ import re
 import shutil
 import subprocess
 import sys
+import time
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,9 @@ import pytest
 import scipy.io
 
 from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
+from workflow import cli
 from workflow.cli import main
+from workflow.engine import interrupts
 
 FILES_CONFIG = """
 [run]
@@ -328,6 +332,17 @@ def test_version_and_module_entry():
     out, err = process.communicate()
     assert process.returncode == 0, err.decode()
     assert out.decode().startswith("flexlink ")
+
+
+def test_every_command_takes_a_time_limit(flexlink, monkeypatch, tmp_path):
+    cli._plug_in(["those of other packages too"])
+    commands = cli._commands()
+    assert {"simulate", "excite", "look", "report", "blind", "paper"} <= commands.keys()
+    assert [name for name, call in commands.items() if "time_limit" not in signature(call).parameters] == []
+    monkeypatch.setattr(interrupts, "_came", None)
+    monkeypatch.setattr("workflow.commands.simulate.simulate_to_csv", lambda *_: time.sleep(30))
+    answer = flexlink("simulate", "--out", tmp_path / "out", "--time-limit", "0.2")
+    assert (answer.code, answer.err) == (142, "flexlink: the time limit is reached\n")
 
 
 def divided():
