@@ -68,7 +68,7 @@ def compare(*results: Any, names: Sequence[str] = ()) -> Figure:
     >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
     >>> rough = flexlink.identify(example_record(), n_pairs=0, n_real=2)
     >>> figure = flexlink.compare(found, rough, names=["one mode", "two lags"])
-    >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    >>> [text.get_text() for text in figure.legends[0].get_texts()]
     ['one mode', 'two lags']
     """
     from workflow.figures.bode import draw_comparison

@@ -110,6 +110,7 @@ def test_results_show_draw_and_convert():
         assert "object at" not in repr(result)
         assert result._repr_html_().startswith("<p><b>")
         assert isinstance(result.plot(), Figure)
+        assert result.plot()._repr_svg_().endswith("</svg>\n")
         assert len(result.table()) > 0
     assert "mode" in found._repr_html_().partition("<table")[2]
     assert certificate.items[0].requirement in certificate._repr_html_().partition("<table")[2]

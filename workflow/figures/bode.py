@@ -113,7 +113,6 @@ def draw_comparison(responses: Mapping[str, FrequencyUncertainty]) -> Figure:
             phase.fill_between(band.omega_rad_s, band.phase_low_deg, band.phase_high_deg, **filled)
     gain.set(xscale="log", yscale="log", ylabel="gain [as logged]", title="Responses compared")
     phase.set(ylabel="phase [deg]", xlabel="frequency [rad/s]")
-    gain.legend()
     style.hertz_axis(gain)
     return figure
 

@@ -108,9 +108,19 @@ def house_style() -> contextlib._GeneratorContextManager[None]:
     return mpl.rc_context(_RC)
 
 
+class NotebookFigure(Figure):
+    """A figure that a notebook shows; it would know those of pyplot only."""
+
+    def _repr_svg_(self) -> str:
+        text = io.StringIO()
+        with house_style():
+            self.savefig(text, format="svg")
+        return text.getvalue()
+
+
 def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     """An empty figure of the page's width, laid out automatically, owned by no global state."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    figure = NotebookFigure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
