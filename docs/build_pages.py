@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
+import shutil
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
+import jupytext
+import nbformat
 from mkdocs.structure.files import File, Files
+from nbclient import NotebookClient
+from nbconvert import MarkdownExporter
+from nbconvert.filters import strip_ansi
 from pydantic import BaseModel
 
 ROOT = Path(__file__).resolve().parents[1]
 GALLERY = ROOT / "build" / "gallery"
+KERNEL = """---
+jupyter:
+  kernelspec:
+    name: python3
+    display_name: Python 3
+    language: python
+---
+"""
 UNITS = {
     "rad_s": "rad/s", "Nms": "N m s", "Nm": "N m", "kg_m2": "kg m²", "kg_m": "kg/m", "kg": "kg", "rad": "rad",
     "deg": "deg", "Hz": "Hz", "dB": "dB", "percent": "%", "samples": "samples", "V": "V",
@@ -50,8 +67,44 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Links to files of the repository, which are not on the site, become their names."""
+    """Tutorials are run. Links to files of the repository, which are not on the site, become their names."""
+    if page.file.src_uri.startswith("tutorials/"):
+        markdown = notebook(markdown, Path(page.file.src_uri), config, files)
     return re.sub(r"\[[^\]]*\]\((?:\.\./)+((?:examples|benchmarks|tests)[^)]*)\)", r"`\1`", markdown)
+
+
+def notebook(markdown: str, page: Path, config: Any, files: Files) -> str:
+    """The page with what its cells show, each picture a file; the notebook itself beside it."""
+    cells = jupytext.reads(KERNEL + markdown, fmt="md")
+    if config.extra["execute"]:
+        run(cells)
+    text, found = MarkdownExporter().from_notebook_node(cells)
+    for name, content in found["outputs"].items():
+        text = text.replace(f"({name})", f"({page.stem}_{name})")
+        files.append(File.generated(config, f"{page.parent}/{page.stem}_{name}", content=content))
+    files.append(File.generated(config, f"{page.with_suffix('.ipynb')}", content=nbformat.writes(cells)))
+    # Tables and pictures as those of the other pages, text without the colours of a terminal.
+    text = re.sub(r"<style scoped>.*?</style>", "", strip_ansi(text), flags=re.DOTALL)
+    text = re.sub(r"<table[^>]*>", "<table>", text).replace("![svg]", "![What the lines above draw]")
+    text = text.replace("%%bash\n", "")
+    return text.replace("\n\n", f"\n\n[This page as a notebook]({page.stem}.ipynb){{ .notebook }}\n\n", 1)
+
+
+def run(cells: nbformat.NotebookNode) -> None:
+    """Run a notebook in a directory with the examples and nothing else; progress is not kept."""
+    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    with TemporaryDirectory() as folder:
+        shutil.copytree(ROOT / "examples", Path(folder) / "examples")
+        shutil.rmtree(Path(folder) / "examples" / "logs", ignore_errors=True)
+        NotebookClient(
+            cells,
+            kernel_name="python3",
+            extra_arguments=["--log-level=ERROR"],
+            resources={"metadata": {"path": folder}},
+            coalesce_streams=True,
+        ).execute()
+    for cell in cells.cells:
+        cell.outputs = [shown for shown in cell.get("outputs", []) if shown.get("name") != "stderr"]
 
 
 def unit_of(key: str, meaning: str) -> str:
