@@ -63,12 +63,18 @@ def run(
         with pytest.MonkeyPatch.context() as patch:
             draw_nothing(patch)
             run_from_files(FAST_ARM, folder / "run")
+            with pytest.MonkeyPatch.context() as replay:
+                for number, (name, output) in enumerate(texts.outputs_replayed(folder, replay).items(), 96):
+                    told(
+                        f"{name}'s directory, then --resume", texts.tampered(output, folder, tampered, number)
+                    )
             texts.cut_computations_off(patch)
             (folder / "good").mkdir()
             good = texts.good_files(folder / "good")
             for number, kind in enumerate(texts.KINDS):
                 told(f"given to a command: {kind}", texts.spoilt_files(good[kind], number, folder, spoilt))
-            told("run directory, then report or --resume", texts.tampered(folder / "run", folder, tampered))
+            found = texts.tampered(texts.run_output(folder / "run"), folder, tampered, 99)
+            told("directory of run, then --resume or report", found)
     told("all", total)
 
 

@@ -706,6 +706,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _no_more_output()  # whoever read it has left; there is nobody to tell
         return EXIT_OK
     except Exception as error:
+        if interrupts.came():  # this is what a library has made of it
+            return _interrupted(arguments)
         if isinstance(error, OSError) and error.filename is None:
             _no_more_output()
         if debug:

@@ -353,18 +353,25 @@ def stopped():
     raise KeyboardInterrupt
 
 
+def swallowed():
+    interrupts._keep(2, None)  # in compiled code, which makes something else of it
+    raise ValueError("invalid matrix")
+
+
 @pytest.mark.parametrize(
     ("fails", "code", "line"),
     [
         (divided, 1, "internal error: ZeroDivisionError: division by zero (--debug shows where)\n"),
         (lambda: np.zeros(2**45), 1, "out of memory (Unable to allocate"),  # more than any address space
         (stopped, 130, "interrupted\n"),  # nothing is there to be continued
+        (swallowed, 130, "interrupted\n"),
     ],
-    ids=["error", "memory", "interrupt"],
+    ids=["error", "memory", "interrupt", "swallowed"],
 )
 @pytest.mark.parametrize("command", ["run.run_from_files", "simulate.simulate_to_csv"])
 def test_what_nobody_expected_is_one_line(flexlink, monkeypatch, tmp_path, command, fails, code, line):
     monkeypatch.setattr(f"workflow.commands.{command}", lambda *arguments, **options: fails())
+    monkeypatch.setattr(interrupts, "_came", None)
     call = command.partition(".")[0], "--out", tmp_path / "run"
     answer = flexlink(*call)
     assert answer.code == code

@@ -321,6 +321,11 @@ def test_resuming_does_only_what_is_missing(cases, tmp_path, here):
     diagnose_cases(cases, out, controller=False, resume=True, engine=engine)
     assert seen.read_text() == "one\ntwo\ntwo\none\n"
     assert everything(out) == first
+    # Nor is an answer that was edited itself.
+    (out / "two.json").write_text((out / "two.json").read_text().replace("friction", "backlash"))
+    diagnose_cases(cases, out, controller=False, resume=True, engine=engine)
+    assert seen.read_text() == "one\ntwo\ntwo\none\ntwo\n"
+    assert everything(out) == first
 
 
 def test_another_code_version_is_done_again(cases, tmp_path, here, monkeypatch):

@@ -9,26 +9,25 @@ import json
 import re
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace as with_fields
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import workflow.commands.designed
-import workflow.diagnose.command
-import workflow.study.work
 import workflow.tasks.design_source
 import workflow.tasks.pipeline
 import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
 from tests.ident.mutations import Tally, tally
 from tests.workflow.command import FAST_ARM, ROOT
-from tests.workflow.diagnosis_examples import write_case
+from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
-from tests.workflow.study_examples import SMALL_STUDY
+from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
 from tests.workflow.test_cli import good_table, write_case as write_own
 from tests.workflow.test_design_sources import (
     QUICK,
@@ -40,6 +39,7 @@ from tests.workflow.test_design_sources import (
     write_response,
 )
 from workflow.cli import main
+from workflow.engine.executor import LocalProcesses
 
 TINY_SIMULATION = """
 [run]
@@ -164,8 +164,7 @@ def cut_computations_off(monkeypatch: pytest.MonkeyPatch) -> None:
         "simulate",
         lambda rig, voltage, *a, **k: simulate(rig, voltage, *a, **k) if len(voltage) < 2000 else _computes(),
     )
-    monkeypatch.setattr(workflow.study.work._Work, "make_base_plant", _computes)
-    monkeypatch.setattr(workflow.diagnose.command, "_compute", _computes)
+    monkeypatch.setattr(LocalProcesses, "run", _computes)
 
 
 def refusal(arguments: list[str], folder: Path) -> str | None:
@@ -211,20 +210,81 @@ def spoilt_files(one: Kind, number: int, folder: Path, count: int) -> Tally:
     return tally(attempt, count, number)
 
 
-def tampered(whole: Path, folder: Path, count: int) -> Tally:
-    """`report` and `run --resume` on a run's directory that was tampered with."""
+Call = Callable[[Path], list[str]]
+
+
+@dataclass(frozen=True)
+class Output:
+    """A directory that a command left, what reads it again, and those files of it that come out the same."""
+
+    whole: Path
+    calls: tuple[Call, ...]
+    same: tuple[str, ...] = ()
+
+
+def run_output(run: Path) -> Output:
+    return Output(
+        run, (lambda place: ["run", "--out", str(place), "--resume"], lambda place: ["report", str(place)])
+    )
+
+
+def outputs_replayed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Output]:
+    """A study and a diagnosis of two cases; from then on every task ends at once as it did there."""
+    kept: dict[str, Any] = {}
+    compute = LocalProcesses.run
+
+    def name(task: Any) -> str:
+        points = getattr(task, "points", None)
+        return task.loaded.case.name if points is None else f"{task.stages} of {points[0].name}"
+
+    def keep(self: LocalProcesses, tasks: Sequence[Any], watch: Any = None) -> Iterator[tuple[int, Any]]:
+        for index, found in compute(self, tasks, watch):
+            kept[name(tasks[index])] = found
+            yield index, found
+
+    def replay(self: LocalProcesses, tasks: Sequence[Any], watch: Any = None) -> Iterator[tuple[int, Any]]:
+        yield from ((index, kept[name(task)]) for index, task in enumerate(tasks))
+
+    study = ["study", "--config", str(write_study(folder, TWO_POINTS)), "--out"]
+    cases = [write_case(folder / "still"), write_case(folder / "sticking", FRICTION)]
+    diagnosis = ["diagnose", *map(str, cases), "--no-controller", "--out"]
+    monkeypatch.setattr(LocalProcesses, "run", keep)
+    for call in (study, diagnosis):
+        assert refusal([*call, str(folder / call[0])], folder) is None
+    monkeypatch.setattr(LocalProcesses, "run", replay)
+
+    def again(call: list[str]) -> Call:
+        return lambda place: [*call, str(place), "--resume"]
+
+    def point(place: Path) -> list[str]:
+        return ["report", str(place / "points" / "1")]
+
+    others = {"diagnose.json", "timings.json", "lock"}
+    answers = sorted({path.name for path in (folder / "diagnose").iterdir()} - others)
+    return {
+        "study": Output(folder / "study", (again(study), point), ("table.csv", "table.json", "study.html")),
+        "diagnose": Output(folder / "diagnose", (again(diagnosis),), tuple(answers)),
+    }
+
+
+def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
+    """Its calls on the directory tampered with: refused, or the first ends with the same files."""
 
     def attempt(rng: np.random.Generator) -> str | None:
         place = folder / "place"
-        shutil.copytree(whole, place)
+        shutil.copytree(one.whole, place, symlinks=True)
         try:
             tamper(rng, place)
-            command = ["report", str(place)] if rng.integers(2) else ["run", "--out", str(place), "--resume"]
-            return refusal(command, place)
+            call = int(rng.integers(len(one.calls)))
+            line = refusal(one.calls[call](place), place)
+            if line is None and call == 0:
+                for name in one.same:
+                    assert (place / name).read_bytes() == (one.whole / name).read_bytes(), f"{name} differs"
+            return line
         finally:
             shutil.rmtree(place)
 
-    return tally(attempt, count, 99)
+    return tally(attempt, count, number)
 
 
 def spoilt_controllers(count: int) -> Tally:
@@ -256,7 +316,15 @@ def test_spoilt_files_are_refused_or_taken(kinds, tmp_path, kind, amount):
 @FEW_AND_ALL
 @pytest.mark.usefixtures("cut_off", "undrawn")
 def test_tampered_run_directories(fast_run, tmp_path, amount):
-    assert tampered(fast_run[0], tmp_path, 8 if amount == "few" else 500).wrong == []
+    assert tampered(run_output(fast_run[0]), tmp_path, 8 if amount == "few" else 500, 99).wrong == []
+
+
+@pytest.mark.usefixtures("undrawn")
+@FEW_AND_ALL
+def test_tampered_studies_and_diagnoses(tmp_path, monkeypatch, amount):
+    outputs = outputs_replayed(tmp_path, monkeypatch)
+    for number, one in enumerate(outputs.values(), 96):
+        assert tampered(one, tmp_path, 12 if amount == "few" else 300, number).wrong == []
 
 
 @FEW_AND_ALL

@@ -12,16 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from benchmarks.interruptions import INTERRUPTS, KILLS, Found, chain, contents, random_stops
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, ROOT, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
 from workflow.config.run_config import load_config
-from workflow.engine import storage
-from workflow.engine.errors import InputError
+from workflow.engine import interrupts, storage
+from workflow.engine.errors import CommandInterruptedError, InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.figures.style import render
 from workflow.report import run_report
 from workflow.report.stage import REPORT
 from workflow.tasks.controller_files import write_controller
@@ -150,6 +152,26 @@ def test_an_interrupt_while_the_command_loads_says_how_to_go_on(fast_run):
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     said = f"flexlink: interrupted; flexlink {' '.join(called)} continues\n"
     assert (ended.returncode, ended.stderr) == (128 + signal.SIGTERM, said)
+
+
+def test_an_interrupt_that_a_library_makes_something_else_of_is_one(fast_run, tmp_path, monkeypatch):
+    def swallowed(*_):
+        monkeypatch.setattr(interrupts, "_came", signal.SIGTERM)
+        raise ValueError("invalid matrix")
+
+    out = tmp_path / "run"
+    shutil.copytree(fast_run[0], out)
+    (out / "report.html").unlink()
+    monkeypatch.setattr(run_report, "write_report", swallowed)
+    with pytest.raises(CommandInterruptedError):
+        run_from_files(FAST_ARM, out, resume=True)
+    assert RunDirectory.open(out).manifest()["status"] == "interrupted"
+
+
+def test_no_picture_that_an_interrupt_went_under_in_is_kept(monkeypatch):
+    monkeypatch.setattr(interrupts, "_came", signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        render(Figure())
 
 
 def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path):

@@ -11,7 +11,7 @@ from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
 from workflow.config.uncertainty_options import UncertaintyOptions
-from workflow.engine import codec, storage
+from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.tasks import truth
@@ -74,6 +74,7 @@ def identified(
         files[out] = storage.npz_bytes(codec.to_arrays(plant))
     if export is not None:
         files[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))
+    interrupts.check()
     storage.write_together(files)
     return _summary(result, out, report, export)
 

@@ -8,8 +8,8 @@
     index.html                 overview of several cases
     timings.json               seconds per case; the only file that differs from run to run
 
-The JSON file of a case is written last and names the hashes of the others: a case whose JSON file stands,
-made from the same inputs by the same code, is done.
+The JSON file of a case is written last and names the hashes of the others and of itself: a case whose JSON
+file stands, made from the same inputs by the same code, is done.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from workflow.engine import storage
+from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import first_difference
 from workflow.engine.store import Store
@@ -29,6 +29,12 @@ from workflow.engine.store import Store
 LAYOUT_VERSION = 1
 MANIFEST = "diagnose.json"
 _ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv", ".xml")
+
+
+def answer_text(document: Mapping[str, Any]) -> str:
+    """An answer as its JSON file has it, with the hash of the rest in it."""
+    rest = {key: value for key, value in document.items() if key != "sha256"}
+    return codec.plain_text({**rest, "sha256": storage.sha256_of_bytes(codec.plain_text(rest).encode())})
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ class DiagnosisDirectory(Store):
     def finished(self, case: str, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
         """The answer to a case if it is there, whole and made from this; else None."""
         document = self._document(f"{case}.json")
-        if document.get("made_from") != made_from:
+        if document.get("made_from") != made_from or answer_text(document) != self._text(case):
             return None
         for name, digest in document.get("files", {}).items():
             file = self.path / name
@@ -106,6 +112,9 @@ class DiagnosisDirectory(Store):
             return storage.read_json(self.path / name)
         except InputError:
             return {}
+
+    def _text(self, case: str) -> str:
+        return (self.path / f"{case}.json").read_text("utf-8")
 
     def discard_if_empty(self) -> None:
         """Take back what `begin` wrote if there is no answer: a corrected case may come. Hold the lock."""

@@ -21,6 +21,7 @@ from plant.effects import LOOK_ALIKES, Effect
 from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
+from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import document_of
 from workflow.diagnose.following import Following, following
 from workflow.diagnose.per_cent import moved, partial_answers, shown
@@ -127,7 +128,7 @@ class Work:
         document = document_of(loaded, found, beside)
         document["made_from"] = self.made_from
         document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
-        return {**files, f"{loaded.case.name}.json": codec.plain_text(document).encode()}
+        return {**files, f"{loaded.case.name}.json": answer_text(document).encode()}
 
 
 def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:

@@ -24,6 +24,7 @@ from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
+from workflow.engine import interrupts
 from workflow.figures.reading import marked, without_minor_ticks
 
 MEASURED = "#6b6b6b"  # what sensors said
@@ -160,9 +161,10 @@ def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
         FigureCanvasAgg(figure)
         svg = _shorter(text.getvalue().encode())
         files = {kind: _saved(figure, kind) for kind in also}
-        if len(svg) <= SVG_LIMIT_BYTES:
-            return Picture("svg", svg, plot, files)
-        return Picture("png", files.get("png") or _saved(figure, "png"), plot, files)
+        small = len(svg) <= SVG_LIMIT_BYTES
+        png = b"" if small else files.get("png") or _saved(figure, "png")
+        interrupts.check()  # compiled parts of matplotlib make anything of one
+        return Picture("svg", svg, plot, files) if small else Picture("png", png, plot, files)
 
 
 def _saved(figure: Figure, kind: str) -> bytes:

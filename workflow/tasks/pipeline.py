@@ -84,11 +84,11 @@ def run_pipeline(
                 _perform(stage, config, results, progress, inputs, before)
             _keep_controller(results, config, dialect)
             summary = summarise(results, config)
-        except KeyboardInterrupt:
-            with suppress(InputError):  # a full disk, a directory that is gone
-                run.record_status("interrupted")
-            raise CommandInterruptedError(out) from None
         except BaseException as error:
+            if isinstance(error, KeyboardInterrupt) or interrupts.came():  # a library may make anything of it
+                with suppress(InputError):  # a full disk, a directory that is gone
+                    run.record_status("interrupted")
+                raise CommandInterruptedError(out) from None
             _fail(run, error, created=not existed)
             raise
         run.record_status("complete" if summary.certified else "complete, not certified")
