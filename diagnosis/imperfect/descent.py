@@ -22,7 +22,12 @@ from plant.effects.search_space import Candidate
 # A nominal value is never believed to be off by more tolerances than this: it then is a finding.
 FARTHEST = 5.0
 _DEVIATION_STEP, _SMALLEST_STEP = 1e-3, 1e-4
+# The same where contacts switch, deviations as logarithms: the loss is jagged below it, and how one contact
+# fell says nothing of where the others lead.
+_COARSE_STEP = {"log": 0.1, "angle": 0.1, "linear": 0.0125}
 _LARGEST_STEP, _LARGEST_MOVE = 2.0, 1.5
+# Grids around a size on which the loss does not depend smoothly: how far, points of each.
+_REACHES, _POINTS = (0.1, 0.03), 9
 _AGAIN = (2, 5, 8, 11)
 _STATE_ITERATIONS = 30
 
@@ -52,6 +57,11 @@ class Descent:
     @property
     def effects(self) -> tuple[Any, ...]:
         return effects_at(self.candidates, self.coordinates)
+
+    @property
+    def non_smooth(self) -> bool:
+        """Whether contacts switch."""
+        return _non_smooth(self.candidates)
 
     def coordinates_of(self, k: int) -> Real:
         """Those of the k-th candidate."""
@@ -139,7 +149,10 @@ def descend(
     P, A = deviations.size, coordinates.size
     low, high = box(candidates)
     d, x = deviations.copy(), np.clip(coordinates, low, high)
-    steps = np.array([max(axis.step, _SMALLEST_STEP) for c in candidates for axis in c.axes])
+    coarse = _COARSE_STEP if _non_smooth(candidates) else {}
+    steps = np.array(
+        [max(axis.step, coarse.get(axis.scale, _SMALLEST_STEP)) for c in candidates for axis in c.axes]
+    )
 
     def left(d: Real, x: Real, start: Start) -> Real:
         return records.coefficients(d, effects_at(candidates, x), start)
@@ -150,7 +163,7 @@ def descend(
     by_effects = np.zeros((e.size, A))
     for iteration in range(iterations):
         if nominal_jacobian is None or iteration in _AGAIN:
-            step = np.full(P, _DEVIATION_STEP)
+            step = np.full(P, coarse.get("log", _DEVIATION_STEP))
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
         if columns is None or iteration == _AGAIN[0]:
             columns = records.start_columns(d, effects_at(candidates, x), start)
@@ -190,6 +203,39 @@ def descend(
     assert columns is not None
     jacobian = np.column_stack([nominal_jacobian, by_effects])
     return Descent(tuple(candidates), d, x, start, e, jacobian, columns, loss, prior, converged)
+
+
+def _non_smooth(candidates: Sequence[Candidate]) -> bool:
+    return any(c.dependence == "non-smooth" for c in candidates)
+
+
+def refined(records: Records, end: Descent) -> Descent:
+    """The end with the sizes on which the loss does not depend smoothly sought on grids around it, all else
+    following, and descended from the best of each."""
+    low, high = box(end.candidates)
+    first = 0
+    for candidate in end.candidates:
+        for reach in _REACHES if candidate.dependence == "non-smooth" else ():
+            trials = []
+            for shift in np.linspace(-reach, reach, _POINTS):
+                x = end.coordinates.copy()
+                x[first] = np.clip(x[first] + shift, low[first], high[first])
+                e = records.coefficients(end.deviations, effects_at(end.candidates, x), end.start)
+                trials.append((*follow(records, end, e, end.start), x))
+            _, d, x = min(trials, key=lambda trial: trial[0])
+            again = descend(
+                records,
+                end.candidates,
+                d,
+                x,
+                end.start,
+                nominal_jacobian=end.jacobian[:, : d.size],
+                columns=end.columns,
+                iterations=5,
+            )
+            end = min(end, again, key=lambda one: one.loss)
+        first += len(candidate.axes)
+    return end
 
 
 def best_move(records: Records, part: slice, columns: Real, e: Real, state: Real) -> Real:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.evidence.look_alikes import look_alike
-from diagnosis.imperfect.descent import Descent, best_move, descend, loss_at, occam
+from diagnosis.imperfect.descent import Descent, best_move, descend, loss_at, occam, refined
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.imperfect.starts import Point, beside, points_of
 from diagnosis.machine.case import Case
@@ -23,7 +23,7 @@ Progress = Callable[[float, str], None]
 # Starts descended from alone; parents extended and effects fitted beside each: pairs, larger sets.
 _ALONE, _BESIDE_POINTS = 2, 4
 _PARENTS, _TRIED = (3, 1), (6, 4)
-_FINISHED = 6
+_FINISHED, _REFINED = 6, 2
 # Sets of several whose simple effects are also continued as those that contain them.
 _CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
@@ -131,7 +131,7 @@ class Search:
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
             if k < _FINISHED and not end.converged:
                 end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
-            self.add(end)
+            self.add(refined(self.records, end) if k < _FINISHED else end)
 
     def _descended(
         self, around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
@@ -212,14 +212,17 @@ class Search:
             )
             trials += [(candidate, near[0])] if near else []
         trials.sort(key=lambda trial: trial[1].loss)
-        chosen: dict[str, tuple[Candidate, Point]] = {}
+        chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
         for candidate, point in trials:
             pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
             if len(chosen) < most or pulled:
-                chosen.setdefault(candidate.effect, (candidate, point))
-        for candidate, point in chosen.values():
-            nominal = parent.jacobian[:, : parent.deviations.size]
-            self.add(self._from(parent, candidate, point, nominal))
+                # Beside contacts that switch the one side may look better and the other be so.
+                side = candidate.axes[0].low if parent.non_smooth else 0.0
+                chosen.setdefault((candidate.effect, side), (candidate, point))
+        nominal = parent.jacobian[:, : parent.deviations.size]
+        ends = [self._from(parent, candidate, point, nominal) for candidate, point in chosen.values()]
+        for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
+            self.add(refined(self.records, end) if k < _REFINED else end)
 
     def _look_alikes(self) -> None:
         """Causes beyond the list in place of what they look like, wherever that may be the answer."""

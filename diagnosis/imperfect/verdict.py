@@ -155,7 +155,7 @@ def _judged(
         rests = {
             name: search.without(reduced, k)
             if fit and len(reduced.names) > 1
-            else _best_without(best, reduced, name)
+            else best_without(best, reduced, name)
             for k, name in enumerate(reduced.names)
         }
         within = [_part(search, reduced, name, rest, parts.get(name), listed) for name, rest in rests.items()]
@@ -176,7 +176,7 @@ def _judged(
     return Judged(explanation, named, score_of(explanation, listed, model_error), complete)
 
 
-def _best_without(
+def best_without(
     best: Mapping[tuple[str, ...], Explanation], explanation: Explanation, name: str
 ) -> Explanation:
     """The set without this effect; where nobody fitted that, the best of its parts."""
@@ -197,8 +197,7 @@ def _part(
 ) -> Part:
     """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
     set without it."""
-    carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
-    share = max(float(np.sqrt(np.prod(np.max(carried, axis=1)))), seen.share if seen else 0.0)
+    share = max(share_beside(rest, explanation), seen.share if seen else 0.0)
     limit = _INTERESTS * search.case.machine.weighing.model_error
     matters = _soft(share / limit, _INTERESTS_WIDTH)
     off = _tolerances_off(search, explanation, explanation.names.index(name))
@@ -207,6 +206,13 @@ def _part(
         preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
         matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
     return Part(name, share, matters)
+
+
+def share_beside(rest: Explanation, explanation: Explanation) -> float:
+    """Share of the motion that a set carries beyond a part of it: geometric mean of estimation and held-out
+    records."""
+    carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
+    return float(np.sqrt(np.prod(np.max(carried, axis=1))))
 
 
 def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float | None:
