@@ -9,9 +9,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from diagnosis import Case, Experiment, diagnose
+from diagnosis import (
+    Case,
+    EffectParameter,
+    Experiment,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    diagnose,
+)
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent, best_move, descend
+from diagnosis.imperfect.descent import Descent, best_move, descend, refined
 from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
@@ -80,6 +89,37 @@ def test_a_state_far_from_the_guess_is_found_in_one_move():
     assert at_the_end < near.fun + 0.1
 
 
+def test_where_contacts_switch_a_fit_does_not_end_in_the_nearest_jump():
+    # The response to two sizes is a slope with a step of a tenth of it at every two per cent.
+    rng = np.random.default_rng(14)
+    shapes = rng.standard_normal((4, 600, 1))
+
+    def response(parameters, effects, inputs):
+        sizes = [effects.get(name, {"gap_m": 0.01})["gap_m"] for name in ("play", "slack")]
+        steps = [np.mod(np.log(size) / 0.02, 1.0) for size in sizes]
+        return sum(
+            s * a + 0.1 * j * b for s, j, a, b in zip(sizes, steps, shapes[:2], shapes[2:], strict=True)
+        )
+
+    effects = tuple(
+        PlantEffect(name, (EffectParameter("gap_m", 0.01, 10.0),), dependence="non-smooth")
+        for name in ("play", "slack")
+    )
+    true = {"play": {"gap_m": 1.0}, "slack": {"gap_m": 1.3}}
+    measured = response({}, true, None) + 0.02 * rng.standard_normal((600, 1))
+    plant = Plant(response, {}, {}, ("x_m",), np.array([0.02]), effects, model_error=0.05)
+    records = [
+        PlantExperiment(name, role, np.zeros((600, 1)), measured)
+        for name, role in (("a", "estimation"), ("b", "held_out"))
+    ]
+    case = PlantCase("jumps", plant, tuple(records))
+    of = Records(case, case.estimation)
+    nothing = np.zeros(0)
+    end = descend(of, case.machine.candidates(case.experiments), nothing, np.log([0.6, 0.8]), of.at_rest())
+    found = [change.values["gap_m"] for change in refined(of, end).effects]
+    np.testing.assert_allclose(found, [1.0, 1.3], rtol=0.02)
+
+
 def test_a_drift_stays_in_the_lowest_octaves():
     drift = np.column_stack([np.linspace(-1, 1, 1000)] * 2)
     case = Case(
@@ -136,6 +176,30 @@ def test_records_of_an_independent_simulator_with_imperfections(gap_cases, name,
         assert total == pytest.approx(found.gap_closed, rel=1e-9)
     for value, low, high in found.shares.carried.values():
         assert low < value < high
+
+
+def test_dry_friction_of_the_background_is_inside_the_interval_of_the_friction_found():
+    # A part of what rubs is no listed effect: what is found is both together.
+    rng = np.random.default_rng(15)
+    rubbing = ({"name": "coulomb_friction", "torque_Nm": 0.1},)
+    truth = Truth(
+        RIG.model_dump(exclude={"tolerances"}),
+        rubbing,
+        Background(dry_friction_Nm=0.015, presliding_rad=1e-3),
+    )
+    records = []
+    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
+        voltage = rng.choice([-3.0, 3.0], 40).repeat(15)
+        clean = truth.record(voltage, None, None, Before(0.4))
+        read = np.column_stack([clean.hub_angle_rad, clean.tip_m])
+        noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
+        records.append(Experiment(name, role, voltage, read + noise * rng.standard_normal(read.shape)))
+    found = diagnose(Case("rubs", RIG, tuple(records), 0.05))
+    (friction,) = [e for e in found.effects if e.name == "coulomb_friction"]
+    assert found.combination == ("coulomb_friction",)
+    low, high = friction.intervals["torque_Nm"]
+    assert friction.parameters["torque_Nm"] == pytest.approx(0.115, rel=0.02)
+    assert low < 0.1 < 0.115 < high < 0.15
 
 
 def test_a_time_limit_says_what_was_not_tried(gap_cases):
