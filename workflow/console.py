@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 from rich.table import Column, Table
 
-from workflow.engine import progress
+from workflow.engine import interrupts, progress
 from workflow.engine.errors import printable
 
 if TYPE_CHECKING:
@@ -117,6 +117,7 @@ class TerminalProgress(progress.Progress):
         self.update(stage, 0.0)
 
     def update(self, stage: str, fraction: float, message: str = "") -> None:
+        interrupts.check()  # some libraries swallow one while they are loaded
         self._worked_s = self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0)
         self._doing = f"{stage}: {message}" if message else stage
         ahead = self._ahead().partition(", ")[2].rstrip(")")

@@ -19,6 +19,7 @@ from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, ROOT, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
 from workflow.config.run_config import load_config
+from workflow.console import TerminalProgress
 from workflow.engine import interrupts, storage
 from workflow.engine.errors import CommandInterruptedError, InputError
 from workflow.engine.progress import Progress
@@ -166,6 +167,12 @@ def test_an_interrupt_that_a_library_makes_something_else_of_is_one(fast_run, tm
     with pytest.raises(CommandInterruptedError):
         run_from_files(FAST_ARM, out, resume=True)
     assert RunDirectory.open(out).manifest()["status"] == "interrupted"
+
+
+def test_an_interrupt_that_went_under_while_libraries_were_loaded_ends_the_first_stage(monkeypatch):
+    monkeypatch.setattr(interrupts, "_came", signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), TerminalProgress(quiet=True) as progress:
+        progress.start("records")
 
 
 def test_no_picture_that_an_interrupt_went_under_in_is_kept(monkeypatch):
