@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import glob
-import os
+import json
 import re
 import shlex
 import shutil
-import signal
-import subprocess
-import sys
-import time
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -22,13 +20,11 @@ from plant.presets import paper_link
 from tests.workflow.command import ROOT
 from workflow.tasks.model_files import read_model
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README, MAKEFILE = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "Makefile"))
 COMMANDS = [
     shlex.split(text.replace("\\\n", " "))
     for text in re.findall(r"^    \.venv/bin/flexlink ((?:.*\\\n)*.*)$", README, re.MULTILINE)
 ]
-# These take from a minute to hours: that they are accepted as written, and begin, is what is tested here.
-ONLY_BEGUN = ("study", "blind", "paper")
 # First mode of the arm behind the logs with its hub free, from the physical model alone.
 TRUE_HZ = sorted(abs(pole) / (2 * np.pi) for pole in linear_arm(paper_link()).poles() if pole.imag > 10)[0]
 
@@ -47,31 +43,50 @@ def clean(tmp_path, monkeypatch):
     return tmp_path
 
 
+def said(words: str) -> bool:
+    return re.search(words, " ".join(README.split())) is not None
+
+
 def modes_of(document) -> list[float]:
     return [mode["frequency_Hz"] for mode in document["numbers"]["modes"] if mode["is_mode"]]
 
 
-@pytest.mark.slow
-def test_commands_of_the_readme_give_the_right_answer(clean, flexlink):
-    def call(name):
-        (command,) = [one for one in COMMANDS if one[0] == name]
-        return flexlink(
-            *(found for word in command for found in (sorted(glob.glob(word)) or [word])), "--json"
-        )
+@pytest.fixture
+def call(clean, flexlink):
+    """Run the command of this name as the README has it, and return what `--json` prints."""
 
-    assert len(call("simulate").document()["files"]) == 10
-    found = modes_of(call("identify").document())
+    def run(name: str):
+        (command,) = [one for one in COMMANDS if one[0] == name]
+        words = [found for word in command for found in (sorted(glob.glob(word)) or [word])]
+        return flexlink(*words, "--json").document()
+
+    return run
+
+
+@pytest.mark.slow
+def test_commands_of_the_readme_give_the_right_answer(call):
+    assert len(call("simulate")["files"]) == 10
+    found = modes_of(call("identify"))
     assert abs(found[0] / TRUE_HZ - 1) < 0.03
     assert len(found) == 2
+    assert said(rf"{found[1]:.2f} Hz for 33.2 on the logs above")
     assert read_model(Path("hub.mat")).model.output_name == "hub_angle_rad"
     assert Path("hub.html").is_file()
-    call("excite").document()
+    call("excite")
     planned = [np.loadtxt(path, delimiter=",", skiprows=1) for path in sorted(glob.glob("voltages/*.csv"))]
     assert len(planned) == 8
     assert max(np.max(np.abs(table[:, 1])) for table in planned) <= 24
-    assert call("run").document()["certified"]
+    assert call("run")["certified"]
     assert Path("runs/mine/controller.c").is_file()
-    (answer,) = call("diagnose").document()["cases"]
+    (snippet,) = re.findall(r"^    from pathlib import Path\n(?:    .*\n)+", README, re.MULTILINE)
+    names: dict = {}
+    exec(textwrap.dedent(snippet), names)
+    assert names["summary"].certified
+
+
+@pytest.mark.slow
+def test_the_diagnosis_of_the_readme_finds_what_was_hidden(call):
+    (answer,) = call("diagnose")["cases"]
     machine = tomllib.loads(Path("examples/gap_case/machine.toml").read_text(encoding="utf-8"))
     (truth,) = machine["source"]["effects"]
     assert answer["combination"] == [truth["name"]]
@@ -82,28 +97,52 @@ def test_commands_of_the_readme_give_the_right_answer(clean, flexlink):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ONLY_BEGUN)
-def test_long_commands_of_the_readme_are_accepted_and_begin(name, clean):
-    (command,) = [one for one in COMMANDS if one[0] == name]
-    out, said = Path(command[command.index("--out") + 1]), clean / "said.txt"
-    with said.open("wb") as stream:
-        process = subprocess.Popen(
-            [sys.executable, "-c", "import sys; from workflow.cli import main; sys.exit(main())", *command],
-            stdout=stream,
-            stderr=stream,
-            env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(clean)},
-            start_new_session=True,
-        )
-    try:
-        deadline = time.monotonic() + 120
-        while not out.is_dir() and name != "paper" and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.2)
-        time.sleep(8.0)
-        assert process.poll() is None, said.read_text(encoding="utf-8")
-    finally:
-        os.killpg(process.pid, signal.SIGKILL)  # how commands end when asked to: test_cli.py, test_resume.py
-        process.wait()
+def test_make_run_gives_the_numbers_of_the_readme(clean, flexlink):
+    (words,) = re.findall(r"^run:.*\n\t\$\(BIN\)/flexlink (.*)$", MAKEFILE, re.MULTILINE)
+    answer = flexlink(*words.replace("$(OUT)", "runs/default").split(), "--json").document()
+    assert answer["certified"]
+    (predicted,) = re.findall(r"predicted [\d.]+, certified at most [\d.]+, measured [\d.]*\d", README)
+    assert any(row["value"].startswith(predicted) for row in answer["table"])
+    assert Path("runs/default/figures/overview.svg").is_file()
+    (command,) = re.findall(r"`flexlink (report runs/default .*?)`", README)
+    assert flexlink(*command.split()).code == 0
+    assert Path("runs/default/figures/overview.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.slow
+def test_the_study_of_the_readme(call, flexlink):
+    points = call("study")["numbers"]["points"]
+    certified = [point for point in points if point["state"] == "certified"]
+    assert said(f"{len(points)} points, {len(certified)} certified")
+    for point in points:  # the longer the wish, the higher the order it takes
+        asked = point["values"]
+        too_much = asked["specification.bandwidth_rad_s"] == 5.5, asked["specification.controller_order"] == 3
+        assert (point in certified) == (not all(too_much)), asked
+    with open("runs/study/table.csv", newline="") as stream:
+        assert len(list(csv.DictReader(stream))) == len(points)
+    (command,) = re.findall(r"`flexlink (report runs/study/.*?)`", README)
+    assert "certified" in flexlink(*command.split()).out
+
+
+@pytest.mark.slow
+def test_the_blind_cases_of_the_readme(call):
+    call("blind")
+    scores = json.loads(Path("runs/blind/scores.json").read_text(encoding="utf-8"))
+    right = scores["diagnosis"]["table"]["all"]["verdict and set right, every case"]
+    assert said(f"verdict and set right in {right['hits']:.0f} of {right['count']}")
+
+
+@pytest.mark.slow
+def test_the_paper_of_the_readme(call):
+    call("paper")
+    with open("runs/paper/table.csv", newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["quantity"].startswith("mode found, ")]
+    found = {(row["figure"], row["quantity"].partition(", ")[2]): int(row["value"]) for row in rows}
+    of = int(rows[0]["unit"].split()[1])
+    assert found["2", "GOBF"] == found["4", "GOBF"] == of
+    assert all(found["3", name] < of / 2 for name in ("ARX", "ARMAX", "OE"))
+    assert all(found["3", f"{name} (better start)"] == of for name in ("ARMAX", "OE"))
+    assert len(list(Path("runs/paper").glob("figure-*.svg"))) == 7
 
 
 def voltage_and_motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
