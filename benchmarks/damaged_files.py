@@ -66,7 +66,8 @@ def run(
             with pytest.MonkeyPatch.context() as replay:
                 for number, (name, output) in enumerate(texts.outputs_replayed(folder, replay).items(), 96):
                     told(
-                        f"{name}'s directory, then --resume", texts.tampered(output, folder, tampered, number)
+                        f"directory of {name}, then --resume",
+                        texts.tampered(output, folder, tampered, number),
                     )
             texts.cut_computations_off(patch)
             (folder / "good").mkdir()
