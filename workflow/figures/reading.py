@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
+from matplotlib import rcParams
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.markers import TICKDOWN, TICKLEFT, TICKUP
 from matplotlib.text import Annotation
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import Locator, NullLocator
 
 POINT = 72  # units of an SVG per inch
 
@@ -39,6 +40,8 @@ def marked(figure: Figure) -> dict[str, Any]:
     for place, axes in enumerate(shown):
         axes.set_gid(f"a{place}")
         for artist in (*axes.lines, *axes.collections, *axes.patches, *axes.images, *axes.texts):
+            if str(artist.get_gid()).endswith("tick_minor"):
+                continue
             number += 1
             kind = f"{_place_of(artist, axes)}-" if artist in axes.texts else "d-"
             if kind == "d-":
@@ -62,8 +65,7 @@ def marked(figure: Figure) -> dict[str, Any]:
                 ],
             }
         )
-    with without_minor_ticks(figure):
-        extents = [axes.get_tightbbox(renderer) for axes in shown] if _columns(shown) else []
+    extents = [axes.get_tightbbox(renderer) for axes in shown] if _columns(shown) else []
     columns = sorted((e.x0 / figure.dpi * POINT, e.x1 / figure.dpi * POINT) for e in extents if e is not None)
     above = [legend.get_window_extent(renderer).y1 / figure.dpi * POINT for legend in figure.legends]
     return {
@@ -75,18 +77,41 @@ def marked(figure: Figure) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def without_minor_ticks(figure: Figure) -> Iterator[None]:
-    """Context for measuring: minor ticks have no words and are shorter than the others, but most numerous."""
+def take_minor_ticks(figure: Figure) -> list[tuple[Axis, Locator]]:
+    """Take the minor ticks off every axis, most numerous and without words; to be put back as one artist."""
     every = [axis for axes in _all_axes(figure) for axis in (axes.xaxis, axes.yaxis)]
-    minor = [axis.get_minor_locator() for axis in every]
+    taken = [(axis, axis.get_minor_locator()) for axis in every]
     for axis in every:
         axis.set_minor_locator(NullLocator())
-    try:
-        yield
-    finally:
-        for axis, locator in zip(every, minor, strict=True):
-            axis.set_minor_locator(locator)
+    return taken
+
+
+def draw_minor_ticks(taken: list[tuple[Axis, Locator]]) -> None:
+    """Those of an axis as markers of one line: as ticks they would take a quarter of the drawing's time."""
+    for axis, locator in taken:
+        axis.set_minor_locator(locator)
+        low, high = sorted(axis.get_view_interval())
+        places = [place for place in axis.get_minorticklocs() if low <= place <= high]
+        axis.set_minor_locator(NullLocator())
+        if not places or not axis.get_visible():
+            continue
+        axes: Any = axis.axes
+        x = axis is axes.xaxis
+        edge = [1.0 if hasattr(axes, "_parent") else 0.0] * len(places)  # a second axis stands on top
+        marker: Any = TICKLEFT if not x else TICKUP if edge[0] else TICKDOWN
+        line = Line2D(
+            *((places, edge) if x else (edge, places)),
+            transform=axes.get_xaxis_transform("grid") if x else axes.get_yaxis_transform("grid"),
+            marker=marker,
+            markersize=rcParams["xtick.minor.size"],
+            markeredgewidth=rcParams["xtick.minor.width"],
+            color=rcParams["xtick.color"],
+            linestyle="none",
+            clip_on=False,
+            zorder=0.5,
+            gid=f"{'xy'[not x]}tick_minor",
+        )
+        axes.add_artist(line)
 
 
 def _columns(shown: list[Any]) -> bool:

@@ -25,7 +25,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 from matplotlib.transforms import Bbox
 
 from workflow.engine import interrupts
-from workflow.figures.reading import marked, without_minor_ticks
+from workflow.figures.reading import draw_minor_ticks, marked, take_minor_ticks
 
 MEASURED = "#6b6b6b"  # what sensors said
 MODEL = "#0072B2"  # identified model, open loop
@@ -180,14 +180,15 @@ def _settle(figure: Figure) -> None:
     The layout solver's last bits depend on where its objects lie in memory; clip paths are named after them.
     """
     engine = figure.get_layout_engine()
+    minor = take_minor_ticks(figure)
     if engine is not None:
         # Drawing everything, as draw_without_rendering does, would take as long again.
-        with without_minor_ticks(figure):
-            engine.execute(figure)
+        engine.execute(figure)
     figure.set_layout_engine("none")
     figure.align_ylabels()  # only now: the solver would ask every label of a column for every other one
     for axes in figure.axes:
         axes.set_position(Bbox(np.round(axes.get_position(original=True).get_points(), 5)))
+    draw_minor_ticks(minor)
 
 
 def _shorter(svg: bytes) -> bytes:

@@ -103,16 +103,7 @@ def _flatten(element: ET.Element) -> None:
     children: list[ET.Element] = []
     for child in element:
         _flatten(child)
-        if (
-            child.tag == "g"
-            and len(child) == 1
-            and child.get("class") in ("x", "y")
-            and child[0].tag == "use"
-        ):
-            child[0].set("class", f"{child.get('class')} {child[0].get('class', '')}")  # a minor tick
-            children.append(child[0])
-        else:
-            children.extend(child if child.tag == "g" and not child.attrib else [child])
+        children.extend(child if child.tag == "g" and not child.attrib else [child])
     element[:] = children
     looks = {child.get("class") for child in element if child.tag == "use"}
     alike = len(children) > 2 and len(looks) == 1 and None not in looks
@@ -122,18 +113,15 @@ def _flatten(element: ET.Element) -> None:
             child.attrib.pop("class", None)
 
 
-def _minor_ticks_together(axes: ET.Element, marks: dict[str | None, ET.Element]) -> None:
+def _minor_ticks_together(group: ET.Element, marks: dict[str | None, ET.Element]) -> None:
     """Minor ticks of an axis as one path: a third of their size, and there are a hundred in a picture."""
-    paths: dict[tuple[str, str], ET.Element] = {}
-    for tick in [
-        child for child in axes if child.tag == "use" and child.get("class", "")[:2] in ("x ", "y ")
-    ]:
-        mark = marks[tick.attrib["href"][1:]]
-        look = tick.attrib["class"], mark.get("class", "")
-        path = paths.setdefault(look, ET.Element("path", {"class": " ".join(look), "d": ""}))
-        path.attrib["d"] += f"M{tick.get('x')} {tick.get('y')}" + mark.attrib["d"].removeprefix("m0 0")
-        axes.remove(tick)
-    axes.extend(paths.values())
+    many = group.find("g")
+    if many is None or group.get("class") not in ("x", "y"):
+        return
+    mark = marks[many[0].attrib["href"][1:]]
+    steps = (f"M{tick.get('x')} {tick.get('y')}{mark.attrib['d'].removeprefix('m0 0')}" for tick in many)
+    look = f"{many.get('class', '')} {mark.get('class', '')}"
+    group[:] = [ET.Element("path", {"class": look, "d": "".join(steps)})]
 
 
 def _samples(legend: ET.Element) -> Iterator[Markup]:
