@@ -160,11 +160,15 @@ def _judged(
         }
         within = [_part(search, reduced, name, rest, parts.get(name), listed) for name, rest in rests.items()]
         parts |= {part.name: part for part in within}
-        least = min(within, key=lambda part: (part.matters, part.share))
-        if least.matters >= 0.5 or len(rests[least.name].names) < len(reduced.names) - 1:
+        small = [part.name for part in within if part.matters < 0.5]
+        if not small:
             break
-        # Two effects that can replace each other would both seem to carry nothing: the lesser goes first.
-        reduced = rests[least.name]
+        # Two effects that can replace each other would both seem to carry nothing: the one goes first without
+        # which the records are the likelier.
+        rest = max((rests[name] for name in small), key=lambda e: score_of(e, listed, model_error))
+        if len(rest.names) < len(reduced.names) - 1:
+            break
+        reduced = rest
     at_edge = any(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
