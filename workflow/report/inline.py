@@ -121,7 +121,8 @@ def _minor_ticks_together(group: ET.Element, marks: dict[str | None, ET.Element]
     mark = marks[many[0].attrib["href"][1:]]
     steps = (f"M{tick.get('x')} {tick.get('y')}{mark.attrib['d'].removeprefix('m0 0')}" for tick in many)
     look = f"{many.get('class', '')} {mark.get('class', '')}"
-    group[:] = [ET.Element("path", {"class": look, "d": "".join(steps)})]
+    # A tick that stands alone elsewhere may use the same mark.
+    group[:] = [*group.findall("defs"), ET.Element("path", {"class": look, "d": "".join(steps)})]
 
 
 def _samples(legend: ET.Element) -> Iterator[Markup]:
