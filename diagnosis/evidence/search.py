@@ -11,7 +11,7 @@ import numpy as np
 from diagnosis.evidence.hypotheses import BESIDE_NON_SMOOTH, DISAGREEMENT, Hypothesis
 from diagnosis.evidence.screening import Screening, Start, smallest_size
 from diagnosis.fit.discrepancy import discrepancy
-from diagnosis.fit.fit import Fit, cost_at, fit
+from diagnosis.fit.fit import Fit, cost_at, fit, non_smooth
 from diagnosis.fit.non_smooth import refined
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
@@ -200,8 +200,7 @@ def _simulated(screening: Screening, trial: _Trial) -> _Trial:
     """The trial with its best starts judged by simulation."""
     if trial.candidate.kind.harmonic:
         return trial
-    non_smooth = trial.candidate.dependence == "non-smooth"
-    best = trial.starts[: _NON_SMOOTH_TO_SIMULATE if non_smooth else _STARTS_TO_SIMULATE]
+    best = trial.starts[: _NON_SMOOTH_TO_SIMULATE if non_smooth([trial.candidate]) else _STARTS_TO_SIMULATE]
     starts = screening.simulated_beside(trial.around, trial.candidate, best)
     return replace(trial, starts=starts) if starts else trial
 
@@ -300,8 +299,7 @@ def _reduced(
             before = known.get(tuple(sorted(c.effect for c in rest)))
             start = cost_at(model, rest, x, whole.deviations)
             # From one contact sequence to the next the cost jumps: there a bad start says nothing.
-            non_smooth = any(c.dependence == "non-smooth" for c in rest)
-            if before is not None and start > before.cost + _CLOSE and not non_smooth:
+            if before is not None and start > before.cost + _CLOSE and not non_smooth(rest):
                 continue
             end = _refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS), base)
             if before is None or end.cost < before.cost:

@@ -58,7 +58,7 @@ class Fit:
     @property
     def non_smooth(self) -> bool:
         """Whether contacts switch: the cost jumps from one sequence of them to the next."""
-        return any(c.dependence == "non-smooth" for c in self.candidates)
+        return non_smooth(self.candidates)
 
     @property
     def rms(self) -> float:
@@ -197,16 +197,21 @@ def box(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
 
 def _steps(candidates: Sequence[Candidate]) -> Real:
     """Of difference quotients along all coordinates (A,)."""
-    non_smooth = any(c.dependence == "non-smooth" for c in candidates)
+    jumps = non_smooth(candidates)
     return np.array(
         [
             max(axis.step, _STEP_BESIDE_NON_SMOOTH[axis.scale])
-            if non_smooth and c.dependence != "non-smooth"
+            if jumps and c.dependence != "non-smooth"
             else axis.step
             for c in candidates
             for axis in c.axes
         ]
     )
+
+
+def non_smooth(candidates: Sequence[Candidate]) -> bool:
+    """Whether contacts switch in any of these."""
+    return any(c.dependence == "non-smooth" for c in candidates)
 
 
 def effects_at(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.fit.fit import box, effects_at, quotients
+from diagnosis.fit.fit import box, effects_at, non_smooth, quotients
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.machine.machine_protocol import Real
@@ -61,7 +61,7 @@ class Descent:
     @property
     def non_smooth(self) -> bool:
         """Whether contacts switch."""
-        return _non_smooth(self.candidates)
+        return non_smooth(self.candidates)
 
     def coordinates_of(self, k: int) -> Real:
         """Those of the k-th candidate."""
@@ -149,7 +149,7 @@ def descend(
     P, A = deviations.size, coordinates.size
     low, high = box(candidates)
     d, x = deviations.copy(), np.clip(coordinates, low, high)
-    coarse = _COARSE_STEP if _non_smooth(candidates) else {}
+    coarse = _COARSE_STEP if non_smooth(candidates) else {}
     steps = np.array(
         [max(axis.step, coarse.get(axis.scale, _SMALLEST_STEP)) for c in candidates for axis in c.axes]
     )
@@ -203,10 +203,6 @@ def descend(
     assert columns is not None
     jacobian = np.column_stack([nominal_jacobian, by_effects])
     return Descent(tuple(candidates), d, x, start, e, jacobian, columns, loss, prior, converged)
-
-
-def _non_smooth(candidates: Sequence[Candidate]) -> bool:
-    return any(c.dependence == "non-smooth" for c in candidates)
 
 
 def refined(records: Records, end: Descent) -> Descent:
