@@ -17,6 +17,7 @@ from control_design.analysis.worst_case import PlantData
 from control_design.convex.youla_basis import AffineLoop
 from control_design.plants.ellipses import Complex, Real, nearest_distance, quotient
 from control_design.specification.requirement import LoopFunction
+from ident.data.arrays import real_rows
 
 _DIRECTIONS = 24  # half-planes of every hull
 _ANGLES, _RADII = 300, 60  # samples of the disc that is known to contain R
@@ -85,7 +86,7 @@ class _Programme:
     """Is there x with Re(turn_j (offset_k + slope_k x)) <= support_kj for all frequencies and directions?"""
 
     def __init__(self, slope: Complex, offset: Complex, turn: Complex) -> None:
-        _, sizes, directions = np.linalg.svd(np.vstack([slope.real, slope.imag]), full_matrices=False)
+        _, sizes, directions = np.linalg.svd(real_rows(slope), full_matrices=False)
         keep = sizes > _KEPT * sizes[0]
         scaled = slope @ (directions[keep].T / sizes[keep] * 10.0)
         rows = np.real(turn[None, :, None] * scaled[:, None, :])

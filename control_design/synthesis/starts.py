@@ -19,6 +19,7 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import local_maxima
 from control_design.specification.requirement import LoopFunction
 from control_design.specification.specification import ModulusMargin
+from ident.data.arrays import real_rows
 
 _DECADES_OF_TRACKING = 1.5  # below the crossover, in which the integrator-like loop is wished for
 _HIGHEST = 0.95  # of Nyquist: the Tustin frequency has its pole there
@@ -106,12 +107,7 @@ class StartMaker:
         n = self.cascade.order
         columns = np.stack([p**power / whole for power in range(n, -1, -1)], axis=1) * weight[:, None]
         size = np.linalg.norm(columns, axis=0)
-        target = wanted * weight
-        solution = np.linalg.lstsq(
-            np.concatenate([columns.real, columns.imag]) / size,
-            np.concatenate([target.real, target.imag]),
-            rcond=1e-9,
-        )[0]
+        solution = np.linalg.lstsq(real_rows(columns) / size, real_rows(wanted * weight), rcond=1e-9)[0]
         return _in_sections(self.cascade.sections, solution / size, denominators)
 
     def _wishes(self, data: PlantData) -> tuple[Real, Complex, Real]:

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from ident.basis.functions import nuisance_columns
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import RealArray, lock
+from ident.data.arrays import RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
@@ -172,8 +172,7 @@ def _relative_spread(
     """Factor M (2 F, K) of the covariance M M^T of the relative errors (Re, Im) of a band."""
     if posterior is not None:
         spread = posterior.frequency_rows(estimate.omega_rad_s[inside]) @ posterior.covariance_factor
-        spread = spread / size[inside, np.newaxis]
-        return np.concatenate([spread.real, spread.imag])
+        return real_rows(spread / size[inside, np.newaxis])
     values, vectors = np.linalg.eigh(estimate.covariance[inside] / size[inside, None, None] ** 2)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return np.asarray(block_diag(*roots))

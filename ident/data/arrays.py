@@ -21,6 +21,12 @@ def kernel_array(array: RealArray) -> RealArray:
     return array if flags.c_contiguous and flags.writeable else array.copy(order="C")
 
 
+def real_rows(values: ComplexArray) -> RealArray:
+    """Real parts (F, .) above imaginary ones: complex equations in real unknowns, as twice as many real
+    ones."""
+    return np.concatenate([values.real, values.imag])
+
+
 def lock(record: object, *names: str, dtype: npt.DTypeLike = np.float64) -> None:
     """Replace these fields of a frozen record by copies that cannot be written to."""
     for name in names:

@@ -34,7 +34,7 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.basis.structure import front_response
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.distortion import period_of
 from ident.data.record import Record
 from ident.friction.arm import FASTEST_POLE
@@ -248,8 +248,8 @@ def _at_amplitude(
         each realisation (R, M) would move it."""
         mean = ratios.mean(axis=0)
         columns = (speed * (delayed - mean))[:, None] * terms
-        inverse = np.linalg.pinv(np.vstack([columns.real, columns.imag]))
-        n = inverse @ np.concatenate([mean.real, mean.imag])
+        inverse = np.linalg.pinv(real_rows(columns))
+        n = inverse @ real_rows(mean)
         rest = (ratios - mean) * (1 + speed * (terms @ n))
         return n, np.hstack([rest.real, rest.imag]) @ inverse.T
 
@@ -309,8 +309,6 @@ def _on_poles(
     scale = 1 / np.abs(responses.mean(axis=(0, 1)))
     targets = ((responses - taps @ rows[:, poles.order :].T) * scale).reshape(-1, omega.size).T
     columns = scale[:, None] * rows[:, : poles.order]
-    solved = np.linalg.lstsq(
-        np.vstack([columns.real, columns.imag]), np.vstack([targets.real, targets.imag]), rcond=1e-10
-    )[0]
+    solved = np.linalg.lstsq(real_rows(columns), real_rows(targets), rcond=1e-10)[0]
     on_poles = solved.T.reshape(*responses.shape[:2], -1)
     return form, np.concatenate([on_poles, np.broadcast_to(taps, (len(responses), *taps.shape))], axis=2)

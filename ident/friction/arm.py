@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
-from ident.data.arrays import ComplexArray, RealArray, kernel_array
+from ident.data.arrays import ComplexArray, RealArray, kernel_array, real_rows
 from ident.data.record import Record
 from ident.friction.kernel import step_through
 
@@ -95,8 +95,7 @@ class SteppedArm:
             * front_response(omega, dt_s, structure.integrators, 0)[:, None]
         )
         scale = 1 / np.linalg.norm(basis, axis=1)[:, None]
-        a, b = (scale * part for part in (columns, basis))
-        a, b = (np.vstack([part.real, part.imag]) for part in (a, b))
+        a, b = (real_rows(scale * part) for part in (columns, basis))
         length = np.linalg.norm(a, axis=0)
         solved = np.linalg.lstsq(a / length, b, rcond=None)[0] / length[:, None]
         weights = solved[: rates.size].astype(np.complex128)

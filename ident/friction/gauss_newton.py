@@ -16,7 +16,7 @@ from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input
-from ident.data.arrays import RealArray
+from ident.data.arrays import RealArray, real_rows
 from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
 from ident.uncertainty.embedding_algebra import triangle_of
@@ -258,8 +258,4 @@ def _on_doubled(poles: Poles, model: GobfModel) -> RealArray:
     z = np.exp(1j * np.linspace(1e-3, np.pi, 400))
     basis = basis_response(poles.doubled(), z)
     response = basis_response(model.poles, z) @ model.coefficients
-    return np.asarray(
-        np.linalg.lstsq(
-            np.vstack([basis.real, basis.imag]), np.concatenate([response.real, response.imag]), rcond=None
-        )[0]
-    )
+    return np.asarray(np.linalg.lstsq(real_rows(basis), real_rows(response), rcond=None)[0])
