@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from workflow.engine.errors import InputError, describe_os_error, shortened
+from workflow.engine.errors import InputError, cannot, shortened
 
 MOST_BYTES = 32 * 2**20
 MOST_TOML_BYTES = 2**20
@@ -21,14 +21,12 @@ _LONGEST_TOML_LINE = 20_000
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     """UTF-8 text of a file. Raises InputError naming it."""
+    with cannot("read", path), open(path, "rb") as stream:
+        content = stream.read(most_bytes + 1)  # pipes have no size: one byte more than is allowed
+    if len(content) > most_bytes:
+        raise InputError(f"{path}: larger than {most_bytes / 2**20:g} MiB")
     try:
-        with open(path, "rb") as stream:  # pipes have no size: read one byte more than is allowed
-            content = stream.read(most_bytes + 1)
-        if len(content) > most_bytes:
-            raise InputError(f"{path}: larger than {most_bytes / 2**20:g} MiB")
         return content.decode("utf-8-sig")  # editors on Windows like to put a mark in front
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
 

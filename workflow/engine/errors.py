@@ -71,6 +71,15 @@ def need(*paths: Path | None) -> None:
 
 
 @contextmanager
+def cannot(do: str, path: Path) -> Iterator[None]:
+    """What the system refuses, in one line: `cannot write PATH: reason`. Raises InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot {do} {path}: {error.strerror or error}") from error
+
+
+@contextmanager
 def naming(where: str) -> Iterator[None]:
     """Turn a library's complaint about user input into an `InputError` that says where it arose.
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ident.data.foreign_files import Unread, content_of, shown
 from ident.data.npz_files import npz_arrays
 from workflow.engine import codec, documents
-from workflow.engine.errors import InputError, describe_os_error, naming
+from workflow.engine.errors import InputError, cannot, naming
 
 TEMPORARY_SUFFIX = ".part"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # earliest date a zip entry can carry; a constant makes the bytes reproducible
@@ -42,44 +42,48 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
 
     Raises InputError (one line) where the disk refuses.
     """
-    temporary = {path: path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}") for path in contents}
-    path = Path()
+    temporary = {path: _temporary(path) for path in contents}
     try:
-        try:
-            for path, content in contents.items():
-                with open(temporary[path], "wb") as stream:
-                    stream.write(content)
-                    stream.flush()
-                    os.fsync(stream.fileno())
-            for path in contents:
+        for path, content in contents.items():
+            with cannot("write", path), open(temporary[path], "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+        for path in contents:
+            with cannot("write", path):
                 os.replace(temporary[path], path)
-        except BaseException:
-            for leftover in temporary.values():
-                with suppress(OSError):  # what went wrong first is what is said
-                    leftover.unlink(missing_ok=True)
-            raise
-        for folder in {path.parent for path in contents}:
+    except BaseException:
+        for leftover in temporary.values():
+            with suppress(OSError):  # what went wrong first is what is said
+                leftover.unlink(missing_ok=True)
+        raise
+    for folder in {path.parent for path in contents}:
+        with cannot("write", folder):
             _flush_directory(folder)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _temporary(path: Path) -> Path:
+    """Where a file is before it is whole, beside its place."""
+    return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+
+
+def try_out(path: Path) -> None:
+    """Whether a file of this name can be made: permission bits know neither of read-only file systems nor of
+    the administrator. Raises OSError."""
+    trial = _temporary(path)
+    trial.touch()
+    trial.unlink()
 
 
 def check_writable(path: Path) -> None:
-    """Refuse an output file before the work is done: its directory must be there and take new files.
-
-    Tried out, because permission bits do not know of read-only file systems or of the administrator.
-    """
+    """Refuse an output file before the work is done: its directory must be there and take new files."""
     parent = path.absolute().parent
     if path.is_dir():
         raise InputError(f"cannot write {path}: it is a directory")
     if not parent.is_dir():
         raise InputError(f"cannot write {path}: {parent} is not a directory")
-    trial = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
-    try:
-        trial.touch()
-        trial.unlink()
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+    with cannot("write", path):
+        try_out(path)
 
 
 def refuse_in_the_way(read: Iterable[Path], written: Iterable[tuple[str, Path]]) -> None:
@@ -168,12 +172,8 @@ def read_npz(path: Path) -> dict[str, AnyArray]:
 
     Raises InputError naming the file.
     """
-    try:
+    with naming(str(path)), cannot("read", path):
         arrays = npz_arrays(content_of(path))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error
     for name, array in arrays.items():
         if isinstance(array, Unread):
             raise InputError(f"{path}: '{shown(name)}' holds {array.why}")
@@ -186,11 +186,8 @@ def sha256_of_bytes(content: bytes) -> str:
 
 def sha256_of_file(path: Path) -> str:
     """Hash of a file's content. Raises InputError naming the file."""
-    try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {describe_os_error(error, path)}") from error
+    with cannot("read", path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def remove_leftovers(directory: Path) -> None:

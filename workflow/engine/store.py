@@ -7,7 +7,6 @@ anybody else is ever touched.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from workflow.engine import storage
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import InputError, cannot, naming
 
 
 @dataclass(frozen=True)
@@ -41,19 +40,14 @@ class Store:
     def held(self) -> set[str]:
         """What is in the directory, leftovers of killed writers and the lock aside. Raises InputError where
         nothing can be written there."""
-        try:
+        with cannot("write", self.path):
             ancestor = self.path.absolute()
             while not ancestor.exists():
                 ancestor = ancestor.parent
             if not ancestor.is_dir():
                 raise InputError(f"cannot write {self.path}: {ancestor} is not a directory")
-            # Permission bits do not tell of read-only file systems, nor bind the administrator: try.
-            trial = ancestor / f".flexlink.{os.getpid()}{storage.TEMPORARY_SUFFIX}"
-            trial.touch()
-            trial.unlink()
+            storage.try_out(ancestor / "flexlink")
             entries = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
-        except OSError as error:
-            raise InputError(f"cannot write {self.path}: {error.strerror or error}") from error
         return {name for name in entries if not name.endswith(storage.TEMPORARY_SUFFIX) and name != "lock"}
 
     def refuse_unless_free(self, *, resume: bool = False, replace: bool = False) -> bool:
@@ -105,11 +99,9 @@ class Store:
         there = self.refuse_unless_free(resume=resume, replace=replace)
         if replace:
             self.clear()
-        try:
+        with cannot("write", self.path):
             for folder in ("", *self.folders):
                 (self.path / folder).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot write {self.path}: {error.strerror or error}") from error
         return there and not replace
 
     def locked(self) -> AbstractContextManager[None]:
