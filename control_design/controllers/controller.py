@@ -4,10 +4,8 @@ delay."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from os import PathLike
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -100,17 +98,6 @@ class Controller(Law):
     def stepper(self) -> ControllerStepper:
         """A fresh machine-side instance at rest."""
         return ControllerStepper(self)
-
-    def save_mat(self, file: str | PathLike[str] | BinaryIO) -> None:
-        """MATLAB 5 file (path or stream) with A, B, C, D, M, dt_s, limits (inf = none) and the delay."""
-        import scipy.io  # here: few use such files, and every command would wait for it
-
-        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        given = values.pop("feedforward")
-        if given is not None:
-            values["feedforward"] = vars(given)
-        plain = {name: float("inf") if value is None else value for name, value in values.items()}
-        scipy.io.savemat(Path(file) if isinstance(file, (str, PathLike)) else file, plain)  # type: ignore[arg-type]
 
 
 class ControllerStepper:

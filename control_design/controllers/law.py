@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -113,6 +114,19 @@ class Law:
     def to_json(self) -> str:
         """Readable JSON text."""
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+
+    def to_mat(self) -> bytes:
+        """MATLAB 5 file of all fields; a limit that is None is infinite, a feed-forward that is None is left
+        out."""
+        import scipy.io  # here: few use such files, and every command would wait for it
+
+        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        given = values.pop("feedforward", None)
+        if given is not None:
+            values["feedforward"] = vars(given)
+        stream: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
+        scipy.io.savemat(stream, {k: np.inf if value is None else value for k, value in values.items()})
+        return bytes(stream.getvalue())
 
     @classmethod
     def from_json(cls, text: str) -> Self:

@@ -34,7 +34,7 @@ from tests.workflow.report_examples import (
 )
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.engine.errors import InputError
-from workflow.tasks.controller_files import filter_bytes, filter_file
+from workflow.tasks.controller_files import filter_file, law_bytes
 from workflow.tasks.design import (
     bracket_numbers,
     certify_asked,
@@ -275,9 +275,9 @@ def test_filter_files(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
     assert filter_file(Path("k.json")) == Path("k_reference_filter.json")
-    again = ReferenceFilter.from_json(filter_bytes(found, ".JSON").decode())
+    again = ReferenceFilter.from_json(law_bytes(found, ".JSON").decode())
     assert np.array_equal(again.A, found.A)
-    mat = scipy.io.loadmat(BytesIO(filter_bytes(found, ".mat")))
+    mat = scipy.io.loadmat(BytesIO(law_bytes(found, ".mat")))
     assert np.array_equal(mat["B"], found.B)
     assert mat["dt_s"].item() == found.dt_s
 
@@ -286,7 +286,7 @@ def test_filter_files(filtered, tmp_path):
 def test_reference_filter_in_c_agrees_to_1e_12(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
-    (tmp_path / "f.c").write_bytes(filter_bytes(found, ".c"))
+    (tmp_path / "f.c").write_bytes(law_bytes(found, ".c"))
     flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Werror", "-shared", "-fPIC"]
     command = [str(_COMPILER), *flags, str(tmp_path / "f.c"), "-o", str(tmp_path / "f.so")]
     subprocess.run(command, check=True, capture_output=True)

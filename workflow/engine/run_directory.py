@@ -40,8 +40,9 @@ _RESULT = "result"
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")
 
 
+CONTROLLER_SUFFIXES = (".json", ".c", ".h")
 CONTROLLER_FILES = tuple(
-    f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in (".json", ".c", ".h")
+    f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in CONTROLLER_SUFFIXES
 )
 
 

@@ -2,43 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
-from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import scipy.io
 
 from control_design.controllers.c_code import Dialect, c_header, c_source
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
-from workflow.engine import codec, storage
+from workflow.engine import storage
+from workflow.engine.run_directory import CONTROLLER_SUFFIXES
 from workflow.text.templates import render_text
-
-RUN_FILES = ("controller.json", "controller.c", "controller.h")
-"""What a run leaves in its directory; those of a reference filter are named after them (`filter_file`)."""
-
-
-def _noted(code: Callable[..., str], found: ReferenceFilter, dialect: Dialect) -> bytes:
-    """The C code of a reference filter behind a note on how it is called."""
-    names = dialect.beside("reference_filter")
-    note = render_text("reference_filter_note.h.j2", prefix=names.prefix).rstrip()
-    return f"{note}\n{code(_as_law(found), names.prefix, names.number)}".encode("ascii")
-
-
-def _mat(controller: Controller) -> bytes:
-    stream = BytesIO()
-    controller.save_mat(stream)
-    return stream.getvalue()
-
-
-def _filter_mat(found: ReferenceFilter) -> bytes:
-    stream: Any = BytesIO()  # scipy takes any binary file; its annotations know of paths only
-    scipy.io.savemat(stream, codec.plain(found))
-    return bytes(stream.getvalue())
 
 
 def _as_law(found: ReferenceFilter) -> Controller:
@@ -55,18 +29,6 @@ def _as_law(found: ReferenceFilter) -> Controller:
     )
 
 
-_CONTROLLER: Mapping[str, Callable[[Controller, Dialect], bytes]] = {
-    ".json": lambda controller, _: controller.to_json().encode(),
-    ".mat": lambda controller, _: _mat(controller),
-    ".c": lambda controller, c: c_source(controller, c.prefix, c.number).encode("ascii"),
-    ".h": lambda controller, c: c_header(controller, c.prefix, c.number).encode("ascii"),
-}
-_FILTER: Mapping[str, Callable[[ReferenceFilter, Dialect], bytes]] = {
-    ".json": lambda found, _: found.to_json().encode(),
-    ".mat": lambda found, _: _filter_mat(found),
-    ".c": partial(_noted, c_source),
-    ".h": partial(_noted, c_header),
-}
 SUFFIXES = (".json", ".mat", ".c")
 
 
@@ -75,15 +37,25 @@ def filter_file(controller_file: Path) -> Path:
     return controller_file.with_name(f"{controller_file.stem}_reference_filter{controller_file.suffix}")
 
 
-def filter_bytes(found: ReferenceFilter, suffix: str, dialect: Dialect = Dialect()) -> bytes:  # noqa: B008
+def law_bytes(law: Controller | ReferenceFilter, suffix: str, dialect: Dialect = Dialect()) -> bytes:  # noqa: B008
     """The file's content, by the ending."""
-    return _FILTER[suffix.lower()](found, dialect)
+    suffix = suffix.lower()
+    if suffix == ".json":
+        return law.to_json().encode()
+    if suffix == ".mat":
+        return law.to_mat()
+    code = c_header if suffix == ".h" else c_source
+    if isinstance(law, Controller):
+        return code(law, dialect.prefix, dialect.number).encode("ascii")
+    names = dialect.beside("reference_filter")
+    note = render_text("reference_filter_note.h.j2", prefix=names.prefix).rstrip()
+    return f"{note}\n{code(_as_law(law), names.prefix, names.number)}".encode("ascii")
 
 
 def targets(out: Path) -> list[Path]:
     """Files of a controller written to `out`: those of a run in a directory, C with its header."""
     if out.is_dir():
-        return [out / name for name in RUN_FILES]
+        return [out / f"controller{suffix}" for suffix in CONTROLLER_SUFFIXES]
     return [out, out.with_suffix(".h")] if out.suffix.lower() == ".c" else [out]
 
 
@@ -103,11 +75,9 @@ def write_controller(
     c = dialect or Dialect()
     known = f", certified for {about}" if about else ""
     law = replace(controller, name=controller.name + (known if certified else " (NOT CERTIFIED)"))
-    content = {path: _CONTROLLER[path.suffix.lower()](law, c) for path in targets(out)}
+    content = {path: law_bytes(law, path.suffix, c) for path in targets(out)}
     if reference_filter is not None:
-        content |= {
-            filter_file(path): filter_bytes(reference_filter, path.suffix, c) for path in targets(out)
-        }
+        content |= {filter_file(path): law_bytes(reference_filter, path.suffix, c) for path in targets(out)}
     storage.write_together(
         {path: data for path, data in content.items() if not path.is_file() or path.read_bytes() != data}
     )
