@@ -31,7 +31,7 @@ from ident.friction import (
     other_output_without_friction,
     without_friction,
 )
-from plant import parse_effect, simulate
+from plant import parse_effects, simulate
 from plant.excitation import multisine, multisine_lines
 from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, quantised, rig_of
@@ -51,7 +51,7 @@ def voltage(rms_V: float, rng: np.random.Generator) -> RealArray:
 
 def truth(source: SimulatedSource, rms_V: float, realisations: int) -> tuple[ComplexArray, RealArray]:
     """Best linear approximation (2, F) and its standard error."""
-    rig, effects = rig_of(source), [parse_effect(effect) for effect in source.effects]
+    rig, effects = rig_of(source), parse_effects(source.effects)
     rng = np.random.default_rng([7, round(1000 * rms_V)])
     ratios = np.empty((realisations, 2, LINES.size), dtype=np.complex128)
     for ratio in ratios:
@@ -63,7 +63,7 @@ def truth(source: SimulatedSource, rms_V: float, realisations: int) -> tuple[Com
 
 
 def recorded(source: SimulatedSource, seed: int) -> list[Record]:
-    rig, effects = rig_of(source), [parse_effect(effect) for effect in source.effects]
+    rig, effects = rig_of(source), parse_effects(source.effects)
     rng, records = np.random.default_rng([8, seed]), []
     for k, rms_V in enumerate(RECORDED_V):
         u = voltage(rms_V, rng)

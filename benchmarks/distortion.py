@@ -26,7 +26,7 @@ from benchmarks.without_friction import EDGES_RAD_S, FRICTIONS_NM, with_friction
 from ident.data.arrays import RealArray
 from ident.data.distortion import BandLevel, Distortion, LineLevels, distortion_of
 from ident.data.record import Record
-from plant import ExperimentPlan, parse_effect
+from plant import ExperimentPlan, parse_effects
 from plant.simulation import Simulator
 from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, quantised, rig_of
@@ -74,7 +74,7 @@ def run(
     reach, cpu = np.zeros((0, 2)), []
     for torque_Nm in FRICTIONS_NM:
         rubbing = with_friction(source, torque_Nm, counts)
-        arm = Simulator(rig_of(rubbing), [parse_effect(effect) for effect in rubbing.effects])
+        arm = Simulator(rig_of(rubbing), parse_effects(rubbing.effects))
         exact = records_of(rubbing, arm, plan_of(rms, 0, truth, 1), np.random.default_rng(10**6), noisy=False)
         found: list[list[tuple[Distortion, ...]]] = [[], []]
         for k in range(first, first + seeds):

@@ -13,8 +13,8 @@ from ident.data.foreign_files import LARGEST_BYTES, Unread, shown
 _ENCRYPTED = 0x1
 
 
-def npz_arrays(content: bytes, only: str | None = None) -> dict[str, Any]:
-    """The arrays of an npz file by name (or just the one called `only`); `Unread` in place of Python objects.
+def npz_arrays(content: bytes) -> dict[str, Any]:
+    """The arrays of an npz file by name; `Unread` in place of Python objects.
 
     Raises ValueError with the reason, without the name of the file: no archive, encrypted, damaged, a name
     twice, more than `LARGEST_BYTES`. Nothing is ever unpickled.
@@ -28,8 +28,7 @@ def npz_arrays(content: bytes, only: str | None = None) -> dict[str, Any]:
         raise ValueError("damaged: a name is there twice")
     if sum(entry.file_size for entry in entries.values()) > LARGEST_BYTES:
         raise ValueError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
-    wanted = entries if only is None else {only: entries[only]} if only in entries else {}
-    return {name: _array(archive, name, entry) for name, entry in wanted.items()}
+    return {name: _array(archive, name, entry) for name, entry in entries.items()}
 
 
 def _array(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo) -> Any:

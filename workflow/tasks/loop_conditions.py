@@ -19,7 +19,7 @@ from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
-from plant.effects import EFFECTS, parse_effect
+from plant.effects import EFFECTS, parse_effects
 from plant.machine import Machine
 from plant.rig import Rig
 from plant.simulation import simulate as simulate_arm
@@ -143,7 +143,7 @@ class ConditionBench:
         start, length = n // 20, max(2, round(_PUSH_S / dt))
         force = np.zeros(n)
         force[start : start + length] = np.sin(np.pi * (np.arange(length) + 0.5) / length)[: n - start]
-        effects = [parse_effect(effect) for effect in self.effects.values()]
+        effects = parse_effects(self.effects.values())
         linear = [effect for effect in effects if effect.modify(Machine(self.rig)).linear]
         free = simulate_arm(
             self.rig, np.zeros(n), linear, rng=None, tip_force_N=force, n_modes=self.source.modes

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.data.record import Record
-from plant.effects import parse_effect
+from plant.effects import parse_effects
 from plant.rig import Rig
 from plant.simulation import SampledArm, simulate
 from workflow.config.rig_settings import PRESETS, read_rig
@@ -42,7 +42,7 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
     trajectory = simulate(
         rig,
         voltage,
-        [parse_effect(effect) for effect in source.effects],
+        parse_effects(source.effects),
         rng=stage_rng(seed, "records", entry.name, "noise"),
         n_modes=source.modes,
     )
@@ -86,7 +86,7 @@ class EncodedArm(SampledArm):
         self._step, self._force = source.encoder_step_rad, tip_force_N
         replaced = {effect["name"] for effect in extra_effects}
         kept = [effect for effect in source.effects if effect["name"] not in replaced]
-        effects = [parse_effect(effect) for effect in (*kept, *extra_effects)]
+        effects = parse_effects((*kept, *extra_effects))
         super().__init__(rig or rig_of(source), effects, rng, n_modes=source.modes)
 
     def reset(self) -> None:

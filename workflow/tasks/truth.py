@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ident.checks.plausible_modes import LARGEST_DAMPING
-from plant.effects import make_machine, parse_effect
+from plant.effects import make_machine, parse_effects
 from plant.modal import default_n_modes, equations_of_motion
 from workflow.config.run_config import SimulatedSource
 from workflow.config.settings import Section, check
@@ -40,7 +40,7 @@ class Truth(Section):
 
 def truth_of(source: SimulatedSource) -> Truth:
     """One set of modes for all outputs: they differ in zeros alone."""
-    machine = make_machine(rig_of(source), [parse_effect(effect) for effect in source.effects])
+    machine = make_machine(rig_of(source), parse_effects(source.effects))
     machine = replace(machine, joint=replace(machine.joint, backlash_gap_rad=None))
     rig = machine.rig
     a = equations_of_motion(machine, source.modes or default_n_modes(rig)).state_matrix()
