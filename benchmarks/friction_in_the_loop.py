@@ -28,11 +28,11 @@ import numpy as np
 
 from benchmarks.closed_loop_sensitivity import designed, identified
 from benchmarks.harness import Print, main
-from benchmarks.without_friction import with_friction
+from benchmarks.without_friction import estimation_records, with_friction
 from control_design.analysis.closed_loop import measure_sensitivity, simulate
 from control_design.controllers.controller import Controller
 from ident.friction import fit_friction
-from plant import SampledArm, parse_effect
+from plant import SampledArm, parse_effects
 from plant.machine import DryFriction
 from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.tasks.friction_loop import (
@@ -43,7 +43,7 @@ from workflow.tasks.friction_loop import (
     predicted_peak,
 )
 from workflow.tasks.loop_sensitivity import SensitivityPlan, plan_sensitivity, rms_of, settling_samples
-from workflow.tasks.simulated_rig import EncodedArm, rig_of, simulate_record
+from workflow.tasks.simulated_rig import EncodedArm, rig_of
 
 FRICTIONS_NM = (0.005, 0.02, 0.1)
 SIZES_RAD = (0.003, 0.01, 0.03, 0.1, 0.2)
@@ -54,7 +54,7 @@ SINE_RAD, SINE_RAD_S = 0.05, 0.1
 
 def sticking_on_arm(controller: Controller, source: SimulatedSource, samples: int) -> float:
     """By bisection, noise and encoder off."""
-    arm = SampledArm(rig_of(source), [parse_effect(effect) for effect in source.effects], None)
+    arm = SampledArm(rig_of(source), parse_effects(source.effects), None)
     low, high = 1e-5, 1.0
     while high > 1.01 * low:
         middle = float(np.sqrt(low * high))
@@ -67,7 +67,7 @@ def sine_errors(law: Controller, source: SimulatedSource, seed: int) -> tuple[fl
     """rms after the first quarter of a period: of the hub, and as measured."""
     quarter = round(0.5 * np.pi / SINE_RAD_S / law.dt_s)
     reference = SINE_RAD * np.sin(0.5 * np.pi * np.arange(5 * quarter) / quarter)
-    quiet = SampledArm(rig_of(source), [parse_effect(effect) for effect in source.effects], None)
+    quiet = SampledArm(rig_of(source), parse_effects(source.effects), None)
     noisy = EncodedArm(source, (), np.random.default_rng([seed, 4]))
     hub, measured = (simulate(law, arm, reference).measured for arm in (quiet, noisy))
     return tuple(float(np.sqrt(np.mean((reference - y)[quarter:] ** 2))) for y in (hub, measured))
@@ -82,7 +82,7 @@ def one_arm(
     channel = config.control_channel
     source = with_friction(config.source, torque_Nm, 16384)
     key = [seed, FRICTIONS_NM.index(torque_Nm)]
-    records = [simulate_record(source, e, seed) for e in source.records if e.role == "estimation"]
+    records = estimation_records(source, seed)
     at_hub = [record.siso(channel.input, channel.output) for record in records]
     found = fit_friction(at_hub, channel.identification)
     loops = drawn(controller, found, np.random.default_rng([*key, 1]), DRAWS)
@@ -114,11 +114,7 @@ def run(out: Print, *, seeds: int = 14, first: int = 0) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plant = identified(config, Path(folder))
     controller, certificate = designed([plant], config)
-    records = [
-        simulate_record(config.source, e, config.run.seed)
-        for e in config.source.records
-        if e.role == "estimation"
-    ]
+    records = estimation_records(config.source, config.run.seed)
     plan = plan_sensitivity(controller, plant, rms_of([record.input for record in records]), 300)
     bound = certificate.plants[0].worst_peak_sensitivity
     out(f"controller of the default arm: linear peak of |S| {plan.nominal_peak:.4f}, certified {bound:.4f}")

@@ -152,6 +152,18 @@ class Command:
             with suppress(ProcessLookupError):
                 os.kill(others[int(which * len(others))], way.number)
 
+    def watched(self, every_s: float) -> tuple[float, float]:
+        """CPU seconds and the largest MiB seen until the end. Raises RuntimeError where it ends with another
+        code than 0."""
+        cpu_s, mib = 0.0, 0.0
+        while self.process.poll() is None:
+            cpu_s, mib = max(cpu_s, self.cpu_s()), max(mib, self.largest_mib())
+            time.sleep(every_s)
+        code, error = self.ended()
+        if code != 0:
+            raise RuntimeError(f"{self.process.args[3]} ended with {code}: {error[-300:]}")
+        return cpu_s, mib
+
     def ended(self, seconds: float = 1800.0) -> tuple[int, str]:
         """Exit code and standard error without lines of progress."""
         try:
@@ -164,15 +176,8 @@ class Command:
 
 def undisturbed(call: Sequence[str], out: Path) -> tuple[dict[str, bytes], float]:
     """The files, and the CPU seconds it took."""
-    command = Command([*call, "--out", str(out)])
-    spent = 0.0
-    while command.process.poll() is None:
-        spent = max(spent, command.cpu_s())
-        time.sleep(0.05)
-    code, error = command.ended()
-    if code != 0:
-        raise RuntimeError(f"{call[0]} ended with {code}: {error}")
-    return contents(out), spent
+    spent_s, _ = Command([*call, "--out", str(out)]).watched(0.05)
+    return contents(out), spent_s
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -10,7 +10,6 @@ largest memory that one of them ever had. A size of 0 is left out.
 from __future__ import annotations
 
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -47,15 +46,8 @@ def write_log(path: Path, samples: int, seed: int) -> Path:
 
 
 def used_by(*arguments: object) -> tuple[float, float]:
-    """CPU seconds and MiB of a command. Raises RuntimeError where it does not end with 0."""
-    command, cpu_s, mib = Command([*map(str, arguments), "--quiet"]), 0.0, 0.0
-    while command.process.poll() is None:
-        cpu_s, mib = max(cpu_s, command.cpu_s()), max(mib, command.largest_mib())
-        time.sleep(0.1)
-    code, error = command.ended()
-    if code != 0:
-        raise RuntimeError(f"{arguments[0]} ended with {code}: {error[-300:]}")
-    return cpu_s, mib
+    """CPU seconds and MiB of a command."""
+    return Command([*map(str, arguments), "--quiet"]).watched(0.1)
 
 
 def told(out: Print, what: str, size: int, used: tuple[float, float]) -> None:

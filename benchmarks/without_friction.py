@@ -40,6 +40,11 @@ def with_friction(source: SimulatedSource, torque_Nm: float, counts: int) -> Sim
     )
 
 
+def estimation_records(source: SimulatedSource, seed: int) -> list[Record]:
+    """Of all its experiments that are to be identified from."""
+    return [simulate_record(source, entry, seed) for entry in source.records if entry.role == "estimation"]
+
+
 def true_responses(source: SimulatedSource, omega_rad_s: RealArray) -> ComplexArray:
     """Responses (F, 2) from the voltage, held and a sample late, to hub and tip, without dry friction."""
     rig = rig_of(source)
@@ -71,11 +76,7 @@ def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> 
         found = np.zeros((3, seeds, 2, OMEGA_RAD_S.size))
         levels, cpu = [], []
         for k in range(seeds):
-            records: list[Record] = [
-                simulate_record(source, entry, first + k)
-                for entry in source.records
-                if entry.role == "estimation"
-            ]
+            records = estimation_records(source, first + k)
             begin = time.process_time()
             at_hub, at_tip = ([r.siso(c.input, c.output) for r in records] for c in (hub, tip))
             friction = fit_friction(at_hub, hub.identification)
