@@ -1,10 +1,12 @@
-"""Records from files: what is read, and that every kind of bad input gets one line that names the place."""
+"""Records from files: what is read, and that every kind of bad input gets one line that names the place.
+
+Formats and layouts of files: `test_forty_logs.py`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.io
 
 from ident.data import record_files
 from ident.data.record import Record
@@ -49,13 +51,6 @@ def test_csv_is_read(good):
     np.testing.assert_allclose(record.time_s, 0.01 * np.arange(6))
 
 
-def test_csv_with_spaces_bom_and_trailing_blank_lines(tmp_path):
-    path = tmp_path / "log.csv"
-    text = "\n".join([f"{T}, {U} ,{Y}", *rows(), "", ""])
-    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
-    assert read(path).n_samples == 6
-
-
 def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
     rng = np.random.default_rng(0)
     stamps = 5.0 + 1e-3 * np.arange(50) + rng.uniform(-5e-8, 5e-8, 50)
@@ -94,11 +89,6 @@ FAULTS = {
     "blank line": ([HEAD, *rows(3), "", *rows(3, start=3)], ["log.csv, line 5: column 't_s' is empty"]),
     "short row": ([HEAD, *rows(3), "0.03,1", *rows(2, start=4)], ["line 5: column 'y_rad' is empty"]),
     "long row": ([HEAD, *rows(3), "0.03,1,2,3", *rows(2, start=4)], ["line 5: 4 cells where line 1 has 3"]),
-    "no header": (
-        ["0,1,2", "1,2,3"],
-        ["no column 't_s'; the file has column 1, column 2", "column names in line 1"],
-    ),
-    "decimal commas": ([HEAD, "0,00,1,00,2,00"], ["line 2: 6 cells where line 1 has 3", "decimal point"]),
     "time stands still": (
         [HEAD, *rows(4), "0.030000,1,2", *rows(1, start=5)],
         ["log.csv, line 6: time 't_s' goes from 0.03 to 0.03 s", "expected increasing time"],
@@ -166,26 +156,6 @@ def test_one_string_is_not_a_list_of_columns(good):
 
 def arrays():
     return {T: 0.01 * np.arange(6), U: np.array([1, -1, 1, -1, 1, -1]), Y: 0.5 * np.arange(6)}
-
-
-def test_npz_and_mat_are_read_like_csv(tmp_path, good):
-    np.savez(tmp_path / "log.npz", **arrays())
-    scipy.io.savemat(tmp_path / "log.mat", arrays())
-    expected = read(good)
-    for record in (
-        Record.from_file(tmp_path / "log.npz", [U], [Y], time=T),
-        Record.from_file(tmp_path / "log.mat", [U], [Y], time=T),
-    ):
-        np.testing.assert_array_equal(record.input, expected.input)
-        np.testing.assert_array_equal(record.output, expected.output)
-        assert record.dt_s == expected.dt_s
-
-
-def test_npz_with_objects_is_refused_without_running_them(tmp_path):
-    path = tmp_path / "log.npz"
-    np.savez(path, **(arrays() | {U: np.array([object()] * 6)}))
-    with pytest.raises(ValueError, match="'u_V' holds Python objects"):
-        Record.from_file(path, [U], [Y], time=T)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import math
 import os
@@ -13,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.workflow.test_figures import panels
+from tests.workflow.test_figures import is_whole, panels
 from validation.paper import command
 from validation.paper.command import DRAWERS, PAGE, headlines_of, page_html, redraw_paper
 from validation.paper.experiments import run_experiments
@@ -55,30 +54,10 @@ def test_one_figure_for_each_of_the_paper(pictures):
 @pytest.mark.parametrize("number", list(DRAWERS))
 def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
     figure = DRAWERS[number](results)
-    with style.house_style():
-        figure.draw_without_rendering()
-        renderer = figure.canvas.get_renderer()
-    shown = panels(figure)
-    for axes in shown:
+    for axes in panels(figure):
         for label in filter(None, (axes.get_xlabel(), axes.get_ylabel())):
             assert re.search(r"\[.+\]", label), f"no unit in {label!r}"
-    words = [axes._left_title for axes in shown]
-    words += [axis.label for axes in shown for axis in (axes.xaxis, axes.yaxis)]
-    words += figure.legends[0].get_texts()
-    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in words if text.get_text()]
-    for text, box in boxes:  # 1.5 pixels: glyphs overhang their advance a little
-        assert box.x0 >= -1.5, text
-        assert box.y0 >= -1.5, text
-        assert box.x1 <= figure.bbox.x1 + 1.5, text
-        assert box.y1 <= figure.bbox.y1 + 1.5, text
-    for (one, first), (other, second) in itertools.combinations(boxes, 2):
-        overlap = (
-            min(first.x1, second.x1) - max(first.x0, second.x0),
-            min(first.y1, second.y1) - max(first.y0, second.y0),
-        )
-        assert min(overlap) <= 1.5, f"{one!r} overlaps {other!r}"
-    legend = figure.legends[0].get_window_extent(renderer)
-    assert not any(legend.overlaps(axes.get_window_extent(renderer)) for axes in shown)
+    is_whole(figure)
 
 
 def test_page_stands_alone_and_says_both_sides(results, pictures, tmp_path, faults_seen):

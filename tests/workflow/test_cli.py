@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -11,7 +10,6 @@ import subprocess
 import sys
 import time
 from inspect import signature
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -476,34 +474,11 @@ def test_design_of_an_impossible_specification_is_three_like_a_run(flexlink, tmp
     assert not (tmp_path / "controller.json").exists()
 
 
-def test_a_full_disk_leaves_no_half_of_the_experiments(refused, monkeypatch, tmp_path):
-    from workflow.engine import storage
-
-    fsync = storage.os.fsync
-
-    def second_does_not_fit(descriptor):
-        if Path(os.readlink(f"/proc/self/fd/{descriptor}")).name.startswith(".02"):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        fsync(descriptor)
-
-    monkeypatch.setattr(storage.os, "fsync", second_does_not_fit)
-    assert "No space left" in refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-
-
 def test_reader_that_leaves_early_is_no_error(fast_run):
     with start_flexlink("report", fast_run[0], "--quiet") as process:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 0
-
-
-def test_output_that_cannot_be_written_is_one_line(fast_run):
-    with open("/dev/full", "wb") as full:
-        process = start_flexlink("report", fast_run[0], "--json", "--quiet", stdout=full)
-        _, err = process.communicate()
-    assert process.returncode == 2
-    assert err.decode() == "flexlink: cannot write the output: No space left on device\n"
 
 
 def test_terminal_codes_in_names_are_shown_as_text(refused, tmp_path):

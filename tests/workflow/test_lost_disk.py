@@ -7,15 +7,13 @@ import errno
 import json
 import os
 import shutil
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 import workflow.diagnose.command
-from tests.workflow.command import FAST_ARM, ROOT
+from tests.workflow.command import FAST_ARM, finish, start_flexlink
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from tests.workflow.study_examples import TWO_POINTS, assert_same_study, point_bytes, write_study
 from tests.workflow.test_design_sources import QUICK, WISH, arm, document
@@ -128,6 +126,13 @@ def test_files_of_an_identification_are_all_there_or_none(name, tmp_path, monkey
     assert (out / "model.npz").read_text() == "an earlier one"
 
 
+def test_simulated_experiments_are_all_there_or_none(tmp_path, monkeypatch, refused):
+    FullDisk(monkeypatch, ["02_fresh_b_prbs_b_.csv"])
+    line = refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "new")
+    assert "b_.csv: No space left on device" in line
+    assert not (tmp_path / "new").exists()
+
+
 def test_files_of_a_design_are_all_there_or_none(tmp_path, monkeypatch, refused):
     (tmp_path / "wish.toml").write_text(WISH + QUICK)
     (tmp_path / "arm.json").write_text(json.dumps(document(arm())))
@@ -237,14 +242,9 @@ def test_files_are_found_again_from_another_folder(tmp_path, monkeypatch):
     assert load_config(Path("../a") / own.name)[0].to_document() == here.to_document()
 
 
-def test_an_output_that_takes_nothing_is_one_line(tmp_path):
+@pytest.mark.parametrize("how", [(), ("--json",)])
+def test_an_output_that_takes_nothing_is_one_line(how, tmp_path):
     (tmp_path / "log.csv").write_text("t_s,u,y\n" + "".join(f"{k},{k % 3},{k % 5}\n" for k in range(40)))
-    with open("/dev/full", "w") as full:
-        ended = subprocess.run(
-            [sys.executable, "-m", "flexlink", "look", str(tmp_path / "log.csv")],
-            cwd=ROOT,
-            stdout=full,
-            stderr=subprocess.PIPE,
-        )
-    line = "flexlink: cannot write the output: No space left on device\n"
-    assert (ended.returncode, ended.stderr.decode()) == (2, line)
+    with open("/dev/full", "wb") as full:
+        process = start_flexlink("look", tmp_path / "log.csv", *how, stdout=full)
+        assert finish(process, 2) == "flexlink: cannot write the output: No space left on device\n"
