@@ -19,8 +19,9 @@ from matplotlib.ticker import Locator, NullLocator
 POINT = 72  # units of an SVG per inch
 
 
-def marked(figure: Figure) -> dict[str, Any]:
+def marked(figure: Figure, reaches: list[tuple[float, float]]) -> dict[str, Any]:
     """Name the artists of a figure that is laid out, in place, and describe it in units of its SVG, y down.
+    reaches: from where to where each panel reaches with its words, in pixels.
 
     Names (the SVG's ids): `aN` of the N-th axes; `kE-M` of data under the legend's entry E, `d-M` of other
     data, `t-M` and `u-M` of words at a place in the data, of the latter only x is. Returned: `axes`, a list
@@ -36,6 +37,7 @@ def marked(figure: Figure) -> dict[str, Any]:
     for axes in filter(shown.__contains__, figure.axes):
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             looks.setdefault(_look(handle), entries.get(str(label)))
+    parents = {child: axes for axes in figure.axes for child in axes.child_axes}
     number, described = 0, []
     for place, axes in enumerate(shown):
         axes.set_gid(f"a{place}")
@@ -48,15 +50,16 @@ def marked(figure: Figure) -> dict[str, Any]:
                 entry = entries.get(str(artist.get_label()), looks.get(_look(artist)))
                 kind = "d-" if entry is None else f"k{entry}-"
             artist.set_gid(f"{kind}{number}")
-        parent = getattr(axes, "_parent", axes)  # of a second frequency axis, which has no place of its own
+        parent = parents.get(axes, axes)  # of a second frequency axis, which has no place of its own
         left, bottom, right, top = parent.get_position().extents
         box = [left * width, (1 - top) * height, right * width, (1 - bottom) * height]
         described.append(
             {
                 "box": [round(float(value), 2) for value in box],
                 "near": axes.get_aspect() != "auto",  # a plane: values belong to points, not to an x
-                "x": _scale(axes.xaxis),
-                "y": _scale(axes.yaxis),
+                # A second axis has a scale of functions, of the same kind as its parent's.
+                "x": _scale(axes.xaxis, parent.get_xscale()),
+                "y": _scale(axes.yaxis, axes.get_yscale()),
                 "second": parent is not axes,
                 "names": [_name(axes, "x"), _name(axes, "y")],
                 "with": [
@@ -65,8 +68,7 @@ def marked(figure: Figure) -> dict[str, Any]:
                 ],
             }
         )
-    extents = [axes.get_tightbbox(renderer) for axes in shown] if _columns(shown) else []
-    columns = sorted((e.x0 / figure.dpi * POINT, e.x1 / figure.dpi * POINT) for e in extents if e is not None)
+    columns = sorted((low / figure.dpi * POINT, high / figure.dpi * POINT) for low, high in reaches)
     above = [legend.get_window_extent(renderer).y1 / figure.dpi * POINT for legend in figure.legends]
     return {
         "axes": described,
@@ -97,7 +99,7 @@ def draw_minor_ticks(taken: list[tuple[Axis, Locator]]) -> None:
             continue
         axes: Any = axis.axes
         x = axis is axes.xaxis
-        edge = [1.0 if hasattr(axes, "_parent") else 0.0] * len(places)  # a second axis stands on top
+        edge = [0.0 if axes in axes.figure.axes else 1.0] * len(places)  # a second axis stands on top
         marker: Any = TICKLEFT if not x else TICKUP if edge[0] else TICKDOWN
         line = Line2D(
             *((places, edge) if x else (edge, places)),
@@ -112,12 +114,6 @@ def draw_minor_ticks(taken: list[tuple[Axis, Locator]]) -> None:
             gid=f"{'xy'[not x]}tick_minor",
         )
         axes.add_artist(line)
-
-
-def _columns(shown: list[Any]) -> bool:
-    """Whether panels stand beside each other: to measure their words takes as long as to draw them."""
-    spans = [axes.get_position().intervalx for axes in shown if not hasattr(axes, "_parent")]
-    return any(one[1] < other[0] for one in spans for other in spans)
 
 
 def _all_axes(figure: Figure) -> Iterator[Any]:
@@ -147,14 +143,10 @@ def _place_of(text: Artist, axes: Axes) -> str:
     return "u" if isinstance(where, tuple) and where[0] == "data" else "w"
 
 
-def _scale(axis: Axis) -> list[Any]:
+def _scale(axis: Axis, kind: str) -> list[Any]:
     """Limits, and the kind of scale: lin, log, or the range in which a symmetric log scale is linear."""
     low, high = (float(f"{value:.7g}") for value in axis.get_view_interval())
     linear: Any = getattr(axis.get_transform(), "linthresh", None)
-    # A second axis has a scale of functions, of the same kind as its parent's.
-    kind = (
-        getattr(axis.axes, "_parent", axis.axes).get_xscale() if axis is axis.axes.xaxis else axis.get_scale()
-    )
     return [low, high, linear or ("log" if kind == "log" else "lin")]
 
 

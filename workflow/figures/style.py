@@ -17,15 +17,17 @@ from typing import Any, Literal, TypeVar, cast
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.transforms import Bbox
+from matplotlib.transforms import ScaledTranslation
 
 from workflow.engine import interrupts
-from workflow.figures.reading import draw_minor_ticks, marked, take_minor_ticks
+from workflow.figures.layout import lay_out, titles
+from workflow.figures.reading import POINT, draw_minor_ticks, marked, take_minor_ticks
 
 MEASURED = "#6b6b6b"  # what sensors said
 MODEL = "#0072B2"  # identified model, open loop
@@ -61,6 +63,7 @@ _RC: Any = {
     "axes.titlesize": 10.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # `_raise_titles` knows what is in the way; looking for it measures all words again
     "axes.labelsize": 9.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -152,8 +155,10 @@ def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
     also: further kinds of file, pdf or png.
     """
     with house_style():
-        _settle(figure)
-        plot = marked(figure)
+        minor = take_minor_ticks(figure)
+        reaches = lay_out(figure)
+        draw_minor_ticks(minor)
+        plot = marked(figure, reaches)
         text = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         canvas: Any = FigureCanvasSVG(figure)
@@ -172,23 +177,6 @@ def _saved(figure: Figure, kind: str) -> bytes:
     dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
     figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
     return buffer.getvalue()
-
-
-def _settle(figure: Figure) -> None:
-    """Lay the figure out once and for all, panels on a grid of 1e-5 of its size.
-
-    The layout solver's last bits depend on where its objects lie in memory; clip paths are named after them.
-    """
-    engine = figure.get_layout_engine()
-    minor = take_minor_ticks(figure)
-    if engine is not None:
-        # Drawing everything, as draw_without_rendering does, would take as long again.
-        engine.execute(figure)
-    figure.set_layout_engine("none")
-    figure.align_ylabels()  # only now: the solver would ask every label of a column for every other one
-    for axes in figure.axes:
-        axes.set_position(Bbox(np.round(axes.get_position(original=True).get_points(), 5)))
-    draw_minor_ticks(minor)
 
 
 def _shorter(svg: bytes) -> bytes:
@@ -231,6 +219,7 @@ def finish(figure: Figure) -> None:
     """Last step of a figure: labels of log axes, and one legend below, where it hides nothing, every entry
     once."""
     plain_log_labels(figure)
+    _raise_titles(figure)
     handles: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -262,6 +251,27 @@ def finished(draw: D) -> D:
         return figure
 
     return cast(D, styled)
+
+
+_SECOND_AXIS_PT, _POWER_PT = 27.4, 12.0  # from the panel's edge to above ticks, numbers and words
+
+
+def _raise_titles(figure: Figure) -> None:
+    """Titles above a second frequency axis, or the power of ten of the y axis, where there is one."""
+    for axes in figure.axes:
+        for title in titles(axes):
+            above = _SECOND_AXIS_PT if axes.child_axes else _POWER_PT if _has_power(axes.yaxis) else 0.0
+            raised = axes.transAxes + ScaledTranslation(
+                0, (above + mpl.rcParams["axes.titlepad"]) / POINT, figure.dpi_scale_trans
+            )
+            if raised.transform((0, 1))[1] > title.get_transform().transform((0, 1))[1]:
+                title.set_transform(raised)
+
+
+def _has_power(axis: Axis) -> bool:
+    formatter = axis.get_major_formatter()
+    formatter.set_locs(list(axis.get_majorticklocs()))
+    return bool(formatter.get_offset()) and axis.get_offset_text().get_visible()
 
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

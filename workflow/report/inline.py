@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import lru_cache
 from xml.etree import ElementTree as ET
 
 from markupsafe import Markup
@@ -166,6 +167,7 @@ def relative(path: str) -> str:
     return "".join(out)
 
 
+@lru_cache(maxsize=10_000)
 def _short(hundredths: int) -> str:
     text = f"{hundredths / 100:.2f}".rstrip("0").rstrip(".")
     return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else "0" if text == "-0" else text

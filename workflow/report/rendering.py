@@ -70,8 +70,8 @@ def render_page(
 def _garbage_left() -> Iterator[None]:
     """While pictures are drawn, what was there before is not looked through for garbage.
 
-    A picture is tens of thousands of small objects; to go through all that the numerical libraries hold whenever
-    their number has grown by so many takes a fifth of the drawing's time.
+    A picture is tens of thousands of small objects; to go through all that the numerical libraries hold
+    whenever their number has grown by so many takes a sixth of the drawing's time.
     """
     gc.freeze()
     try:
