@@ -68,4 +68,4 @@ build/gallery/.drawn: $(STAMP)
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info
-	find . -name "*.nb[ic]" -delete
+	find . \( -name "*.nb[ic]" -o -name "*.template" \) -delete

@@ -11,6 +11,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ident.data.finding import Finding
+from workflow.text.compiled import CompiledTemplates
 from workflow.text.formats import FILTERS, TESTS
 
 
@@ -26,6 +27,7 @@ def environment(*own: tuple[str, Callable[..., Any]], package: str = "workflow")
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=None if own else CompiledTemplates(),
     )
     made.filters.update(FILTERS, words=words, labelled=labelled)
     made.filters.update(own)
