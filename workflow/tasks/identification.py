@@ -48,7 +48,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     config, records = stage.config, stage.results.records
     measured = [item.record for item in records.of_role("estimation")]
     unseen = [item for item in records.records if item.role != "estimation"]
-    friction = friction_of(stage, measured) if config.friction_identified else None
+    friction = friction_of(stage) if config.friction_identified else None
     channels = []
     for k, channel in enumerate(config.channels):
 
@@ -74,7 +74,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 report,
                 two_stage=finding,
             )
-            as_measured = [record.siso(channel.input, channel.output) for record in measured]
+            as_measured = records.fitted(channel)
             if known is not None:
                 found = clipped_as_measured(found, as_measured)
             found = with_warnings(found, amplitude_effects(as_measured))
@@ -106,11 +106,11 @@ def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) ->
     return with_warnings(found, clipped(measured))
 
 
-def friction_of(stage: StageInput, measured: Sequence[Record]) -> FrictionFit:
+def friction_of(stage: StageInput) -> FrictionFit:
     """Coulomb friction of the shaft whose position the control channel measures."""
     channel = stage.config.control_channel
     with naming(f"channel {channel.label!r}"):
-        at_shaft = [record.siso(channel.input, channel.output) for record in measured]
+        at_shaft = stage.results.records.fitted(channel)
         for other in stage.config.channels:
             refuse_unrecorded(at_shaft, other.uncertainty.amplitudes)
         found = fit_friction(

@@ -19,8 +19,6 @@ from ident.data.signal_filter import band_limited, settling_time_s
 from ident.friction import (
     EquivalentFriction,
     FrictionFit,
-    at_amplitudes,
-    equivalent_friction,
     fit_friction,
     refuse_unrecorded,
     refuse_unseen_shaft,
@@ -35,7 +33,13 @@ from workflow.engine.progress import Progress
 from workflow.tasks.identification import clipped_as_measured, identified_channel
 from workflow.tasks.results import IdentifiedChannel, Tests, UncertainChannel
 from workflow.tasks.truth import TrueMode
-from workflow.tasks.uncertainty import N_BANDS, display_grid, residual_tests, uncertain_channel
+from workflow.tasks.uncertainty import (
+    N_BANDS,
+    display_grid,
+    promised_response,
+    residual_tests,
+    uncertain_channel,
+)
 
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
@@ -84,9 +88,9 @@ def identify_records(
     """
     options, progress = options or IdentOptions(), progress or Progress()
     promised = promised or UncertaintyOptions()
-    friction, equivalent, logs_to_validate = None, None, fresh_records
+    friction, opened, logs_to_validate = None, None, fresh_records
     with naming("identify"), progress.stage("identify") as update:
-        used, opened = list(measured), None
+        used = list(measured)
         if promised.friction_identified:
             if band_rad_s is not None or any(record.reference is not None for record in measured):
                 raise ValueError(
@@ -99,24 +103,10 @@ def identify_records(
                 [friction.taken_off(record) for record in part] for part in (used, fresh_records)
             )
         if band_rad_s is not None:
-            # A pair far outside the band could only describe the filter's skirts.
-            options = options.model_copy(
-                update={
-                    "omega_min_rad_s": options.omega_min_rad_s or band_rad_s[0] / 2,
-                    "omega_max_rad_s": options.omega_max_rad_s
-                    or min(2 * band_rad_s[1], 0.9 * np.pi / measured[0].dt_s),
-                }
+            options = _searched_around(band_rad_s, options, measured[0].dt_s)
+            used, fresh_records = (
+                [_inside(band_rad_s, record) for record in part] for part in (used, fresh_records)
             )
-
-            def inside(record: Record) -> Record:
-                filtered = band_limited(record, *band_rad_s)
-                settled_s = settling_time_s(record.dt_s, *band_rad_s)
-                # Of a short record half is kept, whatever the filter's start leaves in it.
-                start = min(round(settled_s / record.dt_s), record.n_samples // 2)
-                return filtered.slice(start, record.n_samples)
-
-            used = [inside(record) for record in measured]
-            fresh_records = [inside(record) for record in fresh_records]
         if any(record.reference is not None for record in measured):
             # The first stage runs its model from rest, so it has to be fitted as from rest: free responses
             # that it estimated would be missing in the input it makes.
@@ -139,26 +129,20 @@ def identify_records(
             about = clipped_as_measured(about, measured)
         about, found = replace(about, band_rad_s=band_rad_s), about.identification
     with naming("identify"), progress.stage("uncertainty"):
-        poles, linear = found.model.poles, None
+        poles, equivalent = found.model.poles, None
         bounds = EmbeddingOptions(order_given=options.n_pairs is not None)
         if friction is None:
             posterior, tests = _posterior(used, found, noise_order, bounds)
+            linear = posterior
         else:
             white = whiteness_test([friction.residual(record) for record in measured]).passed
-            behind = behind_friction(
-                measured,
-                friction,
-                found.model,
-                bounds.model_copy(
-                    update={"coloured_noise": not white, "max_ar_order": noise_order or _NOISE_ORDERS[0]}
-                ),
+            coloured = {"coloured_noise": not white, "max_ar_order": noise_order or _NOISE_ORDERS[0]}
+            behind = behind_friction(measured, friction, found.model, bounds.model_copy(update=coloured))
+            linear = behind.response
+            tests = residual_tests(linear, measured, behind.friction)
+            posterior, poles, equivalent = promised_response(
+                behind, poles, friction, measured, promised, np.random.default_rng(0)
             )
-            linear = posterior = behind.response
-            tests = residual_tests(posterior, measured, behind.friction)
-            if promised.promise != "without friction":
-                rng = np.random.default_rng(0)
-                equivalent = equivalent_friction(friction, measured, rng, promised.amplitudes)
-                posterior, poles = at_amplitudes(behind, equivalent, rng, promised.level)
         omega = display_grid(found.model, used)
         if band_rad_s is not None:
             omega = omega[(omega >= band_rad_s[0]) & (omega <= band_rad_s[1])]
@@ -197,6 +181,21 @@ def identify_records(
         friction=friction,
         equivalent=equivalent,
     )
+
+
+def _searched_around(band_rad_s: tuple[float, float], options: IdentOptions, dt_s: float) -> IdentOptions:
+    """No pair far outside the band, where nobody has stated bounds: it could only describe the filter's
+    skirts."""
+    low, high = band_rad_s[0] / 2, min(2 * band_rad_s[1], 0.9 * np.pi / dt_s)
+    bounds = {"omega_min_rad_s": options.omega_min_rad_s or low}
+    return options.model_copy(update=bounds | {"omega_max_rad_s": options.omega_max_rad_s or high})
+
+
+def _inside(band_rad_s: tuple[float, float], record: Record) -> Record:
+    """The record within the band, without the start that the filter spoils; of a short one half is kept."""
+    filtered = band_limited(record, *band_rad_s)
+    settled = round(settling_time_s(record.dt_s, *band_rad_s) / record.dt_s)
+    return filtered.slice(min(settled, record.n_samples // 2), record.n_samples)
 
 
 def _posterior(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
-from operator import itemgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +21,7 @@ from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
 from ident.friction import (
+    BehindFriction,
     EquivalentFriction,
     FrictionFit,
     at_amplitudes,
@@ -63,54 +63,73 @@ N_BANDS = 6
 
 def find_uncertainty(stage: StageInput) -> UncertaintyResult:
     """Posterior, ellipses on a display grid, residual tests and repeat scatter of every channel."""
-    records, channels = stage.results.records.records, list[UncertainChannel]()
-    # The control channel first: it says what the friction does at an amplitude.
-    control, equivalents = stage.config.control_index, dict[str, EquivalentFriction]()
-    order = sorted(range(len(stage.config.channels)), key=lambda k: k != control)
+    config, records, identified = stage.config, stage.results.records, stage.results.identify
+    control, equivalent = config.control_index, None
+    channels: dict[int, UncertainChannel] = {}
+    # The control channel first: it says what the friction does at an amplitude, the same one for all.
+    order = sorted(range(len(config.channels)), key=lambda k: k != control)
     for done, k in enumerate(order):
-        channel, result = stage.config.channels[k], stage.results.identify.channels[k]
+        channel, result = config.channels[k], identified.channels[k]
         stage.progress.update("uncertainty", done / len(order), channel.label)
         with naming(f"channel {channel.label!r}"):
-            friction = stage.results.identify.friction if channel.uncertainty.friction_identified else None
+            friction = identified.friction if channel.uncertainty.friction_identified else None
             poles, tests = result.model.poles, None
             if friction is None:
-                linear = posterior = posterior_of(result.model, result.bounded, channel.embedding, records)
+                linear = posterior = posterior_of(
+                    result.model, result.bounded, channel.embedding, records.records
+                )
             else:
-                measured = [
-                    item.record.siso(channel.input, channel.output)
-                    for item in stage.results.records.of_role("estimation")
-                ]
+                measured = records.fitted(channel)
                 find = without_friction if k == control else other_output_without_friction
                 behind = find(measured, friction, result.model, channel.embedding)
-                linear = posterior = behind.response
+                linear = behind.response
                 if k == control:
                     tests = residual_tests(linear, measured, behind.friction)
-                if channel.uncertainty.promise != "without friction":
-                    promise, rng = channel.uncertainty.promise, stage.rng("uncertainty", channel.label)
-                    if promise not in equivalents:
-                        equivalents[promise] = equivalent_friction(
-                            friction, measured, rng, channel.uncertainty.amplitudes
-                        )
-                    posterior, poles = at_amplitudes(
-                        behind, equivalents[promise], rng, channel.uncertainty.level
-                    )
-            omega = display_grid(result.model, result.bounded)
-            channels.append(
-                uncertain_channel(
-                    channel.uncertainty.method,
-                    channel.uncertainty.level,
-                    posterior,
-                    result,
-                    omega,
-                    nominal_grid(omega, result.data_band_rad_s),
-                    poles=poles,
-                    linear=linear,
-                    tests=tests,
-                    repeat_scatter=scatter_of(channel, result, records, bands_of(omega), friction),
+                posterior, poles, equivalent = promised_response(
+                    behind,
+                    poles,
+                    friction,
+                    measured,
+                    channel.uncertainty,
+                    stage.rng("uncertainty", channel.label),
+                    equivalent,
                 )
+            omega = display_grid(result.model, result.bounded)
+            channels[k] = uncertain_channel(
+                channel.uncertainty.method,
+                channel.uncertainty.level,
+                posterior,
+                result,
+                omega,
+                nominal_grid(omega, result.data_band_rad_s),
+                poles=poles,
+                linear=linear,
+                tests=tests,
+                repeat_scatter=scatter_of(channel, result, records.records, bands_of(omega), friction),
             )
-    in_order = tuple(found for _, found in sorted(zip(order, channels, strict=True), key=itemgetter(0)))
-    return UncertaintyResult(in_order, next(iter(equivalents.values()), None))
+    return UncertaintyResult(tuple(channels[k] for k in sorted(channels)), equivalent)
+
+
+def promised_response(
+    behind: BehindFriction,
+    poles: Poles,
+    friction: FrictionFit,
+    measured: Sequence[Record],
+    promised: UncertaintyOptions,
+    rng: np.random.Generator,
+    equivalent: EquivalentFriction | None = None,
+) -> tuple[ResponsePosterior, Poles, EquivalentFriction | None]:
+    """What the ellipses of an arm with friction are about, and the poles of its nominal: the response behind
+    the friction with the model's poles, or the one at amplitudes, and what stands for the friction there.
+
+    friction: as it was fitted to the measured records, from which equivalent follows where it is not known of
+    another output.
+    """
+    if not promised.about_amplitudes:
+        return behind.response, poles, equivalent
+    if equivalent is None:
+        equivalent = equivalent_friction(friction, measured, rng, promised.amplitudes)
+    return (*at_amplitudes(behind, equivalent, rng, promised.level), equivalent)
 
 
 def uncertain_channel(
