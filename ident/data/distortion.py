@@ -27,7 +27,7 @@ from scipy.stats import chi2, f
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.data.record import Record
+from ident.data.record import Record, in_groups
 
 # A period repeats the input to this share of its power (40 dB: an input as commanded, or well measured).
 _REPEATS = 1e-4
@@ -195,21 +195,19 @@ def distortion_of(records: Sequence[Record], *, period_samples: int | None = Non
     out. Raises ValueError where a record is shorter than the stated period or does not repeat after it,
     periods differ between records, or an output stands still.
     """
-    groups: list[list[_Steady]] = []
+    steady: list[_Steady] = []
     for record in records:
         record.refuse_several()
         period = _period(record, period_samples)
         if period is None:
             continue
-        steady = _Steady.of(record, period)
-        if groups and period != groups[0][0].period:
+        steady.append(_Steady.of(record, period))
+        if period != steady[0].period:
             raise ValueError(
                 f"{record.label}: its input repeats after {period} samples, that of "
-                f"{groups[0][0].record.label} after {groups[0][0].period}; analyse them one by one"
+                f"{steady[0].record.label} after {steady[0].period}; analyse them one by one"
             )
-        alike = next((group for group in groups if steady.alike(group[0])), None)
-        groups.append([steady]) if alike is None else alike.append(steady)
-    return tuple(sorted((_levels(group) for group in groups), key=lambda found: found.rms))
+    return tuple(sorted(map(_levels, in_groups(steady, _Steady.alike)), key=lambda found: found.rms))
 
 
 def _period(record: Record, stated: int | None) -> int | None:
@@ -281,10 +279,7 @@ class _Steady:
 
 def _levels(group: Sequence[_Steady]) -> Distortion:
     first = group[0]
-    realisations: list[list[_Steady]] = []
-    for steady in group:
-        known = next((same for same in realisations if steady.same_input(same[0])), None)
-        realisations.append([steady]) if known is None else known.append(steady)
+    realisations = in_groups(group, _Steady.same_input)
     outputs = [np.vstack([steady.output for steady in same]) for same in realisations]
     inputs = np.stack([same[0].input for same in realisations])
     periods = min(output.shape[0] for output in outputs)

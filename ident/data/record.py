@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from ident.data.record_files import read_table
 from ident.data.table import Table
 from ident.data.time_grid import Repair, TimeGrid
 from ident.data.units import TimeColumn
+
+T = TypeVar("T")
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 _LARGEST = 1e100
@@ -258,3 +260,14 @@ class Record:
             time_column=base,
             repair=None if grid is None else grid.repair,
         )
+
+
+def in_groups(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:
+    """Items in groups, in the order they come: each in the first group whose first item it is like."""
+    groups: list[list[T]] = []
+    for item in items:
+        group = next((group for group in groups if alike(item, group[0])), None)
+        if group is None:
+            groups.append(group := [])
+        group.append(item)
+    return groups

@@ -17,7 +17,7 @@ from scipy.stats import f
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.nonparametric import spectra_of
-from ident.data.record import Record
+from ident.data.record import Record, in_groups
 
 # Excitations of one course, or of one size, differ by no more than this share.
 _SAME = 0.02
@@ -146,15 +146,10 @@ def _independent(deviations: ComplexArray, freedom: int) -> float:
 def repeats_of(records: Sequence[Record]) -> tuple[Repeats, ...]:
     """Every experiment among SISO records that has an amplitude with two records or more; amplitudes with a
     single one are left out. Raises ValueError for several inputs or outputs."""
-    forms: list[list[tuple[Record, RealArray]]] = []
     for record in records:
         record.refuse_several()
-        course = _course(record)
-        if not np.any(course):
-            continue
-        alike = next((form for form in forms if _alike(record, course, *form[0])), None)
-        forms.append([(record, course)]) if alike is None else alike.append((record, course))
-    found = (_experiment(form) for form in forms)
+    moving = [(record, course) for record in records if np.any(course := _course(record))]
+    found = (_experiment(form) for form in in_groups(moving, _alike))
     return tuple(experiment for experiment in found if experiment is not None)
 
 
@@ -164,8 +159,9 @@ def _course(record: Record) -> RealArray:
     return np.asarray(course)
 
 
-def _alike(record: Record, course: RealArray, other: Record, its: RealArray) -> bool:
+def _alike(one: tuple[Record, RealArray], another: tuple[Record, RealArray]) -> bool:
     """Excited in the same way, whatever the size."""
+    (record, course), (other, its) = one, another
     if course.size != its.size or record.dt_s != other.dt_s:
         return False
     return bool(np.linalg.norm(course / np.linalg.norm(course) - its / np.linalg.norm(its)) < _SAME)

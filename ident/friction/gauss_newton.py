@@ -194,11 +194,25 @@ def descended(
                 break
         else:
             break
+    return _with_covariance(found, blocks, targets, float(noise))
+
+
+def _with_covariance(
+    found: FrictionFit, blocks: Sequence[RealArray], targets: Sequence[RealArray], noise: float
+) -> FrictionFit:
+    """The fit with what its equations (`equations`) and a noise of this size leave open.
+
+    Every record has a level of its own, about the common one; it and the logarithms in the law are known
+    beforehand, as further measurements.
+    """
+    count, n = len(blocks), sum(target.size for target in targets)
+    p, q = found.coefficients.size, _parameters(found.law).size
+    logs = np.arange(1, q, 2)
     between = _between_records(blocks, targets, p, _REPEATS * found.level)
-    own = [np.outer(between * block[:, p], np.arange(len(records)) == k) for k, block in enumerate(blocks)]
-    known = np.zeros((logs.size + len(records), p + q + len(records) + 1))
+    own = [np.outer(between * block[:, p], np.arange(count) == k) for k, block in enumerate(blocks)]
+    known = np.zeros((logs.size + count, p + q + count + 1))
     known[: logs.size, p + logs] = noise / STD_LOG * np.eye(logs.size)
-    known[logs.size :, p + q : -1] = noise * np.eye(len(records))
+    known[logs.size :, p + q : -1] = noise * np.eye(count)
     _, triangle, rss, rest = least_squares(
         [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
     )
