@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import settings
 
 from tests.browser import PROGRAM, Browser, faults_of
-from tests.workflow.command import Answer, without_progress
+from tests.workflow.command import ROOT, Answer, without_progress
 from workflow.cli import main
 
 # The same examples on every machine, and no time limit for an example that happens to compile something.
@@ -43,6 +44,15 @@ def gap_cases() -> Path:
     if folder is None:
         pytest.skip("gap cases not found: set FLEXLINK_GAP to the folder that holds labelled/")
     return folder
+
+
+@pytest.fixture
+def examples_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a directory with the examples and nothing else, without logs that somebody has made there."""
+    examples = tmp_path / "examples"
+    shutil.copytree(ROOT / "examples", examples, ignore=shutil.ignore_patterns("logs_of_mine"))
+    shutil.rmtree(examples / "logs", ignore_errors=True)
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture

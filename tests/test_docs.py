@@ -80,16 +80,9 @@ def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
     return done.stdout
 
 
-@pytest.fixture
-def clean(tmp_path, monkeypatch):
-    """A directory with the examples and nothing else."""
-    shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("/logs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.mark.parametrize("name", CONSOLE)
-def test_commands_of_a_page_print_what_it_says(name, clean, flexlink):
+@pytest.mark.usefixtures("examples_alone")
+def test_commands_of_a_page_print_what_it_says(name, flexlink):
     if name == "c_code.md" and shutil.which("gcc") is None:
         pytest.skip("no gcc on this machine")
     run_page(DOCS / name, flexlink)

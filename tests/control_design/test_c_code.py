@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
 import subprocess
 
 import numpy as np
@@ -13,13 +12,9 @@ import scipy.linalg
 from control_design import Controller
 from control_design.controllers.c_code import c_header, c_source
 from control_design.controllers.feedforward import FrictionFeedforward
+from tests.compiler import COMPILER, compiled, needs_compiler
 
 _DT = 0.005
-_COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-
-needs_compiler = pytest.mark.skipif(
-    _COMPILER is None, reason="no C compiler (cc, gcc or clang) on this machine"
-)
 
 
 def _controller(order: int, **fields) -> Controller:
@@ -33,12 +28,7 @@ def _controller(order: int, **fields) -> Controller:
 
 def _compiled(controller: Controller, folder, number: str = "double"):
     """(step, reset) of the compiled controller, with its state inside."""
-    (folder / "arm.c").write_text(c_source(controller, "arm", number))
-    library = folder / "arm.so"
-    command = [_COMPILER, "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic"]
-    command += ["-shared", "-fPIC", str(folder / "arm.c"), "-o", str(library)]
-    subprocess.run(command, check=True, capture_output=True, text=True)
-    code = ctypes.CDLL(str(library))
+    code = compiled(c_source(controller, "arm", number), folder)
     real = ctypes.c_double if number == "double" else ctypes.c_float
     code.arm_step.restype = real
     code.arm_step.argtypes = [ctypes.c_void_p, real] + [real] * (controller.feedforward is not None)
@@ -147,7 +137,7 @@ def test_header_and_source_belong_together(tmp_path):
     program = tmp_path / "program"
     files = [str(tmp_path / "main.c"), str(tmp_path / "arm.c")]
     subprocess.run(
-        [_COMPILER, "-std=c99", "-Werror", *files, "-o", str(program)], check=True, capture_output=True
+        [COMPILER, "-std=c99", "-Werror", *files, "-o", str(program)], check=True, capture_output=True
     )
     assert subprocess.run([str(program)], check=False).returncode == 0
 

@@ -63,12 +63,8 @@ def recorded(torque_Nm: float, seed: int, output: int = 0, *, independent: bool 
 
 def true_response(omega_rad_s: RealArray) -> ComplexArray:
     """Held voltage to hub angle and tip (2, F) of the linear arm."""
-    arm, dt_s = linear_arm(RIG), RIG.sampling.dt_s
-    s, vectors = np.linalg.eig(arm.A)
-    shares = (arm.C @ vectors) * np.linalg.solve(vectors, arm.B[:, :1])[:, 0]
-    held = np.array([dt_s if abs(pole) < 1e-9 else np.expm1(pole * dt_s) / pole for pole in s])
-    z = np.exp(1j * omega_rad_s * dt_s)
-    return np.asarray(((held / (z[:, None] - np.exp(s * dt_s))) @ shares.T).T)
+    sampled = linear_arm(RIG).sample(RIG.sampling.dt_s, method="zoh")
+    return np.asarray(sampled(np.exp(1j * omega_rad_s * RIG.sampling.dt_s))[:, 0])
 
 
 @pytest.fixture(scope="module", params=[0.02, 0.1])

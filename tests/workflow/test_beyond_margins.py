@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
-import subprocess
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -23,6 +21,7 @@ from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.joint_synthesis import JointDesign
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
+from tests.compiler import compiled, needs_compiler
 from tests.workflow.report_examples import (
     DT_S,
     achievable,
@@ -54,8 +53,6 @@ from workflow.tasks.results import (
 )
 from workflow.tasks.summary import verdict_of
 from workflow.text.templates import environment, said
-
-_COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
 def spec(**changes) -> Specification:
@@ -282,15 +279,11 @@ def test_filter_files(filtered, tmp_path):
     assert mat["dt_s"].item() == found.dt_s
 
 
-@pytest.mark.skipif(_COMPILER is None, reason="no C compiler (cc, gcc or clang) on this machine")
+@needs_compiler
 def test_reference_filter_in_c_agrees_to_1e_12(filtered, tmp_path):
     found = filtered.filter
     assert found is not None
-    (tmp_path / "f.c").write_bytes(law_bytes(found, ".c"))
-    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Werror", "-shared", "-fPIC"]
-    command = [str(_COMPILER), *flags, str(tmp_path / "f.c"), "-o", str(tmp_path / "f.so")]
-    subprocess.run(command, check=True, capture_output=True)
-    code = ctypes.CDLL(str(tmp_path / "f.so"))
+    code = compiled(law_bytes(found, ".c").decode(), tmp_path)
     code.reference_filter_step.restype = ctypes.c_double
     code.reference_filter_step.argtypes = [ctypes.c_void_p, ctypes.c_double]
     state = ctypes.create_string_buffer(8 * (found.order + 4))

@@ -7,7 +7,6 @@ import glob
 import json
 import re
 import shlex
-import shutil
 import textwrap
 import tomllib
 from pathlib import Path
@@ -34,15 +33,6 @@ def test_the_readme_has_the_commands_that_are_tested():
     assert names == ["simulate", "identify", "excite", "run", "study", "diagnose", "blind", "paper"]
 
 
-@pytest.fixture
-def clean(tmp_path, monkeypatch):
-    """A directory with the examples and nothing else."""
-    shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("logs_of_mine"))
-    shutil.rmtree(tmp_path / "examples" / "logs", ignore_errors=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def said(words: str) -> bool:
     return re.search(words, " ".join(README.split())) is not None
 
@@ -52,7 +42,7 @@ def modes_of(document) -> list[float]:
 
 
 @pytest.fixture
-def call(clean, flexlink):
+def call(examples_alone, flexlink):
     """Run the command of this name as the README has it, and return what `--json` prints."""
 
     def run(name: str):
@@ -97,7 +87,8 @@ def test_the_diagnosis_of_the_readme_finds_what_was_hidden(call):
 
 
 @pytest.mark.slow
-def test_make_run_gives_the_numbers_of_the_readme(clean, flexlink):
+@pytest.mark.usefixtures("examples_alone")
+def test_make_run_gives_the_numbers_of_the_readme(flexlink):
     (words,) = re.findall(r"^run:.*\n\t\$\(BIN\)/flexlink (.*)$", MAKEFILE, re.MULTILINE)
     answer = flexlink(*words.replace("$(OUT)", "runs/default").split(), "--json").document()
     assert answer["certified"]

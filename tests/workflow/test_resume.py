@@ -225,12 +225,6 @@ class Watch(Progress):
         (self.taken_up if taken_up else self.made).append(stage)
 
 
-def test_resuming_a_finished_run_makes_nothing_again(fast_run):
-    watch = Watch()
-    run_from_files(FAST_ARM, fast_run[0], resume=True, progress=watch)
-    assert watch.taken_up == NAMES
-
-
 def test_missing_page_is_drawn_again(fast_run, tmp_path, plain_page):
     out = tmp_path / "run"
     shutil.copytree(fast_run[0], out)

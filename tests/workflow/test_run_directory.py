@@ -50,14 +50,6 @@ def test_a_place_that_takes_no_files_is_refused_before_the_work():
         RunDirectory(Path("/proc/run")).refuse_unless_free()
 
 
-def test_a_living_run_is_not_replaced(tmp_path):
-    run = begin(tmp_path / "run")
-    with run.locked(), pytest.raises(InputError, match="another process"), run.writing(replace=True):
-        begin(tmp_path / "run", replace=True)
-    assert run.manifest_path.is_file()
-    begin(tmp_path / "run", replace=True)
-
-
 @pytest.mark.parametrize("how", [{"resume": True}, {"replace": True}])
 def test_somebody_elses_directory_is_never_touched(tmp_path, how):
     (tmp_path / "thesis.txt").write_text("years of work")
