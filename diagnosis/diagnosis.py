@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,7 +27,7 @@ from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.intervals import parameter_intervals
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.imperfect.answered import beside_imperfections, reaches_noise, searched
+from diagnosis.imperfect.answered import beside_imperfections, looked_at_again, reaches_noise, searched
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.machine.own_plant import PlantCase
@@ -67,12 +68,16 @@ def diagnose(
     weighing = case.machine.weighing
     if not weighing.model_error > 0:
         return _without_error(case, progress, rng)
-    found = searched(case, progress, time_limit_s)
+    deadline_s = time.monotonic() + time_limit_s
+    found = searched(case, progress, deadline_s)
     if not weighing.stated and isinstance(case, PlantCase) and not found.left_out and reaches_noise(found):
         exact = _without_error(case.without_model_error(), progress, rng)
         if exact.verdict != "unknown":
             return exact
-    return beside_imperfections(found, rng)
+    answer = beside_imperfections(found, rng)
+    if isinstance(case, PlantCase) and not found.left_out:
+        return looked_at_again(answer, progress, deadline_s, rng)
+    return answer
 
 
 def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -41,11 +41,30 @@ _ALIKE = 0.25
 _NEAR_NOISE = 2.0
 
 
-def searched(case: CaseOfMachine, progress: Progress, time_limit_s: float = np.inf) -> Search:
-    """Everything fitted that a diagnosis beside a model error weighs."""
-    search = Search(case, progress, time.monotonic() + time_limit_s)
+def searched(case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf) -> Search:
+    """Everything fitted that a diagnosis beside a model error weighs.
+
+    deadline_s : of time.monotonic(); after it nothing more is tried.
+    """
+    search = Search(case, progress, deadline_s)
     search.run()
     return search
+
+
+def looked_at_again(
+    answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
+) -> Diagnosis:
+    """The answer of a machine that integrates, where what a bias makes of a free run does not interest.
+
+    That drifts as far as it likes, and beside it nothing else seems to matter. Taken only where it names what
+    the first answer does not.
+    """
+    search = Search(answer.case, progress, deadline_s, at_inputs=True)
+    if not search.amplifies:
+        return answer
+    search.run()
+    again = beside_imperfections(search, rng)
+    return again if set(again.combination) - set(answer.combination) else answer
 
 
 def reaches_noise(search: Search) -> bool:
@@ -70,6 +89,8 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         least = _LEAST_KEPT * case.machine.weighing.model_error
         kept = [p.name for p in whole.parts if p.name in found.accepted or p.share > least]
         accepted = search.finished(search.by_these(kept, whole.explanation))
+        if accepted.pooled_held_out(case.noise) > refit.pooled_held_out(case.noise):
+            accepted = whole.explanation
     before = _whitened(case, search.stated())
     moved, after = _whitened(case, refit), _whitened(case, accepted)
     closed, interval = share_closed(case, moved, after, rng, NOISE_FLOOR)
@@ -99,7 +120,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         residuals_refit=moved,
         residuals_after=after,
         simulations=search.simulations,
-        shares=shares_of(search, found, accepted, rng),
+        shares=replace(shares_of(search, found, accepted, rng), at_inputs=search.at_inputs),
         competing=_competing(case, search, found) if isinstance(case, Case) else (),
     )
 

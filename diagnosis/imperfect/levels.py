@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import dct
+from scipy.fft import dct, idct
 
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
@@ -29,6 +29,29 @@ _LOWEST = 4
 _MOST = 16.0
 # Share of the stated model error below which a gain is none: what does not interest is not fitted.
 _UNINTERESTING = 0.4
+
+
+def octaves_of(samples: int) -> npt.NDArray[np.int64]:
+    """(T,) octave of every coefficient of the cosine transform, the first four in one."""
+    octave = np.maximum(np.log2(np.maximum(np.arange(samples), 1) / _LOWEST), -1).astype(np.int64) + 1
+    octave[: min(_LOWEST, samples)] = 0
+    return octave
+
+
+def disturbance(signal: Real, rng: np.random.Generator) -> Real:
+    """(T,) random, as large as a signal (T,), its octaves as large as they are there, but that they do not
+    fall off towards low frequencies: a bias that changes is as likely as anything faster."""
+    octave = octaves_of(signal.size)
+    energy = octave_energies(signal[:, None])[:, 0]
+    envelope = np.maximum.accumulate(energy[::-1])[::-1]
+    size = np.sqrt(envelope * energy.sum() / (np.sum(envelope) or 1.0) / np.bincount(octave))
+    return np.asarray(idct(size[octave] * rng.standard_normal(signal.size), norm="ortho"))
+
+
+def octave_energies(signals: Real) -> Real:
+    """(T, Y) -> (octaves, Y)"""
+    octave = octaves_of(len(signals))
+    return np.array([np.bincount(octave, c * c) for c in dct(signals, axis=0, norm="ortho").T]).T
 
 
 def coefficients(residuals: Real) -> Real:
@@ -41,31 +64,61 @@ class Levels:
     """Bands of the coefficients of some records.
 
     band : (N,) index of the band of every coefficient. counted : (B,) independent values of a band.
-    floor : (B,) energy F_b.
+    floor : (B,) energy F_b; noise : (B,) the part of it that sensors have. felt : (B,) what energy left in a
+    band counts. belongs : (B,) which of the R Y outputs of records it is of; motion : (R Y,) their energies,
+    counted so too.
     """
 
     band: npt.NDArray[np.int64]
     counted: Real
     floor: Real
+    noise: Real
+    felt: Real
+    belongs: npt.NDArray[np.int64]
+    motion: Real
 
     @classmethod
-    def of(cls, records: Sequence[RecordOfMachine], noise: Real, model_error: float) -> Levels:
-        """noise (Y,): standard deviations; model_error: share of the motion that a good model may miss."""
-        bands, counted, floors, first = [], [], [], 0
-        for record in records:
-            T, Y = record.output.shape
-            octave = np.maximum(np.log2(np.maximum(np.arange(T), 1) / _LOWEST), -1).astype(np.int64) + 1
-            octave[: min(_LOWEST, T)] = 0
+    def of(
+        cls,
+        records: Sequence[RecordOfMachine],
+        noise: Real,
+        model_error: float,
+        amplified: Sequence[Real] = (),
+    ) -> Levels:
+        """noise (Y,): standard deviations; model_error: share of the motion that a good model may miss.
+
+        amplified : of every record (octaves, Y), energy that a disturbance as large as its inputs has in its
+            outputs. Octaves in which that is more than an even part of the motion count the less: a machine
+            that integrates makes a motion of what nobody would call a model error, and a good model misses
+            it. Empty: none is.
+        """
+        rows, first, Y = [], 0, noise.size
+        for r, record in enumerate(records):
+            T = len(record.output)
+            octave = octaves_of(T)
             octaves = int(octave[-1]) + 1
-            bands.append(first + (octave[:, None] * Y + np.arange(Y)).ravel())
-            first += octaves * Y
-            samples = np.bincount(octave, minlength=octaves).astype(np.float64)
-            motion = T * np.var(record.output, axis=0) / octaves
-            counted.append(np.repeat(np.minimum(samples, _MOST), Y))
-            floors.append(
-                (samples[:, None] * noise**2 + (_UNINTERESTING * model_error) ** 2 * motion).ravel()
+            samples = np.bincount(octave).astype(np.float64)
+            motion = T * np.var(record.output, axis=0)
+            felt = np.ones((octaves, Y))
+            if amplified:
+                even = motion / octaves
+                felt = even / np.maximum(even, amplified[r])
+                centred = record.output - np.mean(record.output, axis=0)
+                motion = np.sum(felt * octave_energies(centred), axis=0)
+            floor = (_UNINTERESTING * model_error) ** 2 * motion / octaves / felt
+            rows.append(
+                (
+                    first + (octave[:, None] * Y + np.arange(Y)).ravel(),
+                    np.repeat(np.minimum(samples, _MOST), Y),
+                    (samples[:, None] * noise**2 + floor).ravel(),
+                    (samples[:, None] * noise**2).ravel(),
+                    felt.ravel(),
+                    np.tile(r * Y + np.arange(Y), octaves),
+                    motion,
+                )
             )
-        return cls(np.concatenate(bands), np.concatenate(counted), np.concatenate(floors))
+            first += octaves * Y
+        return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
     def energy(self, e: Real) -> Real:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from diagnosis.fit.nominal import LogNormalParameters
-from diagnosis.imperfect.levels import Levels, coefficients
+from diagnosis.imperfect.levels import Levels, coefficients, disturbance, octave_energies
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 
 _NOISE_ALLOWED = 1.5
+# Draws of every disturbance.
+_DISTURBANCES = 4
 _ANGLE_STEP_RAD = 1e-3
 # Of the spread of a state at the start.
 _STATE_STEP = 1e-3
@@ -57,15 +59,30 @@ class StartColumns:
 class Records:
     """Some records of a case as coefficients (N,); counts its simulations."""
 
-    def __init__(self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine]) -> None:
+    def __init__(
+        self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine], *, at_inputs: bool = False
+    ) -> None:
         self.case, self.experiments = case, tuple(experiments)
         self.nominal = LogNormalParameters(case.machine)
-        self.levels = Levels.of(experiments, case.noise, case.machine.weighing.model_error)
+        amplified = [self._amplified(e) for e in experiments] if at_inputs else []
+        self.levels = Levels.of(experiments, case.noise, case.machine.weighing.model_error, amplified)
         self.simulations = 0
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
         unknown = case.machine.unknown_start
         self.state_spread, self.zero_spread = unknown.state_spread, unknown.zero_spread
+
+    def _amplified(self, experiment: RecordOfMachine) -> Real:
+        """(octaves, Y) energies of what disturbances as large as its inputs do to the outputs, of the stated
+        machine from rest; to first order."""
+        simulate, rng = self.case.machine.simulator(()), np.random.default_rng(0)
+        u, small = experiment.input, self.case.machine.weighing.model_error
+        undisturbed = simulate(u)
+        added = [
+            simulate(u + small * column * disturbance(u @ column, rng)[:, None]) - undisturbed
+            for column in np.tile(np.eye(u.shape[1]), (_DISTURBANCES, 1))
+        ]
+        return np.asarray(sum(octave_energies(part / small) for part in added) / _DISTURBANCES)
 
     def at_rest(self) -> Start:
         """Starts as the first samples say, sensors at their zeros."""
@@ -146,11 +163,14 @@ class Records:
         )
 
     def shares(self, residuals: Sequence[Real]) -> Real:
-        """(Y,) RMS left beyond sensor noise over the RMS of the motion (about the mean), all records.
+        """(Y,) RMS left beyond sensor noise over the RMS of the motion (about the mean), all records; of both
+        what is felt (`Levels`).
 
         Noise is allowed half as much again as a data sheet says.
         """
-        noise = (_NOISE_ALLOWED * self.case.noise) ** 2
-        left = sum(np.maximum(np.sum(e**2, axis=0) - len(e) * noise, 0.0) for e in residuals)
-        motion = sum(len(e.output) * np.var(e.output, axis=0) for e in self.experiments)
+        levels, Y = self.levels, self.case.noise.size
+        energy = levels.energy(np.concatenate([coefficients(e) for e in residuals]))
+        beyond = levels.felt * (energy - _NOISE_ALLOWED**2 * levels.noise)
+        left = np.maximum(np.bincount(levels.belongs, beyond), 0.0).reshape(-1, Y).sum(axis=0)
+        motion = levels.motion.reshape(-1, Y).sum(axis=0)
         return np.asarray(np.sqrt(left / motion))

@@ -29,6 +29,8 @@ _CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
 _HELD_OUT_STEPS = 5
+# Of octaves, what is felt where disturbances of the inputs are amplified.
+_AMPLIFIED = 0.5
 _LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
 
 
@@ -58,6 +60,10 @@ class Explanation:
     def key(self) -> tuple[str, ...]:
         return tuple(sorted(self.names))
 
+    def pooled_held_out(self, noise: Real) -> float:
+        """Energy left of the held-out records, in noise deviations (Y,)."""
+        return float(sum(np.sum((part / noise) ** 2) for part in self.left_held_out))
+
     @property
     def evidence(self) -> float:
         return self.log_likelihood + self.log_prior + self.log_volume
@@ -65,17 +71,21 @@ class Explanation:
 
 @dataclass(eq=False)
 class Search:
-    """All that was fitted to a case, the nominal alone first."""
+    """All that was fitted to a case, the nominal alone first.
+
+    at_inputs : the model error is one of the inputs, whatever the machine makes of it (`Levels`).
+    """
 
     case: CaseOfMachine
     progress: Progress
     deadline_s: float = np.inf
+    at_inputs: bool = False
     found: list[Explanation] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.records = Records(self.case, self.case.estimation)
-        self.held_out = Records(self.case, self.case.held_out)
+        self.records = Records(self.case, self.case.estimation, at_inputs=self.at_inputs)
+        self.held_out = Records(self.case, self.case.held_out, at_inputs=self.at_inputs)
         self.points: list[tuple[Candidate, list[Point]]] = []
         self._reduced: set[tuple[object, ...]] = set()  # sets already fitted without one of their effects
 
@@ -86,6 +96,11 @@ class Search:
     @property
     def simulations(self) -> int:
         return self.records.simulations + self.held_out.simulations
+
+    @property
+    def amplifies(self) -> bool:
+        """Whether the machine makes much more of a disturbance of its inputs than of the inputs."""
+        return bool(np.min(self.records.levels.felt) < _AMPLIFIED)
 
     def run(self) -> None:
         """The nominal, every effect alone, then sets of two, three and more beside the likeliest.

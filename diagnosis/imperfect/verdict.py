@@ -119,13 +119,15 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
 
 
 def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
-    """The sets that take part, best first."""
+    """The sets that take part, best first: none that leaves more of the held-out records than the nominal."""
     model_error = search.case.machine.weighing.model_error
     best = best_of_sets(search.found)
+    farthest = search.base.pooled_held_out(search.case.noise)
     score = {
         key: score_of(explanation, listed, model_error)
         for key, explanation in best.items()
         if not _contradicted(explanation, best.values(), model_error)
+        and explanation.pooled_held_out(search.case.noise) <= farthest
     }
     ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]

@@ -15,6 +15,7 @@ from numba import njit
 
 from benchmarks import emps_axis
 from diagnosis import Plant, PlantCase, PlantExperiment, diagnose, with_effects
+from diagnosis.imperfect.answered import beside_imperfections, searched
 from tests.diagnosis.machines import rubbing
 
 DT_S, SAMPLES = 0.01, 700
@@ -74,7 +75,7 @@ def _play(position, gap):
     return found
 
 
-def _late_motor(voltage, delay_s=0.033):
+def _late_motor(voltage, delay_s=0.033, angle=False):
     """The voltage arrives in the middle of a sample; integrated as the position of a body without speed."""
     parts = 10
     late = np.concatenate([np.zeros(round(delay_s / DT_S * parts)), voltage.repeat(parts)])
@@ -83,7 +84,7 @@ def _late_motor(voltage, delay_s=0.033):
         late[: voltage.size * parts],
         DT_S / parts,
     )
-    return fine[::parts, 1]
+    return fine[::parts, 0 if angle else 1]
 
 
 CASES = {
@@ -170,6 +171,38 @@ def test_a_stated_value_far_beyond_its_tolerance_is_named(key, tolerances, true)
     # An uneven spring that is not listed takes up to 2 % of the forces.
     assert found.rig.parameters[key] * ratio == pytest.approx(true, rel=0.02)
     assert found.gap_closed > 0.95
+
+
+def _turning(parameters, effects, inputs):
+    """Angle (T, 1): the motor's speed added up, straight between samples."""
+    speed = _motor(inputs[:, 0].copy(), *parameters.values())[:, 0]
+    T, gain = parameters["time_constant_s"], parameters["gain_rad_Vs"]
+    return np.concatenate([[0.0], np.cumsum(gain * inputs[:-1, 0] * DT_S - T * np.diff(speed))])[:, None]
+
+
+def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
+    """A bias of a hundredth of the largest voltage leaves most of the gap of an angle nobody holds."""
+    rng = np.random.default_rng(5)
+    experiments = []
+    for amplitude, role in ((1.5, "estimation"), (3.0, "estimation"), (2.2, "held_out")):
+        u = amplitude * rng.uniform(-1, 1, SAMPLES // 20).repeat(20)
+        y = _late_motor(u + 0.02, angle=True) + 1e-3 * rng.standard_normal(SAMPLES)
+        experiments.append(PlantExperiment(f"up to {amplitude:g}", role, u[:, None], y[:, None]))
+    stated, tolerances = (
+        {"time_constant_s": 0.2, "gain_rad_Vs": 10.0},
+        {"time_constant_s": 0.1, "gain_rad_Vs": 0.05},
+    )
+    plant = Plant(_turning, stated, tolerances, ("angle_rad",), np.array([1e-3]))
+    plant = with_effects(plant, "all", experiments, dt_s=DT_S, motion="angle_rad")
+    case = PlantCase("turning motor", plant, tuple(experiments))
+    free = beside_imperfections(searched(case, lambda done, what: None), np.random.default_rng(0))
+    found = diagnose(case)
+    assert (free.combination, found.combination) == (("input_offset",), ("input_delay",))
+    assert found.shares.at_inputs
+    assert not free.shares.at_inputs
+    delay = next(change.values["delay_s"] for change in found.repair if change.id == "input_delay")
+    assert delay == pytest.approx(0.033, rel=0.05)
+    assert found.gap_closed > 0
 
 
 def test_emps_by_names_alone_gives_the_published_values(flexlink_data):
