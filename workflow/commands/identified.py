@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,58 +24,54 @@ from workflow.text.formats import count
 from workflow.text.templates import rows_of, words
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What `identify_logs` was asked for, besides the records that it has read."""
-
-    files: tuple[Path, ...]
-    options: IdentOptions | None
-    promised: UncertaintyOptions
-    band_rad_s: tuple[float, float] | None
-    noise_order: int | None
-    input_limit: float | None
-    out: Path | None
-    report: Path | None
-    export: Path | None
-
-
 def identified(
-    measured: Sequence[Record], fresh_logs: Sequence[Record], asked: Asked, progress: Progress
+    measured: Sequence[Record],
+    fresh_logs: Sequence[Record],
+    *,
+    files: Sequence[Path],
+    options: IdentOptions | None,
+    promised: UncertaintyOptions,
+    band_rad_s: tuple[float, float] | None,
+    noise_order: int | None,
+    input_limit: float | None,
+    out: Path | None,
+    report: Path | None,
+    export: Path | None,
+    progress: Progress,
 ) -> RunSummary:
-    """Model, page and table of the records. Raises InputError."""
-    out, report, export = asked.out, asked.report, asked.export
+    """`identify_logs` with the records that were read from the files. Raises InputError."""
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
         raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
     progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
-    true_modes = truth.truth_beside(asked.files, measured[0].output_names[0])
+    true_modes = truth.truth_beside(files, measured[0].output_names[0])
     for record in measured:
         refuse_constant_input(record)
     common = with_common_sampling_time([*measured, *fresh_logs])
     result = identify_records(
         common[: len(measured)],
         common[len(measured) :],
-        asked.options,
-        promised=asked.promised,
-        band_rad_s=asked.band_rad_s,
-        noise_order=asked.noise_order,
+        options,
+        promised=promised,
+        band_rad_s=band_rad_s,
+        noise_order=noise_order,
         with_plot=report is not None,
         progress=progress,
     )
-    result = replace(result, true_modes=truth.beside(result.about, true_modes), input_limit=asked.input_limit)
-    files: dict[Path, bytes] = {}
+    result = replace(result, true_modes=truth.beside(result.about, true_modes), input_limit=input_limit)
+    written: dict[Path, bytes] = {}
     if report is not None:
         from workflow.report.identify_page import identify_page  # loads matplotlib: a second
 
         with progress.stage("report") as update:
-            inputs = {str(path): storage.sha256_of_file(path) for path in asked.files}
-            files[report] = identify_page(result, inputs, update).encode()
+            inputs = {str(path): storage.sha256_of_file(path) for path in files}
+            written[report] = identify_page(result, inputs, update).encode()
     if out is not None:
-        plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, asked.promised.level)
-        files[out] = storage.npz_bytes(codec.to_arrays(plant))
+        plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, promised.level)
+        written[out] = storage.npz_bytes(codec.to_arrays(plant))
     if export is not None:
-        files[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))
+        written[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))
     interrupts.check()
-    storage.write_together(files)
+    storage.write_together(written)
     return _summary(result, out, report, export)
 
 

@@ -92,13 +92,19 @@ def identify_logs(
     measured = [read(Path(path)) for path in logs]
     fresh_logs = [read(Path(path)) for path in validation]
     # Here: what identifies takes seconds to load, and a log that is refused does not need it.
-    from workflow.commands.identified import Asked, identified
+    from workflow.commands.identified import identified
 
     return identified(
         measured,
         fresh_logs,
-        Asked(
-            (*logs, *validation), options, promised, band_rad_s, noise_order, input_limit, out, report, export
-        ),
-        progress or Progress(),
+        files=[*logs, *validation],
+        options=options,
+        promised=promised,
+        band_rad_s=band_rad_s,
+        noise_order=noise_order,
+        input_limit=input_limit,
+        out=out,
+        report=report,
+        export=export,
+        progress=progress or Progress(),
     )
