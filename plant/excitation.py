@@ -147,9 +147,7 @@ def crest_factor(signal: Real) -> float:
     return float(np.max(np.abs(signal)) / np.sqrt(np.mean(np.square(signal))))
 
 
-def log_chirp(
-    start_Hz: float, stop_Hz: float, amplitude_V: float, n_samples: int, dt_s: float, phase_rad: float = 0.0
-) -> Real:
+def log_chirp(start_Hz: float, stop_Hz: float, amplitude_V: float, n_samples: int, dt_s: float) -> Real:
     """Sine (T,) whose frequency grows by the same factor every second, from start to stop over the record.
 
     Phase 2 pi f0 T / ln(f1 / f0) ((f1 / f0)^(t / T) - 1).
@@ -163,7 +161,7 @@ def log_chirp(
     duration = n_samples * dt_s
     rate = np.log(stop_Hz / start_Hz) / duration
     time = np.arange(n_samples) * dt_s
-    return np.asarray(amplitude_V * np.sin(phase_rad + 2 * np.pi * start_Hz * np.expm1(rate * time) / rate))
+    return np.asarray(amplitude_V * np.sin(2 * np.pi * start_Hz * np.expm1(rate * time) / rate))
 
 
 def doublet(amplitude_V: float, start_s: float, pulse_s: float, n_samples: int, dt_s: float) -> Real:

@@ -235,7 +235,6 @@ def bound_all_frequencies(
     worst: WorstCase,
     *,
     modes: tuple[Mode, ...],
-    omega_min_rad_s: float,
     between_own_points: str = "nothing",
 ) -> AllFrequencies:
     """Bound every weighted worst case and the distance from -1 for all frequencies from 0 to Nyquist.
@@ -277,7 +276,6 @@ def bound_all_frequencies(
     edges = starting_edges(
         plant.nyquist_rad_s,
         modes,
-        omega_min_rad_s=omega_min_rad_s,
         extra=(*(() if plant.own_grid is None else plant.own_grid), *bands),
     )
     difference = _model_error(loop, controller, edges[1:])

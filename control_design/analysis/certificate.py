@@ -15,7 +15,7 @@ from control_design.analysis.stability import NyquistCount, closed_loop_poles, l
 from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.frequency_grid import frequency_grid, with_own_grid
+from control_design.plants.frequency_grid import CHECKED_FROM_RAD_S, frequency_grid, with_own_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from control_design.specification.requirement import Findings, SpecificationItem
@@ -78,7 +78,6 @@ def certify(
     plants: Sequence[UncertainPlant],
     specification: Specification,
     *,
-    omega_min_rad_s: float = 1e-4,
     n_dense: int = 6000,
     between_own_points: Literal["nothing", "linear"] = "nothing",
     joint_coverage: float | None = None,
@@ -118,21 +117,13 @@ def certify(
         if rng is None:
             raise ValueError("joint_coverage needs rng, a numpy.random.Generator to draw responses with")
         joint = calibrate(
-            controller,
-            plants,
-            specification,
-            rng=rng,
-            coverage=joint_coverage,
-            draws=joint_draws,
-            omega_min_rad_s=omega_min_rad_s,
+            controller, plants, specification, rng=rng, coverage=joint_coverage, draws=joint_draws
         )
         plants = [at_level(plant, max(plant.level, joint.level)) for plant in plants]
     verdicts: list[PlantVerdict] = []
     items: list[SpecificationItem] = []
     for plant in plants:
-        verdict, found = _check_plant(
-            controller, plant, specification, omega_min_rad_s, n_dense, between_own_points
-        )
+        verdict, found = _check_plant(controller, plant, specification, n_dense, between_own_points)
         verdicts.append(verdict)
         items += found
     nothing = Findings("controller", {}, None, (np.inf, 0.0), np.inf, (), controller)
@@ -159,7 +150,6 @@ def _check_plant(
     controller: Controller,
     plant: UncertainPlant,
     specification: Specification,
-    omega_min_rad_s: float,
     n_dense: int,
     between_own_points: str,
 ) -> tuple[PlantVerdict, list[SpecificationItem]]:
@@ -170,7 +160,7 @@ def _check_plant(
     near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
     wanted = frequency_grid(
-        plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=n_dense, n_mode=120 * len(light)
+        plant.nyquist_rad_s, light, omega_min_rad_s=CHECKED_FROM_RAD_S, n_log=n_dense, n_mode=120 * len(light)
     )
     grid = with_own_grid(plant, wanted)
 
@@ -204,7 +194,6 @@ def _check_plant(
             specification,
             worst,
             modes=tuple(light),
-            omega_min_rad_s=omega_min_rad_s,
             between_own_points=between_own_points,
         )
     else:

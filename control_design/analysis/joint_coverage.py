@@ -22,7 +22,7 @@ from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real, radius_of
 from control_design.plants.first_order import Intervals
-from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.frequency_grid import CHECKED_FROM_RAD_S, frequency_grid
 from control_design.plants.guards import Guard, different_responses, guard_grid
 from control_design.plants.plant_set import Channel, Mode, UncertainPlant, modes_of
 from control_design.plants.set_expansion import FirstOrderUncertainty
@@ -77,7 +77,6 @@ def joint_coverage(
     rng: np.random.Generator,
     coverage: float = 0.95,
     draws: int = 4000,
-    omega_min_rad_s: float = 1e-4,
 ) -> JointCoverage:
     """Calibrate the per-frequency level so that the worst case holds with probability `coverage`.
 
@@ -94,7 +93,7 @@ def joint_coverage(
         raise ValueError(f"joint coverage needs at least 100 draws; got {draws}")
     if not plants:
         raise ValueError("joint coverage needs at least one plant")
-    loops = [SampledLoop(controller, plant, specification, omega_min_rad_s) for plant in plants]
+    loops = [SampledLoop(controller, plant, specification) for plant in plants]
     found = [loop.gamma(rng, draws) for loop in loops]
     gamma = np.max([one.gamma for one in found], axis=0)
     outside = np.max([one.distance for one in found], axis=0)
@@ -151,13 +150,7 @@ class SampledLoop:
     Raises ValueError if an uncertainty cannot be drawn from.
     """
 
-    def __init__(
-        self,
-        controller: Controller,
-        plant: UncertainPlant,
-        specification: Specification,
-        omega_min_rad_s: float = 1e-4,
-    ) -> None:
+    def __init__(self, controller: Controller, plant: UncertainPlant, specification: Specification) -> None:
         self.plant, self.controller, self.specification = plant, controller, specification
         self.draw = _drawn(plant.channel)
         poles = closed_loop_poles(controller, plant)
@@ -166,7 +159,7 @@ class SampledLoop:
             Mode(m.omega_rad_s, max(abs(m.zeta), 1e-3)) for m in modes if m.omega_rad_s < plant.nyquist_rad_s
         ]
         grid = frequency_grid(
-            plant.nyquist_rad_s, light, omega_min_rad_s=omega_min_rad_s, n_log=500, n_mode=80 * len(light)
+            plant.nyquist_rad_s, light, omega_min_rad_s=CHECKED_FROM_RAD_S, n_log=500, n_mode=80 * len(light)
         )
         self.omega_rad_s, self.data = grid, PlantData.build(plant, specification, grid)
         self.unit = self.data.ellipses.scaled(1 / radius_of(plant.level))
@@ -241,7 +234,6 @@ def unstable_draws(
     rng: np.random.Generator,
     draws: int,
     most: int,
-    omega_min_rad_s: float = 1e-4,
 ) -> tuple[int, list[Guard]]:
     """How many of `draws` sampled responses (of every plant) are unstable, and up to `most` different ones
     of each plant, as guards for another synthesis.
@@ -251,8 +243,8 @@ def unstable_draws(
     unstable = np.zeros(draws, dtype=bool)
     guards: list[Guard] = []
     for number, plant in enumerate(plants):
-        loop = SampledLoop(controller, plant, specification, omega_min_rad_s)
-        grid, found = guard_grid(plant, omega_min_rad_s), list[Complex]()
+        loop = SampledLoop(controller, plant, specification)
+        grid, found = guard_grid(plant), list[Complex]()
         for here, count in _chunks(draws):
             responses = loop.draw(rng, count)
             bad = ~loop.stable_of(responses, responses(loop.omega_rad_s))

@@ -24,6 +24,9 @@ from control_design.plants.plant_set import Mode, UncertainPlant
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction, WeightedRequirement
 
+# Local maxima that a round refines, and the points it puts between the neighbours of each.
+_PEAKS, _INSERTED = 8, 9
+
 
 @dataclass(frozen=True, eq=False)
 class Weighting:
@@ -164,13 +167,11 @@ def worst_case(
     start: Real,
     *,
     rounds: int = 3,
-    peaks: int = 8,
-    inserted: int = 9,
 ) -> WorstCase:
     """Evaluate on `start` (F,) and refine around the largest local maxima of every kind.
 
-    response: controller without delay. Each round puts `inserted` points between the neighbours of the
-    `peaks` largest local maxima (ten times finer); plants known on their own grid only are not refined.
+    response: controller without delay. Each round makes the grid ten times finer between the neighbours of
+    the eight largest local maxima; plants known on their own grid only are not refined.
     """
     omega = np.asarray(start, dtype=np.float64)
     for left in range(rounds if plant.own_grid is None else 0, -1, -1):
@@ -179,9 +180,9 @@ def worst_case(
         finer = [omega]
         for name, value in values.items():
             if name != "distance" and np.any(value > 0):
-                for index in local_maxima(value)[:peaks]:
+                for index in local_maxima(value)[:_PEAKS]:
                     low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
-                    finer.append(np.linspace(low, high, inserted + 2)[1:-1])
+                    finer.append(np.linspace(low, high, _INSERTED + 2)[1:-1])
         if left == 0:
             break
         omega = np.unique(np.concatenate(finer))

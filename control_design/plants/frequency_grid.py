@@ -11,6 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from control_design.plants.ellipses import Real
 from control_design.plants.plant_set import Mode, UncertainPlant
 
+CHECKED_FROM_RAD_S = 1e-4
+"""Lowest frequency of the grids that a design is checked on, whatever it was made on."""
+
 
 class GridOptions(BaseModel):
     """How fine the frequency grids of a programme and of its dense check are."""
@@ -113,13 +116,11 @@ def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: in
     return np.union1d(grid, omega[[i for i in local_maxima(value) if value[i] > limit][:most]])
 
 
-def starting_edges(
-    nyquist_rad_s: float, modes: Sequence[Mode], *, omega_min_rad_s: float, extra: npt.ArrayLike = ()
-) -> Real:
+def starting_edges(nyquist_rad_s: float, modes: Sequence[Mode], *, extra: npt.ArrayLike = ()) -> Real:
     """Edges of a first partition of [0, Nyquist] for bounds on intervals: logarithmic, finer around modes."""
-    count = max(60, int(40 * np.log10(nyquist_rad_s / omega_min_rad_s)))
+    count = max(60, int(40 * np.log10(nyquist_rad_s / CHECKED_FROM_RAD_S)))
     inner = frequency_grid(
-        nyquist_rad_s, modes, omega_min_rad_s=omega_min_rad_s, n_log=count, n_mode=40 * len(modes)
+        nyquist_rad_s, modes, omega_min_rad_s=CHECKED_FROM_RAD_S, n_log=count, n_mode=40 * len(modes)
     )
     more = np.asarray(extra, dtype=np.float64)
     more = more[(more > 0) & (more < nyquist_rad_s)]

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, Real
-from control_design.plants.frequency_grid import frequency_grid
+from control_design.plants.frequency_grid import CHECKED_FROM_RAD_S, frequency_grid
 from control_design.plants.plant_set import UncertainPlant
 from ident.data.arrays import lock
 
@@ -53,12 +53,12 @@ class Guard:
         return Ellipses.of_no_size(self.omega_rad_s[index], self.response[index])
 
 
-def guard_grid(plant: UncertainPlant, omega_min_rad_s: float) -> Real:
+def guard_grid(plant: UncertainPlant) -> Real:
     """Frequencies fine enough to count the winding of a response whose modes have moved."""
     return frequency_grid(
         plant.nyquist_rad_s,
         plant.modes,
-        omega_min_rad_s=omega_min_rad_s,
+        omega_min_rad_s=CHECKED_FROM_RAD_S,
         n_log=1200,
         n_mode=400 * len(plant.modes),
     )

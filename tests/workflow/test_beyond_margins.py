@@ -130,7 +130,7 @@ def test_whole_responses_agree_with_drawing_them_here():
 
 
 def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
-    def calibrate(law, plants, specification, *, rng, coverage, draws, omega_min_rad_s=1e-4):
+    def calibrate(law, plants, specification, *, rng, coverage, draws):
         return JointCoverage(coverage, draws, 0.9, 0.99, 0.95, 0.88, 0.9, 0.4, 0.998, 0.99)
 
     monkeypatch.setattr("control_design.analysis.certificate.calibrate", calibrate)
