@@ -19,7 +19,7 @@ known to parts in a thousand).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -167,27 +167,38 @@ def at_amplitudes(
 
     share = 0.0
     if len(centres) > 1:
-        half_decade = int(0.5 * spaced.size / np.log10(spaced[-1] / spaced[0]))
-
-        def inside(share: float, these: ComplexArray) -> RealArray:
-            """Share of responses (A, K, F) within the ellipses, in every window of half a decade."""
-            ellipses, flat = posterior(share).at(spaced, level), these.reshape(-1, spaced.size)[::_THINNED]
-            held = np.mean([ellipses.contains(one) for one in flat], axis=0)
-            return np.asarray(sliding_window_view(held, half_decade).mean(axis=1))
-
-        drawn = responses[..., np.isin(omega, spaced)]
-        together = drawn - drawn.mean(axis=1, keepdims=True) + posterior(0.0).at(spaced, level).centre
-        # Not more than one amplitude alone has: no scatter between them makes up for heavy tails of each.
-        wanted = np.minimum(level, inside(0.0, together)) - _OF_DRAWS
-        wanted[inside(_MOST, drawn) < wanted] = 0.0
-
-        def missing(share: float) -> float:
-            return float(np.max(wanted - inside(share, drawn)))
-
-        # Where the amplitudes differ by less than is known of each, nothing has to be added.
-        if missing(0.0) > 0:
-            share = brentq(missing, 0.0, _MOST, xtol=0.01) if missing(_MOST) < 0 else _MOST
+        share = _share_of_scatter(posterior, responses[..., np.isin(omega, spaced)], spaced, level)
     return posterior(share), damped_poles(friction.model, float(np.sqrt(damping[0] * damping[-1])))
+
+
+def _share_of_scatter(
+    posterior: Callable[[float], ResponsePosterior], drawn: ComplexArray, omega: RealArray, level: float
+) -> float:
+    """How much of the scatter between amplitudes (0 to _MOST) the ellipses need, so that they hold the drawn
+    responses (A, K, F) with probability `level` in every half decade.
+
+    posterior: with a share of the scatter. omega (F,): evenly spaced in its logarithm.
+    """
+    half_decade = int(0.5 * omega.size / np.log10(omega[-1] / omega[0]))
+
+    def inside(share: float, these: ComplexArray) -> RealArray:
+        """Share of responses (A, K, F) within the ellipses, in every window of half a decade."""
+        ellipses, flat = posterior(share).at(omega, level), these.reshape(-1, omega.size)[::_THINNED]
+        held = np.mean([ellipses.contains(one) for one in flat], axis=0)
+        return np.asarray(sliding_window_view(held, half_decade).mean(axis=1))
+
+    together = drawn - drawn.mean(axis=1, keepdims=True) + posterior(0.0).at(omega, level).centre
+    # Not more than one amplitude alone has: no scatter between them makes up for heavy tails of each.
+    wanted = np.minimum(level, inside(0.0, together)) - _OF_DRAWS
+    wanted[inside(_MOST, drawn) < wanted] = 0.0
+
+    def missing(share: float) -> float:
+        return float(np.max(wanted - inside(share, drawn)))
+
+    # Where the amplitudes differ by less than is known of each, nothing has to be added.
+    if missing(0.0) <= 0:
+        return 0.0
+    return brentq(missing, 0.0, _MOST, xtol=0.01) if missing(_MOST) < 0 else _MOST
 
 
 def more_at_a_strong_line(share: float) -> float:

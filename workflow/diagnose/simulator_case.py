@@ -114,9 +114,8 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
     dt_s = _sampling(tables, settings)
     name = settings.case or model.stem
     with naming(str(model)):
-        inputs, outputs, finish = _SIMULATORS[next(k for k in _KINDS if getattr(settings, k))](
-            model, tables, settings, dt_s
-        )
+        open_simulator = _SIMULATORS[next(kind for kind in _KINDS if getattr(settings, kind))]
+        inputs, outputs, finish = open_simulator(model, tables, settings, dt_s)
     experiments = _experiments(paths, tables, settings, inputs, outputs, tracked=settings.mjcf is not None)
     noise = _noise(experiments, outputs, settings)
     with naming(str(model)):
@@ -139,6 +138,8 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
     )
 
 
+# A simulator is opened in two steps: it names the inputs and outputs that the logs are read for, and makes
+# its plant (and what writes a repaired model) of what was read.
 _Finish = Callable[[Sequence[PlantExperiment], Real], tuple[Plant, Callable[[Diagnosis], str] | None]]
 _Simulator = Callable[
     [Path, Sequence[Table], SimulatorSettings, float], tuple[tuple[str, ...], tuple[str, ...], _Finish]
@@ -195,11 +196,8 @@ def _python(model: Path, tables: Sequence[Table], settings: SimulatorSettings, d
     inputs, outputs = tuple(there["INPUTS"]), tuple(there["OUTPUTS"])
     tolerances, effects = there.get("TOLERANCES", {}), tuple(there.get("EFFECTS", ()))
     simulate, parameters = there["simulate"], there["PARAMETERS"]
-    return (
-        inputs,
-        outputs,
-        _with_all(simulate, parameters, tolerances, effects, inputs, outputs, settings, dt_s),
-    )
+    finish = _with_all(simulate, parameters, tolerances, effects, inputs, outputs, settings, dt_s)
+    return inputs, outputs, finish
 
 
 _SIMULATORS: Mapping[str, _Simulator] = {"mjcf": _mjcf, "fmu": _fmu, "python": _python}
