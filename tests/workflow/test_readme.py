@@ -7,6 +7,8 @@ import glob
 import json
 import re
 import shlex
+import shutil
+import subprocess
 import textwrap
 import tomllib
 from pathlib import Path
@@ -31,6 +33,18 @@ TRUE_HZ = sorted(abs(pole) / (2 * np.pi) for pole in linear_arm(paper_link()).po
 def test_the_readme_has_the_commands_that_are_tested():
     names = [command[0] for command in COMMANDS]
     assert names == ["simulate", "identify", "excite", "run", "study", "diagnose", "blind", "paper"]
+
+
+@pytest.mark.skipif(
+    not (ROOT / ".git").exists() or shutil.which("git") is None, reason="no repository, or no git"
+)
+def test_what_the_commands_of_the_readme_leave_is_not_taken_for_source():
+    left = re.findall(r"--(?:out|report|export) ([\w./]+)", README)
+    assert {"hub.html", "voltages", "found", "runs/mine"} <= set(left)
+    for name in left:
+        inside = name if Path(name).suffix else f"{name}/file"
+        asked = subprocess.run(["git", "check-ignore", "-q", inside], cwd=ROOT, check=False)
+        assert asked.returncode == 0, name
 
 
 def said(words: str) -> bool:
