@@ -171,7 +171,7 @@ def identify_frf(
             tuple(search.minima),
             distinct(
                 [
-                    *pole_warnings(poles, fixed, search.bounds, response.dt_s),
+                    *pole_warnings(model, fixed, search.bounds),
                     *pairs_outside(poles, fixed, response.dt_s, band_rad_s),
                 ]
             ),

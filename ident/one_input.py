@@ -337,7 +337,7 @@ def _advice(
     data, fixed, bounds = fitted.data, fitted.search.fixed, fitted.search.bounds
     return [
         *advice(records, data, model, residuals, fixed),
-        *pole_warnings(model.poles, fixed, bounds, data.dt_s),
+        *pole_warnings(model, fixed, bounds),
         *implausible_pairs(model.poles, fixed, data.dt_s, data.longest * data.dt_s),
         *refused,
     ]

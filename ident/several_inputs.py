@@ -71,7 +71,7 @@ def identify_miso(
 
 def _advice(fitted: Fitted, model: MisoModel, residuals: tuple[RealArray, ...]) -> list[Finding]:
     data, search = fitted.data, fitted.search
-    found = pole_warnings(model.poles, search.fixed, search.bounds, data.dt_s)
+    found = pole_warnings(model, search.fixed, search.bounds)
     found += few_samples(data, model.order)
     if least_independence(data) < _ALIKE_INPUT:
         found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))

@@ -7,6 +7,8 @@ from enum import Enum
 import numpy as np
 
 from ident.basis.coordinates import ZETA_LIMIT
+from ident.basis.miso_model import MisoModel
+from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.refinement import Bounds
@@ -62,13 +64,14 @@ def pairs_outside(poles: Poles, fixed: Poles, dt_s: float, band_rad_s: tuple[flo
     ]
 
 
-def pole_warnings(poles: Poles, fixed: Poles, bounds: Bounds, dt_s: float) -> list[Finding]:
+def pole_warnings(model: GobfModel | MisoModel, fixed: Poles, bounds: Bounds) -> list[Finding]:
     """One finding for each searched pole that ended at a bound."""
+    poles, dt_s = model.poles, model.dt_s
     found = [] if poles.order else [finding(FindingKind.NO_POLE)]
     close = 1 + 1e-6
     for a in poles.real[fixed.real.size :]:
         if 1 - a <= bounds.distance_min * close:
-            found.append(finding(FindingKind.SLOW_BOUND, a=a))
+            found.append(finding(FindingKind.SLOW_BOUND, a=a, integrators=model.integrators))
         elif 1 - a >= bounds.distance_max / close:
             found.append(finding(FindingKind.FAST_BOUND, a=a))
     omegas, zetas = poles.omega_rad_s(dt_s), poles.zeta()

@@ -19,6 +19,10 @@ _INPUT = re.compile(
 _OUTPUT = re.compile(
     r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|encoder|hub)(?![a-z])", re.I
 )
+# What the motion should be: the command of a control loop, neither its drive nor what a sensor read.
+_WISHED = re.compile(
+    r"(^|[^a-z])(ref|reference|setpoint|set_point|desired|target|soll|sollwert|des)(?![a-z])", re.I
+)
 _DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
 _MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|[cm]m|rpm|counts?|ticks?", re.I)
 
@@ -33,26 +37,39 @@ class Roles:
 
 
 def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
-    """The columns of one channel. stated: input, output and time as far as the user named them.
+    """The columns of one channel. stated: input, output, time and reference as far as the user named them.
 
-    Raises ValueError where a role has no column or several: it lists all columns, and says what to type.
+    Raises ValueError where a role has no column or several, or where a reference beside them may mean a
+    closed loop: it lists all columns, and says what to type.
     """
     moving = [name for name in table.names if _is_signal(table, name)]
     time = stated.get("time") or _only([name for name in table.names if is_time(table, name)])
-    rest = [name for name in moving if name not in (time, stated.get("input"), stated.get("output"))]
-    inputs = [name for name in rest if _says(table, name, _DRIVEN, _INPUT)]
-    outputs = [name for name in rest if _says(table, name, _MOVED, _OUTPUT)]
+    rest = [name for name in moving if name not in (time, *stated.values())]
+    wished = [name for name in rest if _WISHED.search(name)]
+    inputs = _not_in(wished, [name for name in rest if _says(table, name, _DRIVEN, _INPUT)])
+    outputs = _not_in(wished, [name for name in rest if _says(table, name, _MOVED, _OUTPUT)])
     input_, output = stated.get("input") or _only(inputs), stated.get("output") or _only(outputs)
-    if input_ is not None and output is not None and input_ != output:
+    named = stated.get("input") and stated.get("output")
+    wished = (
+        [] if named or stated.get("reference") else [name for name in wished if name not in (input_, output)]
+    )
+    if input_ is not None and output is not None and input_ != output and not wished:
         return Roles(time, input_, output)
     options = [
         ("--input", input_ or next(iter(inputs), "NAME")),
         ("--output", output or next(iter(outputs), "NAME")),
     ]
+    reference = stated.get("reference") or _only(wished)
+    options += [("--reference", reference)] if reference else []
     options += [("--time", time)] if time else [("--dt-s", "SECONDS")]
     command = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
     listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
     raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink identify {log} {command}")
+
+
+def _not_in(wished: list[str], names: list[str]) -> list[str]:
+    """Those that are no reference; all where none is left, as what drives the arm may be called one."""
+    return [name for name in names if name not in wished] or names
 
 
 def _only(names: list[str]) -> str | None:

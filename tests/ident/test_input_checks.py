@@ -13,6 +13,7 @@ from ident.data.record import Record
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p2
 from tests.ident.findings import kinds, only
 from tests.ident.three_mode_arm import random_arm
+from workflow.text.templates import words
 
 NYQUIST = np.pi / DT_S
 DRIFTS = {FindingKind.DRIFT, FindingKind.SLOW_POLE_IS_DRIFT}
@@ -222,3 +223,13 @@ def test_warnings_name_the_file(tmp_path):
     np.savetxt(path, np.column_stack([binary(), y]), delimiter=",", header="u,y", comments="")
     record = Record.from_file(path, ["u"], ["y"], dt_s=DT_S)
     assert only(warnings_of(record, n_real=1, n_pairs=1), FindingKind.CLIPPED)["record"] == str(path)
+
+
+def test_a_slow_pole_beside_an_integrator_asks_for_no_further_one():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=3000)
+    y = np.cumsum(np.cumsum(u))
+    found = identify([as_record(u, y)], IdentOptions(n_real=1, n_pairs=0, integrators=1))
+    (slow,) = [it for it in found.warnings if it.kind is FindingKind.SLOW_BOUND]
+    assert slow.values["integrators"] == 1
+    assert "no more than the 1 given" in words(slow)

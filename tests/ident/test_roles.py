@@ -41,6 +41,24 @@ def test_what_is_stated_decides():
     )
 
 
+LOOP = table("t_s", "u_ref_rad", "v_drive_counts", "theta_rad", drive="counts")
+
+
+def test_a_reference_is_neither_input_nor_output():
+    """Columns of a measured arm in closed loop."""
+    assert roles_of(LOOP, "a.csv", reference="u_ref_rad") == Roles("t_s", "v_drive_counts", "theta_rad")
+    with pytest.raises(
+        ValueError, match=r"--input v_drive_counts --output theta_rad --reference u_ref_rad --time t_s$"
+    ):
+        roles_of(LOOP, "a.csv")
+    named = {"input": "v_drive_counts", "output": "theta_rad"}
+    assert roles_of(LOOP, "a.csv", **named) == Roles("t_s", "v_drive_counts", "theta_rad")
+
+
+def test_the_reference_of_a_voltage_may_be_what_drives_the_arm():
+    assert roles_of(table("t_s", "u_ref_V", "hub_rad"), "a.csv") == Roles("t_s", "u_ref_V", "hub_rad")
+
+
 def test_nothing_is_guessed():
     with pytest.raises(ValueError, match="--input NAME --output NAME --dt-s SECONDS"):
         roles_of(table("a", "b", "c"), "a.csv")

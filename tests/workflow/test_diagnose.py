@@ -426,3 +426,10 @@ def test_a_recorded_case_from_files_to_files(gap_cases, tmp_path, flexlink):
     # A redesign on the repaired rig meets the machine it was made for; payloads are linear.
     assert fourth["cost_s"] == pytest.approx(third["cost_s"], rel=0.01)
     assert all(run["settles"] for run in (first, second, third, fourth))
+
+
+def test_a_folder_without_a_case_names_the_file_that_may_be_meant(tmp_path, flexlink):
+    """As the example of the simulators has one."""
+    (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"')
+    error = flexlink("diagnose", tmp_path, "--out", tmp_path / "found").err
+    assert f"is it {tmp_path / 'arm.toml'}?" in error

@@ -91,3 +91,11 @@ def test_sparkline():
     assert set(sparkline(levels)) >= {"▁", "▄", "█"}
     # A short pulse among many samples is seen.
     assert sparkline(np.eye(1, 6000, 3030)[0]).index("█") == 30
+
+
+def test_sentences_of_the_page_end_with_their_words(flexlink, tmp_path):
+    rows = "".join(f"{0.01 * k:.2f},{k % 5},{k % 7}\n" for k in range(50))
+    (tmp_path / "log.csv").write_text("t_s,u_V,hub_rad\n" + rows)
+    assert flexlink("look", tmp_path / "log.csv", "--out", tmp_path / "page.html").code == 0
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "numbers from line 2.</li>" in page

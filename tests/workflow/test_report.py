@@ -175,6 +175,13 @@ def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
+def test_what_is_not_proved_of_an_unstable_loop_is_a_line_of_its_own(tmp_path):
+    run = example.build_run(tmp_path / "run", example.config(), gain=400.0)
+    standing = environment().get_template("certificate.j2").module
+    opened = standing.not_checked(RunResults(run).certify.certificate).splitlines()
+    assert opened[0].endswith("not proved: the loop is not robustly stable on the dense grid")
+
+
 def test_a_certificate_does_not_hide_a_loop_that_does_not_settle(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(), settled=1)
     assert "Certificate holds, but the loop does not come to rest" in page.text

@@ -68,7 +68,7 @@ def identify_logs(
     if input_name is None or output_name is None or (time is None and dt_s is None):
         with naming(str(logs[0])):
             table, log = read_table(logs[0]), shlex.quote(str(logs[0]))
-            roles = roles_of(table, log, input=input_name, output=output_name, time=time)
+            roles = roles_of(table, log, input=input_name, output=output_name, time=time, reference=reference)
         input_name, output_name = roles.input, roles.output
         time = roles.time if time is None and dt_s is None else time
 

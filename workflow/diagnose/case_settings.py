@@ -115,8 +115,10 @@ def case_document(place: Path) -> tuple[Path, dict[str, Any]]:
     """The case file of a folder, or the one named itself, and what it says. Raises InputError."""
     file = place if place.is_file() else place / CASE_FILE
     if not file.is_file():
+        others = sorted(place.glob("*.toml")) if place.is_dir() else []
+        instead = f"; is it {others[0]}?" if len(others) == 1 else ""
         raise InputError(
-            f"{place}: no case is there; expected a folder with {CASE_FILE}, or a TOML file like it"
+            f"{place}: no case is there; expected a folder with {CASE_FILE}, or a TOML file like it{instead}"
         )
     return file, read_toml(file)[1]
 
