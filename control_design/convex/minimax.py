@@ -69,13 +69,6 @@ class PlaneRows:
         return np.asarray(quotient(self.numerator(y), below, np.inf))
 
 
-def turning(factor: Complex) -> Real:
-    """Multiplication by complex factors (R,) as matrices (R, 2, 2) on (real, imaginary)."""
-    return np.stack(
-        [np.stack([factor.real, -factor.imag], -1), np.stack([factor.imag, factor.real], -1)], axis=-2
-    )
-
-
 def plane(value: Complex) -> Real:
     """(R,) complex as (R, 2) real."""
     return np.stack([value.real, value.imag], axis=-1)

@@ -21,7 +21,7 @@ from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
 from control_design.controllers.law import Law
 from control_design.convex.convex_options import ReferenceFilterOptions
-from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
+from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio
 from control_design.convex.youla_basis import with_constant
 from control_design.plants.ellipses import Complex, Ellipses, Real, distance_to_minus_one, largest_ratio
 from control_design.plants.frequency_grid import programme_grid
@@ -29,6 +29,7 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
 from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
+from ident.data.arrays import factor_matrices
 
 _BOUNDARY_SAMPLES = 24  # of every ellipse
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
@@ -223,7 +224,7 @@ class _Matching:
             parts.append(
                 PlaneRows(
                     at,
-                    turning((w * tracking).ravel()),
+                    factor_matrices((w * tracking).ravel()),
                     plane((w * (offset - target)).ravel()),
                     np.ones(size),
                     zero,

@@ -24,7 +24,7 @@ import numpy as np
 
 from control_design.analysis.worst_case import Grids, PlantData, worst_of
 from control_design.convex.convex_options import YoulaOptions
-from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio, turning
+from control_design.convex.minimax import MinimaxPoint, PlaneRows, exchanged, plane, smallest_ratio
 from control_design.convex.youla_basis import (
     AffineLoop,
     Factors,
@@ -38,6 +38,7 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
+from ident.data.arrays import factor_matrices
 
 _ELLIPSE_ROUNDS = 20  # turns of angles and Q
 Region = Literal["inscribed", "ellipse", "enclosing"]
@@ -221,7 +222,7 @@ class BracketProblem:
         # e^{-jt} q u in the ellipse's own axes: Re * major, Im * minor.
         along = turn * e.direction * data.delay
         axes = np.stack([major, minor], axis=-1)[:, :, None]
-        reach = axes * turning(along * loop.effort_slope)
+        reach = axes * factor_matrices(along * loop.effort_slope)
         reach_0 = axes[:, :, 0] * plane(along * loop.effort)
         lift = turn * offset * loop.effort_slope
         level = np.real(turn * (1.0 + offset * loop.effort))
@@ -244,7 +245,7 @@ class BracketProblem:
         parts: list[PlaneRows] = []
         for weight, value, change, moved in rows_of + extra:
             use = weight > 0
-            numerator = turning(weight * change)[use], plane(weight * value)[use]
+            numerator = factor_matrices(weight * change)[use], plane(weight * value)[use]
             below = level[use], slope[use], moved * reach[use], moved * reach_0[use]
             parts.append(PlaneRows(at[use], *numerator, *below))
         return PlaneRows.stacked(parts)

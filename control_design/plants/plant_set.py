@@ -85,8 +85,6 @@ class Channel:
     @cached_property
     def poles(self) -> Complex:
         """Nominal poles in z, (n,)."""
-        if self.nominal.nstates == 0:
-            return np.zeros(0, complex)
         return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
 
     @cached_property

@@ -118,6 +118,4 @@ class RationalResponse:
 
 
 def _eigenvalues(matrix: npt.NDArray[np.float64]) -> Complex:
-    if matrix.shape[0] == 0:
-        return np.zeros(0, complex)
     return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)

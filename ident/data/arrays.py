@@ -1,4 +1,4 @@
-"""Array types and the copy-and-lock helper that every frozen record of this package uses."""
+"""Array types, real forms of complex arrays, and the copy-and-lock helper of every frozen record."""
 
 from __future__ import annotations
 
@@ -25,6 +25,12 @@ def real_rows(values: ComplexArray) -> RealArray:
     """Real parts (F, .) above imaginary ones: complex equations in real unknowns, as twice as many real
     ones."""
     return np.concatenate([values.real, values.imag])
+
+
+def factor_matrices(factor: ComplexArray) -> RealArray:
+    """(F,2,2) that do to (Re, Im) what multiplication by a complex factor (F,) does."""
+    re, im = factor.real, factor.imag
+    return np.stack([np.stack([re, -im], -1), np.stack([im, re], -1)], -2)
 
 
 def lock(record: object, *names: str, dtype: npt.DTypeLike = np.float64) -> None:

@@ -22,12 +22,12 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.stats import chi2
 
 from ident.data.arrays import ComplexArray, RealArray
-from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record, in_groups
+from ident.data.widening import circular_widening
 
 # A period repeats the input to this share of its power (40 dB: an input as commanded, or well measured).
 _REPEATS = 1e-4
@@ -154,7 +154,7 @@ class Distortion:
         if self.excited is None:
             return None
         variance = self.excited.power / self.realisations
-        widening = 2 * f.ppf(level, 2, 2 * (self.realisations - 1)) / chi2_radius(level) ** 2
+        widening = circular_widening(self.realisations - 1, level)
         covariance = 0.5 * widening * variance[:, None, None] * np.eye(2)
         return FrequencyUncertainty(
             self.omega_rad_s, self.gain, covariance, self.dt_s, level, "empirical, whole periods"

@@ -1,12 +1,10 @@
-"""Confidence ellipses in the complex plane: axes of 2x2 covariances, distances, widening."""
+"""Confidence ellipses in the complex plane: axes of 2x2 covariances, distances."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-from scipy.stats import f as f_distribution
 
 from ident.data.arrays import ComplexArray, RealArray
 
@@ -71,12 +69,6 @@ def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexA
     return s1, s2, np.exp(1j * angle)
 
 
-def factor_matrices(factor: ComplexArray) -> RealArray:
-    """(F,2,2) that do to (Re, Im) what multiplication by a complex factor (F,) does."""
-    re, im = factor.real, factor.imag
-    return np.stack([np.stack([re, -im], -1), np.stack([im, re], -1)], -2)
-
-
 def spread_covariance(spread: ComplexArray) -> RealArray:
     """Covariances (F,2,2) of (Re, Im) of spread (F,K) times K independent numbers of unit variance."""
     re, im = spread.real, spread.imag
@@ -84,13 +76,6 @@ def spread_covariance(spread: ComplexArray) -> RealArray:
     for i, j, one, other in ((0, 0, re, re), (1, 1, im, im), (0, 1, re, im), (1, 0, re, im)):
         covariance[:, i, j] = np.einsum("fk,fk->f", one, other)
     return covariance
-
-
-def hotelling_widening(freedom: npt.ArrayLike, level: float) -> npt.NDArray[np.float64]:
-    """Factor on a 2x2 covariance estimated with so many degrees of freedom f > 1, so that its chi-square
-    ellipse at `level` is Hotelling's: 2 f / (f - 1) F(2, f - 1) / chi2(2)."""
-    f = np.asarray(freedom, dtype=np.float64)
-    return np.asarray(2 * f / (f - 1) * f_distribution.ppf(level, 2, f - 1) / chi2_radius(level) ** 2)
 
 
 def relative_deficit(covariance: RealArray) -> RealArray:

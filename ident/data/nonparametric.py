@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import detrend
-from scipy.stats import f as f_distribution
 
 from ident.data.arrays import ComplexArray, RealArray
-from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+from ident.data.widening import circular_widening
 
 
 def empirical_frf(
@@ -157,5 +156,4 @@ def _local_ratio(
     n_terms = terms.shape[0] * terms.shape[2]
     # One complex parameter was fitted per group, hence n - 1.
     power = np.sum(np.abs(terms) ** 2, axis=(0, 2)) * n_terms / (n_terms - 1)
-    widening = 2 * f_distribution.ppf(level, 2, 2 * (n_terms - 1)) / chi2_radius(level) ** 2
-    return centre, widening * power / np.abs(denominator) ** 2
+    return centre, circular_widening(n_terms - 1, level) * power / np.abs(denominator) ** 2

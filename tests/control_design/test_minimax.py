@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from control_design.convex.minimax import PlaneRows, plane, smallest_ratio, turning
+from control_design.convex.minimax import PlaneRows, plane, smallest_ratio
+from ident.data.arrays import factor_matrices
 
 
 def _rows(at, factor, offset, level, slope=None, reach=None):
     size = at.size
     return PlaneRows(
         at,
-        turning(np.asarray(factor, complex)),
+        factor_matrices(np.asarray(factor, complex)),
         plane(np.asarray(offset, complex)),
         np.asarray(level, float),
         np.zeros((size, 2)) if slope is None else slope,
