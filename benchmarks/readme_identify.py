@@ -1,0 +1,65 @@
+"""`flexlink identify` as the README has it, on the default logs with other seeds of noise and phases.
+
+    OMP_NUM_THREADS=1 python -m benchmarks.readme_identify [--seeds 50]
+
+Eight records of the default arm (4 and 8 V rms), one integrator, one sample of delay, one real pole and two
+pairs stated. Right: both modes within 3 % of those of the linear arm, and no further pair called a mode. The
+share within 1 % of both, and how often each 95 % interval holds its mode, beside it. CPU per identification,
+uncertainty included.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from benchmarks.harness import Print, main
+from ident import IdentOptions
+from ident.checks.plausible_modes import PairKind, kind_of_pair
+from workflow.config.run_config import SimulatedSource, built_in_config
+from workflow.tasks.log_identification import identify_records
+from workflow.tasks.simulated_rig import simulate_record
+from workflow.tasks.truth import truth_of
+
+EXCITED_HZ = 50.0  # the machine's third mode, at 91 Hz, is not asked for
+
+
+def run(out: Print, *, seeds: int = 50) -> None:
+    source = built_in_config()[0].source
+    assert isinstance(source, SimulatedSource)
+    entries = [entry for entry in source.records if "V rms" in entry.name]
+    true = [mode.frequency_Hz for mode in truth_of(source).modes["hub_angle_rad"]]
+    true = [hertz for hertz in true if hertz < EXCITED_HZ]
+    options = IdentOptions(integrators=1, input_delay_samples=1, noise="auto", n_real=1, n_pairs=2)
+    errors, held, right, cpu = [], [], 0, []
+    for seed in range(seeds):
+        records = [
+            simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad") for entry in entries
+        ]
+        begin = time.process_time()
+        result = identify_records(records, (), options, with_plot=False)
+        cpu.append(time.process_time() - begin)
+        longest_s = max(record.n_samples * record.dt_s for record in records)
+        modes = [
+            mode.frequency_Hz
+            for mode in result.about.modes
+            if kind_of_pair(mode.omega_rad_s, mode.damping, longest_s) is PairKind.MODE
+        ]
+        error = [min((abs(hertz / one - 1) for hertz in modes), default=1.0) for one in true]
+        right += len(modes) == len(true) and max(error) < 0.03
+        errors.append(error)
+        if result.spread.intervals is not None:
+            intervals = [mode.frequency_Hz for mode in result.spread.intervals.modes]
+            held.append([any(low <= one <= high for low, high in intervals) for one in true])
+    e = np.array(errors)
+    out(f"{len(entries)} records a seed; true modes {true[0]:.2f} and {true[1]:.2f} Hz")
+    out(f"both within 3 % and no false mode: {right} of {seeds}")
+    out(f"both within 1 %: {np.sum(np.max(e, axis=1) < 0.01)} of {seeds}")
+    out(f"largest error: {100 * e[:, 0].max():.2f} % and {100 * e[:, 1].max():.2f} %")
+    out(f"95 % interval holds the mode: {np.sum(np.array(held), axis=0).tolist()} of {len(held)}")
+    out(f"CPU median {np.median(cpu):.1f} s, most {max(cpu):.1f} s")
+
+
+if __name__ == "__main__":
+    main(run)
