@@ -92,6 +92,7 @@ def notebook(markdown: str, page: Path, config: Any, files: Files) -> str:
 
 def run(cells: nbformat.NotebookNode) -> None:
     """Run a notebook in a directory with the examples and nothing else; progress is not kept."""
+    os.environ["COLUMNS"] = "96"  # what a page of the site has room for
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     with TemporaryDirectory() as folder:
         shutil.copytree(ROOT / "examples", Path(folder) / "examples")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -145,8 +146,9 @@ class _Output(Console):
 
 def print_summary(summary: RunSummary) -> None:
     """The table of numbers on standard output."""
-    # A pipe has no width; 120 columns keep the rows on one line there.
-    console = _Output(file=sys.stdout, width=None if sys.stdout.isatty() else 120)
+    # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
+    told = sys.stdout.isatty() or "COLUMNS" in os.environ
+    console = _Output(file=sys.stdout, width=None if told else 120)
     table = Table(title=_text(summary.title), title_justify="left", show_header=False, pad_edge=False)
     table.add_column("section", style="bold")
     table.add_column("quantity")

@@ -9,6 +9,8 @@ import numba
 import pytest
 
 from workflow import console
+from workflow.tasks.summary import RunSummary
+from workflow.text.templates import Row, Section
 
 
 @pytest.fixture
@@ -66,3 +68,12 @@ def test_compiling_is_told_once_and_is_no_sign_of_slowness(capfd):
     told._compiled_s, told._began_s = 30.0, time.monotonic() - 30.5
     told.update("all", 0.03)
     assert 60 < float(told._ahead().split("about ")[1].split()[0]) < 100
+
+
+@pytest.mark.parametrize(("asked", "width"), [(None, 120), ("90", 90)])
+def test_tables_in_a_pipe_are_as_wide_as_asked(asked, width, capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if asked is not None:
+        monkeypatch.setenv("COLUMNS", asked)
+    console.print_summary(RunSummary("arm", [Section("model", [Row("modes", "7.6 Hz " * 40)])]))
+    assert max(map(len, capsys.readouterr().out.splitlines())) == width
