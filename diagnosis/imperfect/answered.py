@@ -121,17 +121,17 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         residuals_after=after,
         simulations=search.simulations,
         shares=replace(shares_of(search, found, accepted, rng), at_inputs=search.at_inputs),
-        competing=_competing(case, search, found) if isinstance(case, Case) else (),
+        competing=_competing(search, found),
     )
 
 
-def _competing(case: Case, search: Search, found: judging.Verdict) -> tuple[CompetingHypothesis, ...]:
+def _competing(search: Search, found: judging.Verdict) -> tuple[CompetingHypothesis, ...]:
     """Sets whose effects that matter contradict each other, for the experiment that parts them.
 
     One standard deviation is what the likelihood counts as one: the energies that do not interest, over as
     many independent values as its bands have. Neglected: that they grow with the motion.
     """
-    records, kept = search.records, dict[tuple[str, ...], Descent]()
+    case, records, kept = search.case, search.records, dict[tuple[str, ...], Descent]()
     for one in found.judged:
         key = tuple(sorted(part.name for part in one.parts if part.matters >= 0.5))
         if key and not any(set(key) <= set(other) or set(other) <= set(key) for other in kept):
@@ -140,11 +140,13 @@ def _competing(case: Case, search: Search, found: judging.Verdict) -> tuple[Comp
         part.reshape(-1, case.noise.size).sum(axis=0)  # bands are ordered record, octave, output
         for part in (records.levels.floor, records.levels.counted)
     )
-    level = dict(zip(case.outputs, np.sqrt(judging.TEMPER * floor / counted), strict=True))
-    noise = np.array([level.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
+    noise = np.sqrt(judging.TEMPER * floor / counted)
+    if isinstance(case, Case):
+        level = dict(zip(case.outputs, noise, strict=True))
+        noise = np.array([level.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
     return tuple(
         fitted_hypothesis(
-            case,
+            records.nominal,
             end.candidates,
             end.deviations,
             end.coordinates,

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -25,7 +26,6 @@ from diagnosis.fit.nominal import NominalParameters
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
-from plant.effects import Effect
 from plant.effects.search_space import Candidate
 from plant.rig import Rig
 from plant.simulation import simulate
@@ -40,26 +40,33 @@ def _nothing_free(voltage: Real) -> Real:
     return np.zeros((2 * voltage.size, 0))
 
 
+def simulated(machine: Any, effects: Sequence[Any], inputs: Real) -> Real:
+    """(T, Y) of a Rig for a voltage (T,), of a Plant for inputs (T, U)."""
+    if isinstance(machine, Rig):
+        return simulate(machine, inputs, effects).output
+    return np.asarray(machine.simulator(effects)(inputs))
+
+
 @dataclass(frozen=True, eq=False)
 class CompetingHypothesis:
     """One explanation that is left.
 
     probability : float
-    rig : Rig. With its fitted nominal parameters.
-    effects : tuple of Effect
-    directions : callable. Voltage (T,) -> derivatives (2 T, P) of the outputs in noise deviations, hub before
-        tip sample by sample, by the hypothesis' free parameters; by default there are none.
+    rig : Rig, or Plant of one's own. With its fitted nominal parameters.
+    effects : tuple of Effect, or of Change of an own plant
+    directions : callable. Voltage (T,), or inputs (T, U) of an own plant -> derivatives (Y T, P) of the
+        outputs in noise deviations, sample by sample, by the hypothesis' free parameters; by default none.
     precision : (P, P). What is known about the free parameters: the Gauss-Newton Hessian of the fit to the
         records, prior included.
     causes : tuple of str. Effects that it names; by default all of them.
     name : str. In sentences; by default the causes.
-    noise : (2,). Standard deviations of hub angle and tip position; by default those of the rig's sensors.
-        Infinite where nobody measures.
+    noise : (Y,). Standard deviations of the outputs, of a rig those of hub angle and tip position; by default
+        those of the rig's sensors. Infinite where nobody measures.
     """
 
     probability: float
-    rig: Rig
-    effects: tuple[Effect, ...] = ()
+    rig: Any
+    effects: tuple[Any, ...] = ()
     directions: Callable[[Real], Real] = _nothing_free
     precision: Real = field(default_factory=lambda: np.zeros((0, 0)))
     causes: tuple[str, ...] = ()
@@ -73,9 +80,13 @@ class CompetingHypothesis:
         if not self.noise.size:
             object.__setattr__(self, "noise", FlexibleArm(self.rig).noise)
         if not self.causes:
-            object.__setattr__(self, "causes", tuple(type(effect).id for effect in self.effects))
+            object.__setattr__(self, "causes", tuple(effect.id for effect in self.effects))
         if not self.name:
             object.__setattr__(self, "name", " with ".join(self.causes) or "no effect")
+
+    def outputs(self, inputs: Real) -> Real:
+        """(T, Y) for a voltage (T,), or inputs (T, U) of an own plant, from rest."""
+        return simulated(self.rig, self.effects, inputs)
 
 
 def competing_hypotheses(
@@ -105,11 +116,12 @@ def competing_hypotheses(
 def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
     """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
     x = np.concatenate([np.zeros(0), *fit.coordinates])
-    return fitted_hypothesis(case, fit.candidates, fit.deviations, x, fit.hessian, probability, case.noise)
+    nominal = NominalParameters(case.machine)
+    return fitted_hypothesis(nominal, fit.candidates, fit.deviations, x, fit.hessian, probability, case.noise)
 
 
 def fitted_hypothesis(
-    case: Case,
+    nominal: NominalParameters,
     candidates: Sequence[Candidate],
     deviations: Real,
     coordinates: Real,
@@ -119,16 +131,18 @@ def fitted_hypothesis(
     causes: tuple[str, ...] = (),
 ) -> CompetingHypothesis:
     """The same of deviations (P,) and coordinates (A,) of the candidates, which `precision` (P + A, P + A)
-    belongs to; noise (2,), causes: as in `CompetingHypothesis`."""
-    nominal, fitted = NominalParameters(case.machine), effects_at(candidates, coordinates)
+    belongs to; noise (Y,), causes: as in `CompetingHypothesis`."""
+    fitted = effects_at(candidates, coordinates)
 
-    def outputs(deviations: Real, effects: Sequence[Effect], voltage: Real) -> Real:
-        rig = nominal.at(deviations).description
-        return np.asarray((simulate(rig, voltage, effects).output / noise).ravel())
+    def outputs(deviations: Real, effects: Sequence[Any], voltage: Real) -> Real:
+        return np.asarray((simulated(nominal.at(deviations).description, effects, voltage) / noise).ravel())
+
+    axes = np.array([c.dependence != "non-smooth" for c in candidates for _ in c.axes], dtype=bool)
+    calm_coordinates = coordinates[axes]
 
     def directions(voltage: Real) -> Real:
         # Contacts say little about a small change of a nominal parameter and cost most of the time.
-        calm = tuple(e for e in fitted if type(e).dependence != "non-smooth")
+        calm = effects_at([c for c in candidates if c.dependence != "non-smooth"], calm_coordinates)
         start = outputs(deviations, calm, voltage)
         by_d = quotients(
             lambda d: outputs(d, calm, voltage),
@@ -152,13 +166,19 @@ def fitted_hypothesis(
 
 
 def distances(
-    competing: Sequence[CompetingHypothesis], voltage: Real, whitened: Sequence[Real]
+    competing: Sequence[CompetingHypothesis],
+    voltage: Real,
+    whitened: Sequence[Real],
+    scale: Real | None = None,
 ) -> tuple[Real, list[Real]]:
-    """d of every pair in standard deviations, and what parameters leave of its difference (2 T,).
+    """d of every pair in standard deviations, and what parameters leave of its difference (Y T,).
 
-    whitened: every hypothesis' outputs (2 T,) in noise deviations for the voltage (T,), sample by sample.
+    whitened: every hypothesis' outputs (Y T,) in noise deviations for the voltage (T,), sample by sample.
+    scale (Y T,): noise of the hypotheses over the one that these are whitened by; by default the same.
     """
     free = [hypothesis.directions(voltage) for hypothesis in competing]
+    if scale is not None:
+        free = [scale[:, None] * derivatives for derivatives in free]
     found, remains = [], []
     for i, j in combinations(range(len(competing)), 2):
         D, J = whitened[i] - whitened[j], np.hstack([free[i], free[j]])

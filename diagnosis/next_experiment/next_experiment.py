@@ -18,7 +18,6 @@ from diagnosis.next_experiment.experiment_choices import (
     tailored_excitations,
     within,
 )
-from plant.simulation import simulate
 
 # A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
 _SETTLED = 20.0
@@ -105,7 +104,7 @@ def next_experiment(
     """
     competing = tuple(competing)
     _check(competing)
-    weights = _pair_weights(competing)
+    weights = pair_weights(competing)
     dt = competing[0].rig.sampling.dt_s
     rng = np.random.default_rng(0) if rng is None else rng
     choices = list(excitations(limits.voltage_V, n_samples, dt, rng))
@@ -127,7 +126,7 @@ def next_experiment(
         if prospect.bound[0] <= best[0]:
             break
         apart, _ = prospect.distances(competing)
-        score = _score(apart, weights)
+        score = expected_log_bayes_factor(apart, weights)
         prospect.score = score[0]
         if score > best:
             chosen, best, distance = prospect, score, apart
@@ -135,8 +134,7 @@ def next_experiment(
     considered = [p.considered() for p in sorted(prospects, key=lambda p: -(p.score or 0.0))]
     considered += [Considered(c.kind, c.parameters, c.amplitude_V, False, 0.0, None) for c in left_out]
     x = chosen.excitation
-    names = combinations([r.name for r in competing], 2)
-    pairs = [Separation(two, float(d), float(d**2 / 2)) for two, d in zip(names, distance, strict=True)]
+    pairs = separations(competing, distance)
     first, second = sorted((r.probability for r in competing), reverse=True)[:2]
     return NextExperiment(
         kind=x.kind,
@@ -145,7 +143,7 @@ def next_experiment(
         duration_s=float(x.voltage_V.size * dt),
         dt_s=dt,
         voltage_V=x.voltage_V,
-        separations=tuple(pairs),
+        separations=pairs,
         expected_log_bayes_factor=best[1],
         hub_angle_range_rad=chosen.hub,
         deflection_range_m=chosen.deflection,
@@ -166,12 +164,19 @@ def _check(competing: Sequence[CompetingHypothesis]) -> None:
         raise ValueError("sensors need a noise level above zero to tell hypotheses apart by")
 
 
-def _pair_weights(competing: Sequence[CompetingHypothesis]) -> Real:
+def separations(competing: Sequence[CompetingHypothesis], distance: Real) -> tuple[Separation, ...]:
+    """Of every pair, from `distances`."""
+    names = combinations([r.name for r in competing], 2)
+    return tuple(Separation(two, float(d), float(d**2 / 2)) for two, d in zip(names, distance, strict=True))
+
+
+def pair_weights(competing: Sequence[CompetingHypothesis]) -> Real:
+    """Of every pair, the product of their probabilities; of hopeless ones all alike."""
     p = np.array([a.probability * b.probability for a, b in combinations(competing, 2)])
     return p / p.sum() if p.sum() > 0 else np.full(p.size, 1 / p.size)
 
 
-def _score(distance: Real, weights: Real) -> tuple[float, float]:
+def expected_log_bayes_factor(distance: Real, weights: Real) -> tuple[float, float]:
     """Expected log Bayes factor with settled pairs cut off, and without, to choose between equals."""
     return float(weights @ np.minimum(distance, _SETTLED) ** 2 / 2), float(weights @ distance**2 / 2)
 
@@ -188,7 +193,7 @@ class _Prospect:
         self.deflection = _range(_deflections(competing, outputs))
         self.score: float | None = None
         plain = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
-        self.bound = _score(plain, _pair_weights(competing))
+        self.bound = expected_log_bayes_factor(plain, pair_weights(competing))
 
     @classmethod
     def of(
@@ -197,7 +202,7 @@ class _Prospect:
         outputs: list[Real] = []
 
         def respond(voltage: Real) -> tuple[float, float]:
-            outputs[:] = [simulate(r.rig, voltage, r.effects).output for r in competing]
+            outputs[:] = [r.outputs(voltage) for r in competing]
             angle = max(map(abs, _range([y[:, 0] for y in outputs])))
             return angle, max(map(abs, _range(_deflections(competing, outputs))))
 

@@ -8,17 +8,22 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from diagnosis import ResidualModel
+from diagnosis import Plant, PlantCase, PlantEffect, PlantExperiment, ResidualModel
 from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.fit.fit import Fit, fit
+from diagnosis.fit.nominal import LogNormalParameters
+from diagnosis.machine.flexible_arm import FlexibleArm
+from diagnosis.machine.plant_effect import Change, EffectParameter
 from diagnosis.next_experiment.discrimination import (
     CompetingHypothesis,
     competing_hypotheses,
     competing_hypothesis,
     distances,
+    fitted_hypothesis,
 )
 from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
+from diagnosis.next_experiment.repeat import best_repeat
 from plant import prbs, simulate
 from plant.effects.actuator import ActuatorLag, ActuatorSaturation, InputDelay
 from plant.effects.joint import CoulombFriction, ViscousFriction
@@ -209,8 +214,7 @@ def test_effort_is_bounded(monkeypatch):
         calls.append(1)
         return simulate(*args, **kwargs)
 
-    for module in ("next_experiment", "discrimination"):
-        monkeypatch.setattr(f"diagnosis.next_experiment.{module}.simulate", counted)
+    monkeypatch.setattr("diagnosis.next_experiment.discrimination.simulate", counted)
     competing = _vague(CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), rig=TOLERANT)
     next_experiment((*competing, CompetingHypothesis(0.5, TOLERANT)), Limits(1.0, 0.3, 0.05))
     # At most five scalings of 15, and 2 tolerances and one size for every hypothesis.
@@ -252,3 +256,60 @@ def test_bad_requests_are_one_clear_line(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_a_fitted_rig_competes_with_the_values_it_was_fitted_with():
+    """Beside a model error a deviation multiplies a value by exp(t d); else it divides it by 1 + t d."""
+    nominal, d = LogNormalParameters(FlexibleArm(TOLERANT)), np.array([1.5, -0.5])
+    found = fitted_hypothesis(nominal, (), d, np.zeros(0), np.eye(2), 0.5, NOISE, ("none",))
+    for key, tolerance, deviation in zip(TOLERANT.tolerances, TOLERANT.tolerances.values(), d, strict=True):
+        assert found.rig.value(key) == pytest.approx(TOLERANT.value(key) * np.exp(tolerance * deviation))
+
+
+def _valve(parameters, effects, inputs):
+    """(T, 1) -> (T, 1), at once; a gain, a dead zone or an end of travel."""
+    y = parameters["gain"] * inputs
+    if "dead_zone" in effects:
+        y = np.sign(y) * np.maximum(np.abs(y) - effects["dead_zone"]["width"], 0)
+    limit = effects["end"]["limit"] if "end" in effects else np.inf
+    return np.clip(y, -limit, limit)
+
+
+def _open(*changes, free=False):
+    """Answers about the valve that are left after two records; with `free`, its gain follows."""
+    parameter = EffectParameter("width", 1e-3, 1.0), EffectParameter("limit", 0.1, 10.0)
+    effects = PlantEffect("dead_zone", parameter[:1]), PlantEffect("end", parameter[1:])
+    plant = Plant(_valve, {"gain": 1.0}, {"gain": 0.5}, ("y",), np.array([1e-3]), effects, 0.05)
+    rng = np.random.default_rng(0)
+    records = [
+        PlantExperiment(name, role, u, _valve({"gain": 1.0}, {}, u) + 1e-3 * rng.standard_normal(u.shape))
+        for name, role, size in (("small", "estimation", 1.0), ("large", "held_out", 3.0))
+        for u in [size * np.sin(0.1 * np.arange(200.0))[:, None]]
+    ]
+    noise, P = np.array([0.02]), int(free)
+    competing = tuple(
+        CompetingHypothesis(
+            0.5, plant, (change,) if change else (), lambda u: u[:, :P] / noise, np.zeros((P, P)), noise=noise
+        )
+        for change in changes
+    )
+    return PlantCase("valve", plant, records), competing
+
+
+def test_of_ones_own_machine_the_record_that_shows_the_difference_is_repeated():
+    # A dead zone is a larger share of a small motion, which tolerates less; an end shows in large ones.
+    zone = best_repeat(*_open(None, Change("dead_zone", {"width": 0.05})))
+    assert (zone.record, zone.change) == ("small", "third")
+    assert zone.separations[0].standard_deviations > 2 * zone.same[0].standard_deviations
+    end = best_repeat(*_open(None, Change("end", {"limit": 2.9})))
+    assert (end.record, end.separates) == ("large", True)
+    nothing = best_repeat(*_open(None, Change("end", {"limit": 3.5})))
+    assert not nothing.separates
+
+
+def test_what_a_free_gain_imitates_separates_nothing():
+    case, (stated, _) = _open(None, None, free=True)
+    other = replace(stated, rig=case.plant.scaled({"gain": 1.2}))
+    assert best_repeat(case, (stated, other)).separations[0].standard_deviations < 1e-4
+    known = tuple(replace(one, precision=np.eye(1) * 1e12) for one in (stated, other))
+    assert best_repeat(case, known).separates

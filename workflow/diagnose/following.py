@@ -12,8 +12,8 @@ from diagnosis.machine.case import Case
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
+from diagnosis.next_experiment.repeat import Repeat, best_repeat
 from plant.effects import LOOK_ALIKES, in_words
-from plant.simulation import simulate
 from workflow.engine import storage
 from workflow.text.formats import listing
 
@@ -29,11 +29,13 @@ class Following:
     advice: look at the machine for the unlisted cause (confirm); repeat the worst experiment, or all of them,
     to see what an unknown cause follows; nothing (none); the proposal, which separates the competing ones;
     a look at the machine for every cause left (look), where no simulation can promise to separate them.
+    repeat : of one's own machine, the record that separates the competing ones.
     """
 
     advice: Literal["confirm", "repeat_worst", "repeat_all", "none", "separate", "look"]
     proposal: NextExperiment | None = None
     competing: tuple[CompetingHypothesis, ...] = ()
+    repeat: Repeat | None = None
 
     def csv_text(self) -> str:
         """The proposed voltage, one row per sample; empty without a proposal."""
@@ -49,9 +51,7 @@ class Following:
         that are measured, the hub angle first."""
         assert self.proposal is not None
         noise = self.competing[0].noise
-        first, second = (
-            simulate(one.rig, self.proposal.voltage_V, one.effects).output for one in self.competing[:2]
-        )
+        first, second = (one.outputs(self.proposal.voltage_V) for one in self.competing[:2])
         return np.asarray(((first - second) / noise)[:, np.isfinite(noise)])
 
 
@@ -62,7 +62,9 @@ def following(found: Diagnosis) -> Following:
         return Following("confirm" if found.unlisted else "repeat_worst")
     competing = _left(found)
     if not isinstance(found.case, Case) or (found.case.model_error > 0 and len(competing) < 2):
-        return Following("look" if found.ambiguous_with else "none")
+        # Of a machine of one's own nobody has said what it can be asked for.
+        repeat = best_repeat(found.case, competing) if len(competing) > 1 else None
+        return Following("look" if found.ambiguous_with else "none", competing=competing, repeat=repeat)
     if len(competing) < 2:
         return Following("repeat_all" if "unknown" in found.ambiguous_with else "none")
     longest = max(e.voltage_V.size for e in found.case.experiments)

@@ -115,7 +115,8 @@ class Work:
             files = {f"{name}.html": plant_page(found).encode()}
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found).encode()
-        beside = {"next_experiment": {"advice": following(found).advice}}
+        coming = following(found)
+        beside = {"next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})}}
         return self._with_document(loaded, found, beside, files), time.process_time()
 
     def _with_document(
