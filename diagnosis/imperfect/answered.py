@@ -56,15 +56,17 @@ def looked_at_again(
 ) -> Diagnosis:
     """The answer of a machine that integrates, where what a bias makes of a free run does not interest.
 
-    That drifts as far as it likes, and beside it nothing else seems to matter. Taken only where it names what
-    the first answer does not.
+    That drifts as far as it likes, and beside it nothing else seems to matter. Not taken where the records
+    leave no gap that interests, nor where it only adds to what was named.
     """
+    if answer.verdict == "none":
+        return answer
     search = Search(answer.case, progress, deadline_s, at_inputs=True)
     if not search.amplifies:
         return answer
     search.run()
     again = beside_imperfections(search, rng)
-    return again if set(again.combination) - set(answer.combination) else answer
+    return again if again.combination and not set(again.combination) & set(answer.combination) else answer
 
 
 def reaches_noise(search: Search) -> bool:
