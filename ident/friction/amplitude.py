@@ -5,13 +5,17 @@ uncorrelated with the input (Pintelon and Schoukens, System Identification: A Fr
 ed., ch. 3). For dry friction the approximation is an equivalent viscous friction, f = N d theta/dt with N
 nearly a positive number that falls as the amplitude grows (statistical linearisation), so that
 
-    BLA = G / (1 + j omega N G_shaft),    N(j omega) = n_0 + n_1 j omega + n_2 (j omega)^2 + n_3 (j omega)^3.
+    BLA = G / (1 + j omega N G_shaft),
+    N(j omega) = n_0 + n_1 j omega + n_2 (j omega)^2 + n_3 (j omega)^3 + n_4 j omega / (j omega + corner),
+
+the last where the shaft has a corner, below which the input moves it at a speed.
 
 N comes from simulations of the identified arm at the amplitudes asked for, G and the level of the friction
 from their common posterior. So amplitudes that were not measured have a response, too.
 
 A line that makes much of the motion itself meets more friction than the others (twice as much, were it
-alone). N as one smooth curve does not follow that: it is taken as uncertain by half of it.
+alone): N at each line is that of a weak one, times what a sine among Gaussian motion meets more
+(`more_at_a_strong_line`). A quarter of the largest of these stays uncertain, in size and in phase.
 
 Neglected: every other nonlinearity, and how N depends on the arm's coefficients (the speed of the shaft is
 known to parts in a thousand).
@@ -37,7 +41,7 @@ from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.distortion import period_of
 from ident.data.record import Record
-from ident.friction.arm import FASTEST_POLE
+from ident.friction.arm import FASTEST_POLE, SteppedArm
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction
 
@@ -57,6 +61,9 @@ _THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
 _EXCITED = 1e-3
 _N_GRID = 300
+# Of how much larger N is at the strongest line, what the formula for it leaves open of N at every line.
+# What few lines, which are not Gaussian, leave open of N: relative to how much larger it is at the strongest.
+_UNEVEN = 0.25
 _HALF_WIDTHS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])
 
 
@@ -81,14 +88,16 @@ def _input_rms(records: Sequence[Record]) -> RealArray:
 class EquivalentFriction:
     """The viscous friction that acts like the dry one, on average, at amplitudes of the input.
 
-    friction: what it was simulated from. rms (A,), ascending: of the input. omega_rad_s (F,): excited lines.
-    mean, by_level (A, M): coefficients of N in powers of j omega / omega_rad_s[-1], and their derivative with
-    respect to the level; factor (A, M, M + 1): what the simulations leave open of them.
+    friction: what it was simulated from. rms (A,), ascending: of the input. omega_rad_s (F,): excited lines;
+    stronger (A, F): how much larger N is there than at a weak line. mean, by_level (A, M): coefficients of N
+    at such a one (`_terms`), and their derivative with respect to the level; factor (A, M, M): what the
+    simulations leave open of them.
     """
 
     friction: FrictionFit
     rms: RealArray
     omega_rad_s: RealArray
+    stronger: RealArray
     mean: RealArray
     by_level: RealArray
     factor: RealArray
@@ -101,11 +110,15 @@ class EquivalentFriction:
     def drawn(self, change: RealArray, omega: RealArray, rng: np.random.Generator) -> ComplexArray:
         """(A, K, W) values of N at omega (W,) for changes (K,) of the friction's level."""
         normals = rng.standard_normal((len(self.rms), change.size, self.factor.shape[2]))
+        uneven = rng.standard_normal((len(self.rms), change.size, 2)) @ (1, 1j)
         left_open = normals @ self.factor.transpose(0, 2, 1)
         values = self.mean[:, None] + change[:, None] * self.by_level[:, None] + left_open
         # No line says how N goes on beyond the last.
-        inside = np.minimum(omega, self.omega_rad_s[-1]) / self.omega_rad_s[-1]
-        return np.asarray(values @ (1j * inside) ** np.arange(self.mean.shape[1])[:, None])
+        inside = np.minimum(omega, self.omega_rad_s[-1])
+        smooth = values @ _terms(inside, self.omega_rad_s[-1], _corner(self.friction.arm)).T
+        stronger = [np.interp(omega, self.omega_rad_s, own) for own in self.stronger]
+        few = _UNEVEN * self.stronger.max(axis=1)
+        return np.asarray(smooth * (1 + np.array(stronger)[:, None] + (few[:, None] * uneven)[..., None]))
 
 
 def equivalent_friction(
@@ -201,13 +214,27 @@ def _share_of_scatter(
     return brentq(missing, 0.0, _MOST, xtol=0.01) if missing(_MOST) < 0 else _MOST
 
 
-def more_at_a_strong_line(share: float) -> float:
-    """How much larger N is at a line with this share (0 to 1) of the power of the speed than at the others,
+def _corner(arm: SteppedArm) -> float:
+    """Rate [rad/s] of the slowest real pole: below it the input moves the shaft at a speed, above it not."""
+    real = arm.poles.real[(arm.poles.real > 0) & (arm.poles.real < 1)]
+    return float(-np.log(np.max(real)) / arm.dt_s) if real.size else np.inf
+
+
+def _terms(omega: RealArray, last: float, corner: float) -> ComplexArray:
+    """(F, M) what N is a sum of: powers of j omega, and a step at the corner of the shaft's speed."""
+    powers = (1j * omega / last)[:, None] ** np.arange(_TERMS)
+    if not np.isfinite(corner):
+        return np.asarray(powers)
+    return np.column_stack([powers, 1j * omega / (1j * omega + corner)])
+
+
+def more_at_a_strong_line(share: RealArray) -> RealArray:
+    """How much larger N is at lines with these shares (0 to 1) of the power of the speed than at a weak one,
     relative to theirs: I1(h) / I0(h), h = share / (1 - share) / 2, for a sine among Gaussian motion through
     the sign of their sum (two-input describing function; Gelb and Vander Velde, Multiple-Input Describing
     Functions, 1968). A quarter of a small share; 1 for a line alone."""
-    half = 0.5 * share / max(1 - share, 1e-9)
-    return float(ive(1, half) / ive(0, half))
+    half = 0.5 * share / np.maximum(1 - share, 1e-9)
+    return np.asarray(ive(1, half) / ive(0, half))
 
 
 def damped_poles(model: GobfModel, damping: float) -> Poles:
@@ -232,8 +259,9 @@ def _at_amplitude(
     lines: npt.NDArray[np.intp],
     rms: float,
     rng: np.random.Generator,
-) -> tuple[RealArray, RealArray, RealArray]:
-    """Coefficients (M,) of N, their derivative (M,) by the level, factor (M, M + 1) of their covariance."""
+) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+    """How much larger N is at every line than at a weak one (F,), coefficients (M,) of N at such a one, their
+    derivative (M,) by the level, factor (M, M) of their covariance."""
     period = 2 * (spectrum.size - 1)
     arm, structure = friction.arm, friction.arm.structure
     omega = lines.astype(np.float64) * (2 * np.pi / (period * arm.dt_s))
@@ -241,7 +269,7 @@ def _at_amplitude(
     delayed = z ** -float(structure.input_delay_samples)
     front = front_response(omega, arm.dt_s, structure.integrators, 0)
     speed = 1j * omega * front * (basis_response(arm.poles.doubled(), z) @ friction.coefficients)
-    terms = (1j * omega / omega[-1])[:, None] ** np.arange(_TERMS)
+    terms = _terms(omega, omega[-1], _corner(arm))
     phases = np.exp(2j * np.pi * rng.random((_REALISATIONS, spectrum.size)))
     inputs = [np.fft.irfft(spectrum * one, period) for one in phases]
     inputs = [np.tile(rms * u / np.sqrt(np.mean(u**2)), _PERIODS) for u in inputs]
@@ -254,6 +282,11 @@ def _at_amplitude(
             row[:] = np.fft.rfft(force[-period:])[lines] / np.fft.rfft(u[-period:])[lines]
         return ratios
 
+    ratios = simulated(friction.level)
+    power = np.abs(speed * (delayed - ratios.mean(axis=0)) * spectrum[lines]) ** 2
+    stronger = more_at_a_strong_line(power / power.sum())
+    terms *= (1 + stronger)[:, None]
+
     def solved(ratios: ComplexArray) -> tuple[RealArray, RealArray]:
         """N (M,) from H = N j omega G (z^-d - H), whose rest is the relative error of the BLA; and how far
         each realisation (R, M) would move it."""
@@ -264,17 +297,13 @@ def _at_amplitude(
         rest = (ratios - mean) * (1 + speed * (terms @ n))
         return n, np.hstack([rest.real, rest.imag]) @ inverse.T
 
-    ratios = simulated(friction.level)
     n, moves = solved(ratios)
-    power = np.abs(speed * (delayed - ratios.mean(axis=0)) * spectrum[lines]) ** 2
-    uneven = np.zeros((n.size, 1))
-    uneven[0] = 0.5 * more_at_a_strong_line(float(power.max() / power.sum())) * n[0]
     # A level that is not told from none has its uncertainty for a step, and cannot be negative.
     step = max(_CHANGE_OF_LEVEL * friction.level, 0.5 * friction.level_std)
     ends = friction.level + step, max(friction.level - step, 0.0)
     above, below = (solved(simulated(end))[0] for end in ends)
     left_open = np.asarray(np.linalg.qr((moves - moves.mean(axis=0)) / _REALISATIONS, mode="r")).T
-    return n, (above - below) / (ends[0] - ends[1]), np.hstack([left_open, uneven])
+    return stronger, n, (above - below) / (ends[0] - ends[1]), left_open
 
 
 def _power_spectrum(records: Sequence[Record]) -> RealArray:
@@ -317,7 +346,10 @@ def _on_poles(
     size = poles.order + response.fir_length
     form = replace(response, poles=poles, mean=np.zeros(size), covariance_factor=np.zeros((size, 1)))
     rows, taps = form.frequency_rows(omega), coefficients[:, own.order :]
-    scale = 1 / np.abs(responses.mean(axis=(0, 1)))
+    # Between errors relative to the response, and to what is not known of it, which is a thousandth of that
+    # where friction matters most.
+    every = responses.reshape(-1, omega.size)
+    scale = 1 / np.sqrt(np.std(every, axis=0) * np.abs(np.mean(every, axis=0)))
     targets = ((responses - taps @ rows[:, poles.order :].T) * scale).reshape(-1, omega.size).T
     columns = scale[:, None] * rows[:, : poles.order]
     solved = np.linalg.lstsq(real_rows(columns), real_rows(targets), rcond=1e-10)[0]
