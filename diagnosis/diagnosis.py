@@ -40,6 +40,8 @@ from diagnosis.next_experiment.discrimination import (
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
+# Share of the progress that the first search of an own machine is; the second may not be needed.
+_FIRST_SEARCH = 0.6
 # At most so many explanations are told apart by the next experiment.
 _MOST_COMPETING = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
@@ -69,15 +71,20 @@ def diagnose(
     if not weighing.model_error > 0:
         return _without_error(case, progress, rng)
     deadline_s = time.monotonic() + time_limit_s
-    found = searched(case, progress, deadline_s)
-    if not weighing.stated and isinstance(case, PlantCase) and not found.left_out and reaches_noise(found):
-        exact = _without_error(case.without_model_error(), progress, rng)
+    if not isinstance(case, PlantCase):
+        return beside_imperfections(searched(case, progress, deadline_s), rng)
+    found = searched(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s)
+    if found.left_out:
+        return beside_imperfections(found, rng)
+
+    def again(done: float, what: str) -> None:
+        progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
+
+    if not weighing.stated and reaches_noise(found):
+        exact = _without_error(case.without_model_error(), again, rng)
         if exact.verdict != "unknown":
             return exact
-    answer = beside_imperfections(found, rng)
-    if isinstance(case, PlantCase) and not found.left_out:
-        return looked_at_again(answer, progress, deadline_s, rng)
-    return answer
+    return looked_at_again(beside_imperfections(found, rng), again, deadline_s, rng)
 
 
 def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:

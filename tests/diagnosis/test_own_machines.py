@@ -196,7 +196,9 @@ def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
     plant = with_effects(plant, "all", experiments, dt_s=DT_S, motion="angle_rad")
     case = PlantCase("turning motor", plant, tuple(experiments))
     free = beside_imperfections(searched(case, lambda done, what: None), np.random.default_rng(0))
-    found = diagnose(case)
+    shares_done: list[float] = []
+    found = diagnose(case, progress=lambda done, what: shares_done.append(done))
+    assert shares_done == sorted(shares_done)
     assert (free.combination, found.combination) == (("input_offset",), ("input_delay",))
     assert found.shares.at_inputs
     assert not free.shares.at_inputs
