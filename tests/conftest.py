@@ -28,6 +28,12 @@ def _folder(variable: str, beside: Path) -> Path | None:
     return folder if folder.is_dir() else None
 
 
+@pytest.fixture(autouse=True)
+def no_width_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables are as wide as COLUMNS says, which a terminal or another test may have set."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+
 @pytest.fixture(scope="session")
 def flexlink_data() -> Path:
     """Folder of measured arms (slfr_krauss_2009, daisy_robot_arm, ...)."""

@@ -13,6 +13,7 @@ VALUES = {
     "in_header": "s",
     "dt_s": 1.0,
     "a": 0.9999999,
+    "integrators": 0,
     "omega_rad_s": 12.3456,
     "zeta": 0.0234,
     "fewest_periods": 3.0,
@@ -101,6 +102,7 @@ VALUES = {
 }
 # Other values that lead to other words.
 OTHERWISE = {
+    "SLOW_BOUND": [{"integrators": 1}],
     "TIME_UNIT": [{"in_header": ""}],
     "REPAIRED": [{"missing": 0}],
     "NUISANCE": [{"needed": False}],
