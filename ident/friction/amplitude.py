@@ -61,8 +61,7 @@ _THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
 _EXCITED = 1e-3
 _N_GRID = 300
-# Of how much larger N is at the strongest line, what the formula for it leaves open of N at every line.
-# What few lines, which are not Gaussian, leave open of N: relative to how much larger it is at the strongest.
+# Of how much larger N is at the strongest line, what stays open of N at every line, in size and in phase.
 _UNEVEN = 0.25
 _HALF_WIDTHS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])
 

@@ -18,8 +18,9 @@ from jinja2.bccache import Bucket, BytecodeCache
 class CompiledTemplates(BytecodeCache):
     """Kept as Python keeps its own: in `__pycache__`, a file each, nothing where none can be written.
 
-    A file counts only when it is whole, for the Python, the jinja2 and the text it was made of, and for the
-    modules of `filters`: those of constants are evaluated when a template is compiled.
+    jinja2's own cache of files reads pickles. Here a file counts only when it is whole, for the Python, the
+    jinja2 and the text it was made of, and for the modules of `filters`: those of constants are evaluated
+    when a template is compiled.
     """
 
     def __init__(self, filters: Path = Path(__file__).parent) -> None:
