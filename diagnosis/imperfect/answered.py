@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -122,7 +121,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         residuals_refit=moved,
         residuals_after=after,
         simulations=search.simulations,
-        shares=replace(shares_of(search, found, accepted, rng), at_inputs=search.at_inputs),
+        shares=shares_of(search, found, accepted, rng),
         competing=_competing(search, found),
     )
 

@@ -56,6 +56,7 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         small=tuple(name for name in accepted.names if name not in names),
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
+        at_inputs=search.at_inputs,
         **_over_horizon(search, accepted),
     )
 

@@ -36,10 +36,6 @@ _DEVIATION_STEP = 0.02
 _SURVIVES = 0.01
 
 
-def _nothing_free(voltage: Real) -> Real:
-    return np.zeros((2 * voltage.size, 0))
-
-
 def simulated(machine: Any, effects: Sequence[Any], inputs: Real) -> Real:
     """(T, Y) of a Rig for a voltage (T,), of a Plant for inputs (T, U)."""
     if isinstance(machine, Rig):
@@ -55,7 +51,7 @@ class CompetingHypothesis:
     rig : Rig, or Plant of one's own. With its fitted nominal parameters.
     effects : tuple of Effect, or of Change of an own plant
     directions : callable. Voltage (T,), or inputs (T, U) of an own plant -> derivatives (Y T, P) of the
-        outputs in noise deviations, sample by sample, by the hypothesis' free parameters; by default none.
+        outputs in noise deviations, sample by sample, by the hypothesis' free parameters; None: none is free.
     precision : (P, P). What is known about the free parameters: the Gauss-Newton Hessian of the fit to the
         records, prior included.
     causes : tuple of str. Effects that it names; by default all of them.
@@ -67,7 +63,7 @@ class CompetingHypothesis:
     probability: float
     rig: Any
     effects: tuple[Any, ...] = ()
-    directions: Callable[[Real], Real] = _nothing_free
+    directions: Callable[[Real], Real] | None = None
     precision: Real = field(default_factory=lambda: np.zeros((0, 0)))
     causes: tuple[str, ...] = ()
     name: str = ""
@@ -176,7 +172,10 @@ def distances(
     whitened: every hypothesis' outputs (Y T,) in noise deviations for the voltage (T,), sample by sample.
     scale (Y T,): noise of the hypotheses over the one that these are whitened by; by default the same.
     """
-    free = [hypothesis.directions(voltage) for hypothesis in competing]
+    free = [
+        np.zeros((whitened[0].size, 0)) if one.directions is None else one.directions(voltage)
+        for one in competing
+    ]
     if scale is not None:
         free = [scale[:, None] * derivatives for derivatives in free]
     found, remains = [], []

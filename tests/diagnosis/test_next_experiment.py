@@ -286,11 +286,10 @@ def _open(*changes, free=False):
         for name, role, size in (("small", "estimation", 1.0), ("large", "held_out", 3.0))
         for u in [size * np.sin(0.1 * np.arange(200.0))[:, None]]
     ]
-    noise, P = np.array([0.02]), int(free)
+    noise = np.array([0.02])
+    follows = {"directions": lambda u: u / noise, "precision": np.zeros((1, 1))} if free else {}
     competing = tuple(
-        CompetingHypothesis(
-            0.5, plant, (change,) if change else (), lambda u: u[:, :P] / noise, np.zeros((P, P)), noise=noise
-        )
+        CompetingHypothesis(0.5, plant, (change,) if change else (), noise=noise, **follows)
         for change in changes
     )
     return PlantCase("valve", plant, records), competing
