@@ -53,8 +53,8 @@ class Shares:
 
     names : of the outputs. before, after : RMS left beyond sensor noise over that of the motion, per output:
         nominal values re-estimated, effects added. interests : share of the motion from which on a gap does.
-    carried : effect -> (share of the gap's energy beyond noise that it closes, whatever the order in which
-        effects are added, with its 95 % interval).
+    carried : effect of the repaired model, small ones too -> (share of the gap's energy beyond noise that it
+        closes, whatever the order in which effects are added, with its 95 % interval).
     small : effects in the repaired model that carry less than what interests.
     closes : (effects, share of the gap closed by them alone), most first; also where the answer is unknown.
     not_tried : what a time limit left out.
@@ -101,6 +101,7 @@ class Diagnosis:
         and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
     deviations : key -> tolerances
         How far the nominal parameters are off, with the accepted effects in the model.
+    deviations_refit : key -> tolerances. How far they have to move without any effect.
     rig, repair : The repaired model: nominal parameters moved (a Rig, or a Plant of one's own), effects to
         add (of `plant.effects`, or changes of the own plant).
     residuals_before, residuals_refit, residuals_after : experiment -> (T, 2)
@@ -130,6 +131,7 @@ class Diagnosis:
     gap_closed: float
     gap_closed_interval: tuple[float, float]
     deviations: dict[str, float]
+    deviations_refit: dict[str, float]
     rig: Any
     repair: tuple[Any, ...]
     residuals_before: dict[str, Real]

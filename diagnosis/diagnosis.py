@@ -134,6 +134,7 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(model.nominal.keys, map(float, last.deviations), strict=True)),
+        deviations_refit=dict(zip(model.nominal.keys, map(float, found.base.deviations), strict=True)),
         rig=model.nominal.at(last.deviations).description,
         repair=last.effects if rounding is None else (*last.effects, rounding.effect),
         residuals_before=before,

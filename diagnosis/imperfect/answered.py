@@ -115,6 +115,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(keys, map(float, accepted.end.deviations), strict=True)),
+        deviations_refit=dict(zip(keys, map(float, refit.end.deviations), strict=True)),
         rig=search.records.nominal.at(accepted.end.deviations).description,
         repair=accepted.end.effects,
         residuals_before=before,

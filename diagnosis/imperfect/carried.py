@@ -23,10 +23,12 @@ _LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
 def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.random.Generator) -> Shares:
     """Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
 
-    Carried is the Shapley value of every accepted effect: what it closes, averaged over the orders in which
-    they could be added, so that it depends on none; intervals by bootstrap over blocks of samples.
+    Carried is the Shapley value of every effect of the repaired model, small ones included: what it closes,
+    averaged over the orders in which they could be added, so that it depends on none and all together are
+    what the model closes; intervals by bootstrap over blocks of samples.
     """
-    base, names = search.base, found.accepted
+    base = search.base
+    names = (*found.accepted, *(name for name in accepted.names if name not in found.accepted))
     subsets = {
         chosen: search.by_these(chosen, accepted)
         for count in range(len(names) + 1)
@@ -53,7 +55,7 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         after=tuple(map(float, accepted.shares[1])),
         interests=search.case.machine.weighing.model_error,
         carried=carried,
-        small=tuple(name for name in accepted.names if name not in names),
+        small=tuple(name for name in names if name not in found.accepted),
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
         at_inputs=search.at_inputs,

@@ -136,6 +136,7 @@ class KnownAnswer(Engine):
             gap_closed=closed,
             gap_closed_interval=(closed - 0.01, closed + 0.01),
             deviations=dict.fromkeys(case.rig.tolerances, 0.0),
+            deviations_refit=dict.fromkeys(case.rig.tolerances, -2.6),
             rig=case.rig,
             repair=effects,
             residuals_before=before,

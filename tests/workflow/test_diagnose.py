@@ -211,6 +211,7 @@ def test_beside_a_model_error_a_hub_angle_is_enough(folder, tmp_path, engine, wo
     percent = 100 * pooled_rms(missed) / np.std(held.output[:, 0])
     assert f"the model misses {percent:.3g} % of the motion" in html
     assert "times the sensor noise" not in html
+    assert re.search(r"of the motion, and moves [^.]*inertia \(hub\) by -2\.60 tolerances", html)
     assert "gravity" not in html.split("Partial answers")[-1].split("None of them")[0]
     document = json.loads(files["arm.json"])
     assert document["shares"]["closes"][0] == [["backlash"], 0.62]

@@ -90,7 +90,9 @@ class Work:
             check, no_check = _control(found) if self.controller else (None, "not_asked")
         rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
         effects = effects_text(case.name, found.repair) if found.repair else ""
-        rig = rig_text(case.name, case.rig, found.rig, moved(found), effects_name if effects else "")
+        rig = rig_text(
+            case.name, case.rig, found.rig, moved(found, found.deviations), effects_name if effects else ""
+        )
         html = case_page(
             CasePage(loaded, found, place, remains, coming, check, no_check, rig, effects),
             lambda f, m: report(_CONTROLLER + (1 - _CONTROLLER) * f, f"drawing {m}"),
@@ -173,7 +175,8 @@ def case_page(page: CasePage, progress: Callable[[float, str], None] | None = No
         title=page.loaded.case.name,
         page=page,
         shown=shown(page.found),
-        moved=moved(page.found),
+        moved=moved(page.found, page.found.deviations),
+        moved_refit=moved(page.found, page.found.deviations_refit),
         partial=partial_answers(page.found),
         look_alikes=LOOK_ALIKES,
         versions=[*versions, ("python", sys.version.split()[0])],

@@ -35,10 +35,13 @@ def shown(found: Diagnosis) -> Diagnosis:
     )
 
 
-def moved(found: Diagnosis) -> Mapping[str, float]:
-    """Stated values that were re-estimated -> by how many tolerances, positive where the value grew."""
+def moved(found: Diagnosis, deviations: Mapping[str, float]) -> Mapping[str, float]:
+    """Stated values that were re-estimated -> by how many tolerances, positive where the value grew.
+
+    A deviation multiplies: a value below zero falls where its deviation is above.
+    """
     stated = found.case.machine.description
-    return {key: copysign(d, found.rig.value(key) - stated.value(key)) for key, d in found.deviations.items()}
+    return {key: d * copysign(1.0, stated.value(key)) for key, d in deviations.items()}
 
 
 def partial_answers(found: Diagnosis, most: int = 5) -> tuple[tuple[tuple[str, ...], float], ...]:

@@ -53,7 +53,8 @@ def plant_page(found: Diagnosis) -> str:
         title=found.case.name,
         page=page,
         shown=shown(found),
-        moved=moved(found),
+        moved=moved(found, found.deviations),
+        moved_refit=moved(found, found.deviations_refit),
         partial=partial_answers(found),
         look_alikes=LOOK_ALIKES,
     ).html
