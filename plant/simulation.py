@@ -237,7 +237,7 @@ class SampledArm(Simulator):
             raise ValueError(
                 f"inputs must be finite; got {voltage_V} V, {hub_torque_Nm} N m, {tip_force_N} N"
             )
-        if self._rng is not None:
+        if self._rng is not None and self._measurement is None:
             self.measure()  # every instant takes its noise, looked at or not
         self._pending.append(self.machine.voltage.static(float(voltage_V)))
         late = self._pending.popleft()

@@ -133,8 +133,9 @@ class ControllerStepper:
         reference: the set point, which the feed-forward (if any) looks at; it rested at zero before.
         """
         if self._given is not None:
-            friction = self._given.friction(np.asarray(reference - self._reference), self._controller.dt_s)
-            self._smoothed += self._share * (float(friction) - self._smoothed)
+            moved = reference - self._reference
+            friction = float(self._given.friction(np.asarray(moved), self._controller.dt_s)) if moved else 0.0
+            self._smoothed += self._share * (friction - self._smoothed)
         self._reference = reference
         wanted = float(self._c @ self._x) + self._d * error + self._smoothed
         command = min(max(wanted, self._last - self._change), self._last + self._change)

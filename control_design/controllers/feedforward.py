@@ -50,7 +50,7 @@ class FrictionFeedforward:
     def friction(self, moved: Real, dt_s: float) -> Real:
         """At the motion (T,) of the reference in each sample, before the lag."""
         strength = self.level + self.excess * np.exp(-np.abs(moved) / (self.fall * dt_s))
-        return np.asarray(np.clip(moved / self.turn(dt_s), -1.0, 1.0) * strength)
+        return np.asarray(np.minimum(np.maximum(moved / self.turn(dt_s), -1.0), 1.0) * strength)
 
     def signal(self, reference: Real, dt_s: float) -> Real:
         """What joins the command, (T,), for a reference (T,) that rested at zero before."""

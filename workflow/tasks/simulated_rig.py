@@ -63,7 +63,7 @@ def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.N
     if encoder_step_rad == 0:
         return output
     result = output.copy()
-    result[..., 0] = encoder_step_rad * np.round(output[..., 0] / encoder_step_rad)
+    result[..., 0] = encoder_step_rad * np.rint(output[..., 0] / encoder_step_rad)
     return result
 
 
@@ -94,7 +94,10 @@ class EncodedArm(SampledArm):
         self._forces = iter(() if self._force is None else self._force.tolist())
 
     def measure(self) -> npt.NDArray[np.float64]:
-        return quantised(super().measure(), self._step)
+        output = super().measure()
+        if self._step:
+            output[0] = self._step * np.rint(output[0] / self._step)
+        return output
 
     def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
         super().advance(voltage_V, hub_torque_Nm, tip_force_N + next(self._forces, 0.0))
