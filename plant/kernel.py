@@ -27,8 +27,10 @@ _IN_THE_MIDDLE: Any = np.int64(1)
 _AT_END: Any = np.int64(2)
 
 
-def _compiled(function: _F) -> _F:
-    return cast(_F, njit(cache=True, error_model="numpy")(function))
+def _called(function: _F) -> _F:
+    # By compiled code alone: the ways in for Python and C are not compiled.
+    options: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return cast(_F, njit(**options, error_model="numpy")(function))
 
 
 def _inlined(function: _F) -> _F:
@@ -37,7 +39,7 @@ def _inlined(function: _F) -> _F:
     return cast(_F, njit(inline="always", error_model="numpy")(function))
 
 
-@_compiled
+@_called
 def _smooth_forces(
     first: int,
     last: int,
@@ -209,7 +211,7 @@ def _along(row: Real, x: Real) -> float:
     return total
 
 
-@_compiled
+@_called
 def _largest_stretch(element: Real, e: int, speed: float) -> float:
     """Stretch of a friction element at which its force is the friction level of this speed."""
     level = element[e, 2]
@@ -278,7 +280,7 @@ def _switch(
         mode[e] = wanted[e]
 
 
-@_compiled
+@njit(cache=True, error_model="numpy")
 def run(
     inputs: Real,
     observed: Real,

@@ -10,6 +10,9 @@ import numpy.typing as npt
 RealArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
+# Options of a numba function that compiled code alone calls: the ways in for Python and C are not compiled.
+INSIDE: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
 
 def kernel_array(array: RealArray) -> RealArray:
     """The array as compiled code takes it: C-contiguous and writable, copied only where it is not.

@@ -17,6 +17,7 @@ import numpy as np
 
 from ident.basis.coordinates import blocks_of_point
 from ident.basis.functions import run_cascade, run_cascade_free
+from ident.data.arrays import INSIDE
 
 # A column whose part outside the columns before it is below this fraction of its length carries no
 # information.
@@ -28,9 +29,10 @@ _LEAST_PIVOT = 1e-8
 _START: Any = np.int64(0)
 _LOWER: Any = np.bool_(True)
 _ALL: Any = np.bool_(False)
+_called = numba.njit(**INSIDE)
 
 
-@numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
+@numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
     # Slices counted from 0: with a[k], lo <= k < hi, the compiler has to allow for negative k and does not
     # vectorise (ten times slower).
@@ -41,7 +43,7 @@ def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
     return total
 
 
-@numba.njit(cache=True, forceinline=True, fastmath={"reassoc", "contract"})
+@numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) -> Any:
     """Products of a with rows j .. j + 3, or `last` in place of what lies beyond it, then those of b: each
     number read from memory is used more than once."""
@@ -61,7 +63,7 @@ def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) 
     return (s0, s1, s2, s3), (t0, t1, t2, t3)
 
 
-@numba.njit(cache=True)
+@_called
 def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
     """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i.
 
@@ -78,21 +80,21 @@ def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int,
                 target[second, j + q] = theirs[q]
 
 
-@numba.njit(cache=True)
+@_called
 def _subtract(target: Any, factor: float, row: Any, lo: int, hi: int) -> None:
     x, y = target[lo:hi], row[lo:hi]
     for k in range(x.size):
         x[k] -= factor * y[k]
 
 
-@numba.njit(cache=True)
+@_called
 def _copy(target: Any, source: Any) -> None:
     # Array assignments would do, but each makes numba compile seconds of broadcasting code.
     for k in range(source.size):
         target[k] = source[k]
 
 
-@numba.njit(cache=True)
+@_called
 def _subtract_squares(target: Any, a: Any, first: int) -> None:
     """target[i, j] -= a[i] a[j]^T, lower triangle from row `first` on."""
     for i in range(first, a.shape[0]):
@@ -103,7 +105,7 @@ def _subtract_squares(target: Any, a: Any, first: int) -> None:
             target[i, j] -= total
 
 
-@numba.njit(cache=True)
+@_called
 def schur_drop(gram: Any, b: Any) -> float:
     """b^T gram^-1 b by Cholesky in place; dependent columns are left out."""
     n = b.size
@@ -132,7 +134,7 @@ def schur_drop(gram: Any, b: Any) -> float:
     return drop
 
 
-@numba.njit(cache=True)
+@_called
 def factorise(gram: Any, n: int, least_pivot: float) -> bool:
     """Cholesky factor into the lower triangle of gram[:n, :n]; False if a pivot is below its least share."""
     for j in range(n):
@@ -151,7 +153,7 @@ def factorise(gram: Any, n: int, least_pivot: float) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@_called
 def forward(factor: Any, n: int, b: Any) -> None:
     """b[:n] = L^-1 b[:n]."""
     for i in range(n):
@@ -160,7 +162,7 @@ def forward(factor: Any, n: int, b: Any) -> None:
         b[i] /= factor[i, i]
 
 
-@numba.njit(cache=True)
+@_called
 def backward(factor: Any, n: int, b: Any) -> None:
     """b[:n] = L^-T b[:n]."""
     for i in range(n - 1, -1, -1):
@@ -182,7 +184,7 @@ def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) 
 @numba.njit(cache=True, inline="always")
 def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
     """Free responses of a cascade over the longest record (B, T)."""
-    longest = 0
+    longest = starts[0]  # 0; of Python's own numba would compile `run_cascade_free` once more
     for r in range(starts.size - 1):
         longest = max(longest, starts[r + 1] - starts[r])
     rows = np.empty((2 * blocks.shape[0] - n_real, longest))
@@ -276,7 +278,7 @@ def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> An
     return rows
 
 
-@numba.njit(cache=True)
+@_called
 def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
     for r in range(starts.size - 1):
         lo, hi = starts[r], starts[r + 1]
@@ -284,7 +286,7 @@ def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
             _subtract(target, _dot(local_q[i], target, lo, hi), local_q[i], lo, hi)
 
 
-@numba.njit(cache=True)
+@_called
 def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_local: Any, gram: Any) -> None:
     """Products of rows first .. with all rows before them, local columns taken out of both."""
     n_local = local_q.shape[0]

@@ -25,13 +25,15 @@ from typing import Any
 import numba
 import numpy as np
 
+from ident.data.arrays import INSIDE
+
 _STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
 _ALL = _STRIDES * _STEPS
 _OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
 
 
-@numba.njit(cache=True)
+@numba.njit(**INSIDE)
 def transitions(rates: Any, chain: Any, dt_s: float) -> Any:
     """(2, 3, N): what a step, and a stride, does to a state: its decay, a unit of effort onto it, the state
     before it onto it."""
@@ -51,7 +53,7 @@ def transitions(rates: Any, chain: Any, dt_s: float) -> Any:
     return moves
 
 
-@numba.njit(cache=True)
+@numba.njit(**INSIDE)
 def advance(
     drive: float,
     state: Any,
