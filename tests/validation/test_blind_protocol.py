@@ -264,16 +264,3 @@ def test_a_diagnosis_that_fails_counts_as_a_wrong_answer(tmp_path):
     document = failed("case_0001", failure.reason)
     assert document["verdict"] == "failed"
     assert "case.toml" in document["reason"]
-
-
-@pytest.mark.slow
-def test_a_small_run_from_end_to_end(tmp_path):
-    from workflow.cli import main
-
-    assert main(["blind", "--cases", "2", "--seed", "4", "--out", str(tmp_path / "run"), "--jobs", "1"]) == 0
-    document = json.loads((tmp_path / "run" / "scores.json").read_text())
-    assert document["failed"] == {}
-    assert set(document["baselines"]) == {"parameters only", "residual correlation"}
-    for name in ("case_0001", "case_0002"):
-        prediction = read_json(tmp_path / "run" / "predictions" / f"{name}.json")
-        assert sum(e["probability"] for e in prediction["effects"]) == pytest.approx(1.0, abs=1e-9)

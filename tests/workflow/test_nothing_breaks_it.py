@@ -187,6 +187,8 @@ def refusal(arguments: list[str], folder: Path) -> str | None:
     return line if code == 2 else None
 
 
+# A fault that one damage in a hundred shows is among 300 of a kind with 95 %; with logs and models, `all` are
+# more than 10 000. benchmarks/damaged_files.py spoils further ones, with the same seeds.
 FEW_AND_ALL = pytest.mark.parametrize("amount", ["few", pytest.param("all", marks=pytest.mark.slow)])
 
 
@@ -309,14 +311,14 @@ def spoilt_controllers(count: int) -> Tally:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("cut_off")
 def test_spoilt_files_are_refused_or_taken(kinds, tmp_path, kind, amount):
-    count = 12 if amount == "few" else 850
+    count = 12 if amount == "few" else 300
     assert spoilt_files(kinds[kind], KINDS.index(kind), tmp_path, count).wrong == []
 
 
 @FEW_AND_ALL
 @pytest.mark.usefixtures("cut_off", "undrawn")
 def test_tampered_run_directories(fast_run, tmp_path, amount):
-    assert tampered(run_output(fast_run[0]), tmp_path, 8 if amount == "few" else 500, 99).wrong == []
+    assert tampered(run_output(fast_run[0]), tmp_path, 8 if amount == "few" else 300, 99).wrong == []
 
 
 @pytest.mark.usefixtures("undrawn")

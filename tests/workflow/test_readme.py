@@ -135,6 +135,12 @@ def test_the_blind_cases_of_the_readme(call):
     scores = json.loads(Path("runs/blind/scores.json").read_text(encoding="utf-8"))
     right = scores["diagnosis"]["table"]["all"]["verdict and set right, every case"]
     assert said(f"verdict and set right in {right['hits']:.0f} of {right['count']}")
+    assert scores["failed"] == {}
+    assert set(scores["baselines"]) == {"parameters only", "residual correlation"}
+    predicted = [json.loads(path.read_text()) for path in Path("runs/blind/predictions").glob("*.json")]
+    assert len(predicted) == right["count"]
+    for one in predicted:
+        assert sum(effect["probability"] for effect in one["effects"]) == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -161,6 +161,7 @@ def test_a_stalled_study_goes_on_elsewhere(cluster, tmp_path):
     wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
     cluster.scheduler.send_signal(signal.SIGSTOP)
     began_s = time.monotonic()
+    run_study(study, tmp_path / "near", jobs=1)  # meanwhile
     said = finish(process, 1, seconds=120)
     assert time.monotonic() - began_s < 60
     assert said == (
@@ -168,7 +169,6 @@ def test_a_stalled_study_goes_on_elsewhere(cluster, tmp_path):
         "--resume continues the study\n"
     )
     run_study(study, tmp_path / "out", resume=True, jobs=2)
-    run_study(study, tmp_path / "near", jobs=2)
     assert_same_study(tmp_path / "near", tmp_path / "out")
 
 
