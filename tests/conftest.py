@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import typer.main
 from hypothesis import settings
 
 from tests.browser import PROGRAM, Browser, faults_of
@@ -26,6 +28,19 @@ def _folder(variable: str, beside: Path) -> Path | None:
     named = os.environ.get(variable)
     folder = Path(named) if named else beside
     return folder if folder.is_dir() else None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_time_lost() -> Iterator[None]:
+    """Thousands of calls in this process wait neither for typer to make all commands anew, nor for a disk to
+    have everything before it goes on (no test switches the power off)."""
+    make = typer.main.get_command
+    made = functools.cache(lambda app, _: make(app))
+    with pytest.MonkeyPatch.context() as patch:
+        # Commands from outside join those that were there.
+        patch.setattr(typer.main, "get_command", lambda app: made(app, len(app.registered_commands)))
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 from workflow.config.run_config import load_config
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.pipeline import run_pipeline
+from workflow.tasks.pipeline import config_of, run_pipeline
 from workflow.tasks.results import RunResults
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,8 +38,14 @@ def measure(example: str, out: Path) -> dict[str, Any]:
     """Run an example and read its certificate: plain numbers in the units of their names."""
     config, text = load_config(ROOT / "examples" / f"{example}.toml")
     run_pipeline(config, out, config_text=text)
-    certificate = RunResults(RunDirectory.open(out)).certify.certificate
-    assert certificate is not None, f"{example}: no controller to certify"
+    return of_run(out)
+
+
+def of_run(out: Path) -> dict[str, Any]:
+    """The same of a run that is there."""
+    run = RunDirectory.open(out)
+    config, certificate = config_of(run), RunResults(run).certify.certificate
+    assert certificate is not None, f"{out}: no controller to certify"
     verdict = certificate.plants[0]
     worst = verdict.worst_margins
     band = config.specification.mode_band_rad_s
@@ -52,6 +58,18 @@ def measure(example: str, out: Path) -> dict[str, Any]:
         "phase_margin_deg": math.degrees(worst.phase_rad),
         "delay_margin_s": worst.delay_s,
         "least_mode_damping": min(zetas),
+    }
+
+
+def moved(example: str, found: dict[str, Any]) -> dict[str, Any]:
+    """What is not where the golden file has it: found and golden value by name."""
+    golden = read()[example]
+    assert found.keys() == {"certified", *golden["tolerance"]}, "other numbers than in the golden file"
+    tolerances = {**golden["tolerance"], "certified": 0.0}
+    return {
+        name: (value, golden[name])
+        for name, value in found.items()
+        if abs(value - golden[name]) > tolerances[name] * abs(golden[name])
     }
 
 

@@ -31,8 +31,10 @@ PLAIN = f"""
 [study]
 base = "{FAST_ARM}"
 [changes]
+"achievable_performance.compute" = false
 "closed_loop.draws" = 1
 "closed_loop.conditions" = false
+"closed_loop.sensitivity" = false
 """
 
 TWO_POINTS = f"""{PLAIN}

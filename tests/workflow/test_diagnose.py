@@ -391,7 +391,7 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
 @pytest.mark.slow
 def test_killed_and_resumed_ends_with_the_same_bytes(cases, tmp_path):
     quiet, killed = tmp_path / "quiet", tmp_path / "killed"
-    call = ("diagnose", *cases, "--jobs", 1, "--out")
+    call = ("diagnose", *cases, "--jobs", 1, "--no-controller", "--out")
     finish(start_flexlink(*call, quiet))
     process = start_flexlink(*call, killed)
     wait_until((killed / "one.json").exists, process)

@@ -24,7 +24,7 @@ import workflow.tasks.pipeline
 import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
 from tests.ident.mutations import Tally, tally
-from tests.workflow.command import FAST_ARM, ROOT
+from tests.workflow.command import FAST_ARM, ROOT, draw_nothing
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
@@ -321,10 +321,18 @@ def test_tampered_run_directories(fast_run, tmp_path, amount):
     assert tampered(run_output(fast_run[0]), tmp_path, 8 if amount == "few" else 300, 99).wrong == []
 
 
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Output], Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        draw_nothing(patch)
+        return outputs_replayed(tmp_path_factory.mktemp("outputs"), patch), LocalProcesses.run
+
+
 @pytest.mark.usefixtures("undrawn")
 @FEW_AND_ALL
-def test_tampered_studies_and_diagnoses(tmp_path, monkeypatch, amount):
-    outputs = outputs_replayed(tmp_path, monkeypatch)
+def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, amount):
+    outputs, replay = replayed
+    monkeypatch.setattr(LocalProcesses, "run", replay)
     for number, one in enumerate(outputs.values(), 96):
         assert tampered(one, tmp_path, 12 if amount == "few" else 300, number).wrong == []
 

@@ -18,6 +18,7 @@ import pytest
 
 from plant import linear_arm
 from plant.presets import paper_link
+from tests.golden import margins
 from tests.workflow.command import ROOT
 from workflow.tasks.model_files import read_model
 
@@ -106,6 +107,8 @@ def test_make_run_gives_the_numbers_of_the_readme(flexlink):
     (words,) = re.findall(r"^run:.*\n\t\$\(BIN\)/flexlink (.*)$", MAKEFILE, re.MULTILINE)
     answer = flexlink(*words.replace("$(OUT)", "runs/default").split(), "--json").document()
     assert answer["certified"]
+    off = margins.moved("default_arm", margins.of_run(Path("runs/default")))
+    assert not off, f"measured against golden: {off}; if meant, rerun python -m tests.golden.margins"
     (predicted,) = re.findall(r"predicted [\d.]+, certified at most [\d.]+, measured [\d.]*\d", README)
     assert any(row["value"].startswith(predicted) for row in answer["table"])
     assert Path("runs/default/figures/overview.svg").is_file()
