@@ -44,7 +44,15 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize(("solves", "delay_s"), [(1, 0.0), (1, 0.03), (1, 0.1), (2, 0.06)])
+@pytest.mark.parametrize(
+    ("solves", "delay_s"),
+    [
+        (1, 0.0),
+        pytest.param(1, 0.03, marks=pytest.mark.slow),
+        pytest.param(1, 0.1, marks=pytest.mark.slow),
+        (2, 0.06),
+    ],
+)
 def test_an_interrupt_in_the_interior_point_ends_the_synthesis(tmp_path, solves, delay_s):
     script = tmp_path / "interrupted.py"
     script.write_text(_INTERRUPTED)

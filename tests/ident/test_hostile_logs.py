@@ -83,7 +83,7 @@ def test_many_damaged_bytes(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", IN_A_CHILD)
 def test_many_damaged_bytes_for_a_child(name, tmp_path):
-    fuzz(name, tmp_path, 100)
+    fuzz(name, tmp_path, 50)  # twice as many in benchmarks/damaged_files.py: each takes a process
 
 
 def test_a_child_that_dies_or_hangs_is_a_refusal(tmp_path, monkeypatch):

@@ -82,6 +82,7 @@ def test_a_run_for_which_there_is_no_room_at_all_leaves_nothing(tmp_path, monkey
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_study_goes_on(tmp_path, monkeypatch, continued, flexlink):
     study = write_study(tmp_path, ONE_POINT)
@@ -97,6 +98,7 @@ def test_a_study_goes_on(tmp_path, monkeypatch, continued, flexlink):
     assert point_bytes(tmp_path / "again") == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_diagnosis_goes_on(tmp_path, monkeypatch, continued):
     monkeypatch.setattr(workflow.diagnose.command, "Engine", lambda **_: KnownAnswer((FRICTION,)))

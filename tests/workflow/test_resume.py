@@ -61,8 +61,8 @@ def reference(tmp_path_factory):
 @pytest.mark.parametrize(
     ("appears", "pause_s"),
     [
-        ("manifest.json", 0.0),
-        ("stages/records.npz", 0.02),
+        pytest.param("manifest.json", 0.0, marks=pytest.mark.slow),
+        pytest.param("stages/records.npz", 0.02, marks=pytest.mark.slow),
         ("stages/uncertainty.npz", 0.2),
         ("stages/certify.json", 0.0),
     ],
@@ -260,6 +260,7 @@ def test_c_code_stays_as_it_was_asked_for(fast_run, tmp_path):
         written()
 
 
+@pytest.mark.slow
 def test_stopped_again_and_again_it_ends_with_the_same_files(reference, tmp_path):
     """Kills and interrupts at random moments, continued as the line says: benchmarks/interruptions.py makes
     many, of studies and diagnoses too."""

@@ -18,10 +18,15 @@ from pathlib import Path
 import pytest
 
 from tests.workflow.command import ROOT, finish, start_flexlink, wait_until
-from tests.workflow.study_examples import TWO_POINTS, assert_same_study, write_study
+from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, assert_same_study, write_study
 from workflow.engine.cluster import DaskCluster
 from workflow.engine.errors import StageError
 from workflow.study.run import run_study
+
+# As many points as the small study, without what adds nothing to where they are computed.
+FAR = SMALL_STUDY.replace(
+    "[changes]", '[changes]\n"achievable_performance.compute" = false\n"closed_loop.sensitivity" = false'
+)
 
 
 def free_port() -> int:
@@ -77,7 +82,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 def far_study(folder: Path, address: str) -> tuple[Path, tuple[object, ...]]:
     """A study as a file, and the arguments that run it on the scheduler at this address."""
-    study = write_study(folder)
+    study = write_study(folder, FAR)
     return study, ("study", "--config", study, "--out", folder / "out", "--scheduler", address)
 
 
@@ -132,6 +137,7 @@ class Sleep:
         return self.seconds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("who", "words"),
     [("scheduler", "has not answered for 8 s"), ("worker", "no worker that answers for 8 s")],
