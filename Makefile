@@ -3,6 +3,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $$p && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
+PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 OUT ?= runs/default
 
@@ -19,17 +20,20 @@ help:
 	@echo "make docs   the documentation as a site, build/site/index.html, with a gallery of pages"
 	@echo "make check  what CI runs: tests, lint, types"
 
-# The run at the end fills the cache of compiled code: code compiled in the same process may round otherwise than code
-# from the cache, and a killed run must resume to the same digits.
-$(STAMP): pyproject.toml constraints.txt
+$(PACKAGES): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "flexlink needs Python 3.11 or newer with venv"; exit 2; }
 	@echo "installing flexlink and its pinned dependencies into $(VENV) (a minute or two, once)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+# The run fills the cache of compiled code: code compiled in the same process may round otherwise than code from the
+# cache, and a killed run must resume to the same digits.
+$(STAMP): $(PACKAGES)
 	@echo "compiling the numerical kernels (a minute, once)"
 	@$(BIN)/flexlink run --out $(VENV)/compiled --replace >/dev/null
 	@rm -rf $(VENV)/compiled
-	@touch $(STAMP)
+	@touch $@
 
 install: $(STAMP)
 
@@ -42,12 +46,12 @@ test: $(STAMP)
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
-lint: $(STAMP)
+lint: $(PACKAGES)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 
-types: $(STAMP)
+types: $(PACKAGES)
 	$(BIN)/mypy
 
 check: test-all lint types
