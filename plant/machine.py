@@ -7,6 +7,7 @@ means "as nominal".
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar, cast
 
@@ -33,6 +34,9 @@ class VoltagePath:
     def static(self, voltage_V: Signal) -> Signal:
         """The memoryless part: gain, dead zone, saturation."""
         value = self.gain * voltage_V
+        if isinstance(value, float):  # sample by sample: numpy's functions take five times as long
+            acting = min(max(abs(value) - self.dead_zone_V, 0.0), self.limit_V)
+            return math.copysign(acting, value)
         size = np.minimum(np.maximum(np.abs(value) - self.dead_zone_V, 0.0), self.limit_V)
         return cast(Signal, np.copysign(size, value))
 
