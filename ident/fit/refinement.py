@@ -140,7 +140,7 @@ def refine(
 def pole_system(here: Linearisation, poles: Poles, fixed: Poles = NO_POLES) -> tuple[RealArray, RealArray]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T
     r."""
-    chain = chain_rule(*poles.writable(), *fixed.counts)
+    chain = chain_rule.py_func(*poles.writable(), *fixed.counts)  # too seldom to be compiled by itself
     return chain.T @ here.normal @ chain, chain.T @ here.gradient
 
 
