@@ -158,9 +158,9 @@ def test_start_columns_are_the_derivatives_of_the_residuals():
 
 WORKSHOP = [
     pytest.param("work-04", "none", set(), marks=pytest.mark.slow),
-    pytest.param("work-05", "effect", {"joint_compliance"}, marks=pytest.mark.slow),
+    ("work-05", "effect", {"joint_compliance"}),
     pytest.param("work-06", "effect", {"torque_ripple", "base_compliance"}, marks=pytest.mark.slow),
-    ("work-07", "effect", {"actuator_gain"}),
+    pytest.param("work-07", "effect", {"actuator_gain"}, marks=pytest.mark.slow),
 ]
 
 

@@ -55,6 +55,7 @@ def test_gravity_that_also_bends_the_link_is_gravity(tmp_path):
     assert found.probabilities["gravity"] > 0.98
 
 
+@pytest.mark.slow
 def test_a_spring_to_ground_is_nothing_of_the_list(tmp_path):
     found = _found(tmp_path, "spring", 0.4, 0.15)
     assert found.verdict == "unknown"

@@ -148,7 +148,10 @@ def _case(name, seed=0, **off):
     return PlantCase(name, plant, tuple(experiments))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=[pytest.mark.slow] if one == "coulomb_friction" else []) for one in CASES],
+)
 def test_the_effect_is_found_among_all_that_are_listed(name):
     case = _case(name)
     begun = time.process_time()
