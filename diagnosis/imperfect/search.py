@@ -87,7 +87,9 @@ class Search:
         self.records = Records(self.case, self.case.estimation, at_inputs=self.at_inputs)
         self.held_out = Records(self.case, self.case.held_out, at_inputs=self.at_inputs)
         self.points: list[tuple[Candidate, list[Point]]] = []
-        self._reduced: set[tuple[object, ...]] = set()  # sets already fitted without one of their effects
+        self._reduced: set[tuple[object, ...]] = (
+            set()
+        )  # sets already fitted without an effect, or a simpler one
 
     @property
     def base(self) -> Explanation:
@@ -256,18 +258,20 @@ class Search:
                 self.add(descend(self.records, candidates, end.deviations, x, end.start))
 
     def simpler(self, explanation: Explanation) -> None:
-        """The same with effects in place of those that contain them, where nobody has fitted that yet."""
+        """The same with effects in place of those that contain them, from where these ended: further values
+        may have led out of a minimum in which the simpler effect was left."""
         end = explanation.end
         for k, containing in enumerate(end.candidates):
             for candidate in [c for c, _ in self.points if c.effect == containing.kind.contains]:
+                if (this := (*explanation.names, explanation.evidence, candidate.effect)) in self._reduced:
+                    continue
+                self._reduced.add(this)
                 candidates = (*end.candidates[:k], candidate, *end.candidates[k + 1 :])
-                key = tuple(sorted(c.effect for c in candidates))
                 first = sum(len(c.axes) for c in end.candidates[:k]) + len(candidate.axes)
                 x = np.delete(
                     end.coordinates, slice(first, first + len(containing.axes) - len(candidate.axes))
                 )
-                if not any(e.key == key for e in self.found):
-                    self.add(descend(self.records, candidates, end.deviations, x, end.start))
+                self.add(descend(self.records, candidates, end.deviations, x, end.start))
 
     def without(self, explanation: Explanation, k: int) -> Explanation:
         """The best explanation by the same effects but the k-th."""
