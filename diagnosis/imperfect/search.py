@@ -87,9 +87,8 @@ class Search:
         self.records = Records(self.case, self.case.estimation, at_inputs=self.at_inputs)
         self.held_out = Records(self.case, self.case.held_out, at_inputs=self.at_inputs)
         self.points: list[tuple[Candidate, list[Point]]] = []
-        self._reduced: set[tuple[object, ...]] = (
-            set()
-        )  # sets already fitted without an effect, or a simpler one
+        # Sets already fitted without one of their effects, or with a simpler one.
+        self._reduced: set[tuple[object, ...]] = set()
 
     @property
     def base(self) -> Explanation:
