@@ -293,7 +293,7 @@ def run(
             for (name, call), count in zip(known.items(), _shares(wanted, len(known)), strict=True):
                 able = [way for way in ways if way.reach != "one" or name != "run"]  # which has but itself
                 place = folder / f"{name}-{able[0].number.name}"
-                for way, found in _stopped(out, call, place, whole[name], able, count, stops, seed).items():
+                for way, found in stopped(out, call, place, whole[name], able, count, stops, seed).items():
                     told(out, f"{name}, {way}", found)
                     for each in dataclasses.fields(Found):
                         setattr(total, each.name, getattr(total, each.name) + getattr(found, each.name))
@@ -312,7 +312,7 @@ def _shares(total: int, parts: int) -> list[int]:
     return [total * (k + 1) // parts - total * k // parts for k in range(parts)]
 
 
-def _stopped(
+def stopped(
     out: Print,
     call: Sequence[str],
     place: Path,

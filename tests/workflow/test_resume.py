@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchmarks.interruptions import INTERRUPTS, KILLS, Found, chain, contents, random_stops
+from benchmarks.interruptions import INTERRUPTS, KILLS, stopped, undisturbed
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, ROOT, finish, kill, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
@@ -31,6 +31,7 @@ from workflow.tasks.controller_files import write_controller
 from workflow.tasks.results import ClosedLoopResult, RunResults
 from workflow.tasks.stages import STAGES
 
+RUN = ["run", "--config", str(FAST_ARM)]
 NAMES = [*(stage.name for stage in STAGES), REPORT.name]
 
 
@@ -47,14 +48,18 @@ def assert_same_run(left: Path, right: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory):
-    """The run nobody disturbed, in a process of its own like the one that is killed.
+def whole(tmp_path_factory):
+    """Where the run nobody disturbed is, its files and CPU seconds; in a process like the one that is killed.
 
     A test process has other compiled variants of the kernels in memory, and those may round otherwise.
     """
     out = tmp_path_factory.mktemp("reference") / "run"
-    finish(start_flexlink("run", "--config", FAST_ARM, "--out", out))
-    return out
+    return out, undisturbed(RUN, out)
+
+
+@pytest.fixture(scope="module")
+def reference(whole):
+    return whole[0]
 
 
 # A point is a file that has just appeared, and how long the next stage is then left working before the kill.
@@ -261,14 +266,14 @@ def test_c_code_stays_as_it_was_asked_for(fast_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_stopped_again_and_again_it_ends_with_the_same_files(reference, tmp_path):
+def test_stopped_again_and_again_it_ends_with_the_same_files(whole, tmp_path):
     """Kills and interrupts at random moments, continued as the line says: benchmarks/interruptions.py makes
     many, of studies and diagnoses too."""
-    found = {way: Found() for way in (*KILLS[:2], *INTERRUPTS)}
-    stops = random_stops(np.random.default_rng(15), list(found), 0, len(found), whole_s=12.0)
-    chain(["run", "--config", str(FAST_ARM)], tmp_path / "run", contents(reference), stops, found)
-    assert [line for one in found.values() for line in one.bad] == []
-    assert sum(one.stops - one.past_the_end for one in found.values()) >= 6
+    ways = (*KILLS[:2], *INTERRUPTS)
+    found = stopped(print, RUN, tmp_path / "run", whole[1], ways, len(ways), len(ways), seed=15).values()
+    assert [line for one in found for line in one.bad] == []
+    assert sum(one.stops for one in found) >= len(ways)
+    assert sum(one.past_the_end for one in found) < len(ways) / 2
 
 
 def test_a_run_leaves_its_controller(reference):
