@@ -145,7 +145,7 @@ class _Output(Console):
 
 
 def print_summary(summary: RunSummary) -> None:
-    """The table of numbers on standard output."""
+    """The table of numbers on standard output, and the verdict where it is no complaint on standard error."""
     # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
     told = sys.stdout.isatty() or "COLUMNS" in os.environ
     console = _Output(file=sys.stdout, width=None if told else 120)
@@ -160,7 +160,8 @@ def print_summary(summary: RunSummary) -> None:
                 label, _text(row.label), _text(row.value), end_section=index == len(section.rows) - 1
             )
     console.print(table)
-    console.print(_text(summary.verdict), highlight=False, soft_wrap=True)
+    if summary.certified:
+        console.print(_text(summary.verdict), highlight=False, soft_wrap=True)
     if summary.report_path:
         console.print(f"report: {_text(summary.report_path)}", highlight=False, soft_wrap=True)
 

@@ -63,6 +63,13 @@ class SpecificationItem:
     omega_rad_s: float | None = None
     bound: float | None = None
 
+    @property
+    def only_unproved(self) -> bool:
+        """Whether `achieved` is enough and what was proved of it for all frequencies is not."""
+        if self.met or self.bound is None:
+            return False
+        return (self.achieved - self.required) * (self.bound - self.required) <= 0.0
+
 
 @dataclass(frozen=True)
 class Findings:

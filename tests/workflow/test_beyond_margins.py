@@ -17,7 +17,7 @@ from control_design.analysis.joint_coverage import JointCoverage
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification
-from control_design.specification.requirement import LoopFunction
+from control_design.specification.requirement import LoopFunction, SpecificationItem
 from control_design.synthesis.joint_synthesis import JointDesign
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
@@ -87,8 +87,21 @@ def test_words_of_the_achievable_performance():
 
 def test_advice_on_the_order():
     assert "controller_order = 3 is too low" in said("order_advice", achievable(0.8), 1.2, 3)
-    assert "a higher order does not help" in said("order_advice", achievable(1.1), 1.2, 3)
+    assert "a higher order is not enough" in said("order_advice", achievable(1.1), 1.2, 3)
     assert said("order_advice", AchievablePerformance(), 1.2, 3) == ""
+
+
+def test_a_number_that_is_enough_on_the_grid_and_not_proved_says_so():
+    """Of an unstable loop nothing is proved: an effort of .0005 where 1 is allowed was said to be not met."""
+    effort = SpecificationItem("effort", "hub", 1.0, 5e-4, "", met=False, bound=np.inf)
+    assert said("requirement", effort).endswith(
+        "NOT met (enough on the grid, but not proved for all frequencies)"
+    )
+    distance = SpecificationItem("modulus margin", "hub", 0.5, 0.6, "", met=False, bound=0.0)
+    assert distance.only_unproved
+    missed = replace(effort, achieved=1.2), replace(distance, achieved=0.4), replace(effort, bound=None)
+    proved = replace(effort, met=True, bound=1.0)
+    assert not any(item.only_unproved for item in (*missed, proved))
 
 
 def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():

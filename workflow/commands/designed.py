@@ -113,7 +113,7 @@ def designed(
         done=done,
         order=order,
         advice=advice,
-        verdict=replace(done.certify, reason=reason),
+        verdict=done.certify,
         shares=shares,
         files=files,
     )
