@@ -27,6 +27,7 @@ from diagnosis.imperfect.search import Explanation, Progress, Search, best_of_se
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis, fitted_hypothesis
 from plant.effects.search_space import Candidate
 
@@ -86,7 +87,9 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     refit = search.base
     accepted = refit
     if found.accepted:
-        whole = next(one for one in found.judged if set(found.accepted) <= {p.name for p in one.parts})
+        whole = next(
+            one for one in found.judged if found.fitted(found.accepted) <= {p.name for p in one.parts}
+        )
         least = _LEAST_KEPT * case.machine.weighing.model_error
         kept = [p.name for p in whole.parts if p.name in found.accepted or p.share > least]
         accepted = search.finished(search.by_these(kept, whole.explanation))
@@ -94,7 +97,9 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
             accepted = whole.explanation
     before = _whitened(case, search.stated())
     moved, after = _whitened(case, refit), _whitened(case, accepted)
-    closed, interval = share_closed(case, moved, after, rng, NOISE_FLOOR)
+    rounding = rounding_effect(case)
+    floor = NOISE_FLOOR if rounding is None else rounding.floor
+    closed, interval = share_closed(case, moved, after, rng, floor)
     named: dict[str, Verdict] = {"none": "none", "unknown": "unknown"}
     kind = named.get(found.answer, "effect")
     ambiguous = _ambiguous(found)
@@ -111,13 +116,13 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         gap_before=held_out_gap(case, before),
         gap_refit=held_out_gap(case, moved),
         gap_after=held_out_gap(case, after),
-        noise_floor=NOISE_FLOOR,
+        noise_floor=floor,
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(keys, map(float, accepted.end.deviations), strict=True)),
         deviations_refit=dict(zip(keys, map(float, refit.end.deviations), strict=True)),
         rig=search.records.nominal.at(accepted.end.deviations).description,
-        repair=accepted.end.effects,
+        repair=(*accepted.end.effects, *([found.rounding.effect] if found.rounding else [])),
         residuals_before=before,
         residuals_refit=moved,
         residuals_after=after,
@@ -153,7 +158,7 @@ def _competing(search: Search, found: judging.Verdict) -> tuple[CompetingHypothe
             end.deviations,
             end.coordinates,
             end.precision(records) / judging.TEMPER,
-            found.probabilities.sets.get(key, 0.0),
+            found.probability(key),
             noise,
             key,
         )
@@ -207,6 +212,8 @@ def _named(
             parameters = best.end.candidates[k].parameters(best.end.coordinates_of(k))
             intervals = _intervals(search, best, k, rng)
             gap = held_out_gap(case, _whitened(case, best))
+        elif found.rounding is not None and name == found.rounding.name:
+            parameters, intervals = found.rounding.effect.parameters(), found.rounding.intervals
         entries.append(
             NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
         )

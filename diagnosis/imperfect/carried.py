@@ -14,6 +14,7 @@ from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.verdict import Verdict
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.rounding import rounding_effect
 
 # Blocks of the bootstrap [samples]; draws; partial answers that are told.
 _BLOCK, _DRAWS, _MOST_TOLD = 50, 1000, 5
@@ -28,7 +29,8 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
     what the model closes; intervals by bootstrap over blocks of samples.
     """
     base = search.base
-    names = (*found.accepted, *(name for name in accepted.names if name not in found.accepted))
+    fitted = [name for name in found.accepted if name in accepted.names]
+    names = (*fitted, *(name for name in accepted.names if name not in fitted))
     subsets = {
         chosen: search.by_these(chosen, accepted)
         for count in range(len(names) + 1)
@@ -84,9 +86,10 @@ def _over_horizon(search: Search, accepted: Explanation) -> dict[str, Any]:
 
 
 def _blocks(search: Search, explanation: Explanation) -> Real:
-    """Energy over noise of blocks of the held-out residuals, less what white noise has."""
-    noise = search.case.noise
-    whitened = [np.sum((part / noise) ** 2 - 1, axis=1) for part in explanation.left_held_out]
+    """Energy over noise of blocks of the held-out residuals, less what noise and rounding have."""
+    noise, rounding = search.case.noise, rounding_effect(search.case)
+    white = 1.0 if rounding is None else 1.0 + rounding.variances / noise**2
+    whitened = [np.sum((part / noise) ** 2 - white, axis=1) for part in explanation.left_held_out]
     return np.concatenate([np.add.reduceat(e, np.arange(0, e.size, _BLOCK)) for e in whitened])
 
 

@@ -29,6 +29,8 @@ _LOWEST = 4
 _MOST = 16.0
 # Share of the stated model error below which a gain is none: what does not interest is not fitted.
 _UNINTERESTING = 0.4
+# Noise is allowed half as much again as a data sheet says.
+_NOISE_ALLOWED = 1.5
 
 
 def octaves_of(samples: int) -> npt.NDArray[np.int64]:
@@ -64,9 +66,9 @@ class Levels:
     """Bands of the coefficients of some records.
 
     band : (N,) index of the band of every coefficient. counted : (B,) independent values of a band.
-    floor : (B,) energy F_b; noise : (B,) the part of it that sensors have. felt : (B,) what energy left in a
-    band counts. belongs : (B,) which of the R Y outputs of records it is of; motion : (R Y,) their energies,
-    counted so too.
+    floor : (B,) energy F_b; noise : (B,) what sensors may have, noise and rounding. felt : (B,) what energy
+    left in a band counts. belongs : (B,) which of the R Y outputs of records it is of; motion : (R Y,) their
+    energies, counted so too.
     """
 
     band: npt.NDArray[np.int64]
@@ -84,8 +86,10 @@ class Levels:
         noise: Real,
         model_error: float,
         amplified: Sequence[Real] = (),
+        rounded: Real | float = 0.0,
     ) -> Levels:
-        """noise (Y,): standard deviations; model_error: share of the motion that a good model may miss.
+        """noise (Y,): standard deviations; model_error: share of the motion that a good model may miss;
+        rounded (Y,): variances of rounding beside the noise.
 
         amplified : of every record (octaves, Y), energy that a disturbance as large as its inputs has in its
             outputs. Octaves in which that is more than an even part of the motion count the less: a machine
@@ -110,8 +114,8 @@ class Levels:
                 (
                     first + (octave[:, None] * Y + np.arange(Y)).ravel(),
                     np.repeat(np.minimum(samples, _MOST), Y),
-                    (samples[:, None] * noise**2 + floor).ravel(),
-                    (samples[:, None] * noise**2).ravel(),
+                    (samples[:, None] * (noise**2 + rounded) + floor).ravel(),
+                    (samples[:, None] * (_NOISE_ALLOWED**2 * noise**2 + rounded)).ravel(),
                     felt.ravel(),
                     np.tile(r * Y + np.arange(Y), octaves),
                     motion,

@@ -11,8 +11,8 @@ import numpy as np
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.imperfect.levels import Levels, coefficients, disturbance, octave_energies
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
+from diagnosis.machine.rounding import rounding_effect
 
-_NOISE_ALLOWED = 1.5
 # Draws of every disturbance.
 _DISTURBANCES = 4
 _ANGLE_STEP_RAD = 1e-3
@@ -65,7 +65,11 @@ class Records:
         self.case, self.experiments = case, tuple(experiments)
         self.nominal = LogNormalParameters(case.machine)
         amplified = [self._amplified(e) for e in experiments] if at_inputs else []
-        self.levels = Levels.of(experiments, case.noise, case.machine.weighing.model_error, amplified)
+        rounding = rounding_effect(case)
+        rounded = np.zeros(case.noise.size) if rounding is None else rounding.variances
+        self.levels = Levels.of(
+            experiments, case.noise, case.machine.weighing.model_error, amplified, rounded
+        )
         self.simulations = 0
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
@@ -163,14 +167,11 @@ class Records:
         )
 
     def shares(self, residuals: Sequence[Real]) -> Real:
-        """(Y,) RMS left beyond sensor noise over the RMS of the motion (about the mean), all records; of both
-        what is felt (`Levels`).
-
-        Noise is allowed half as much again as a data sheet says.
-        """
+        """(Y,) RMS left beyond what sensors may have over the RMS of the motion (about the mean), all
+        records; of both what is felt (`Levels`)."""
         levels, Y = self.levels, self.case.noise.size
         energy = levels.energy(np.concatenate([coefficients(e) for e in residuals]))
-        beyond = levels.felt * (energy - _NOISE_ALLOWED**2 * levels.noise)
+        beyond = levels.felt * (energy - levels.noise)
         left = np.maximum(np.bincount(levels.belongs, beyond), 0.0).reshape(-1, Y).sum(axis=0)
         motion = levels.motion.reshape(-1, Y).sum(axis=0)
         return np.asarray(np.sqrt(left / motion))

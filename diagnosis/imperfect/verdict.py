@@ -18,6 +18,7 @@ from scipy.special import expit, softmax
 from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.imperfect.search import Explanation, Search, best_of_sets
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.rounding import Rounding, rounding_effect
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
@@ -71,17 +72,28 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """probabilities; judged: the sets that were weighed, best first; answer: names that are accepted."""
+    """probabilities; judged: the sets that were weighed, best first; answer: names that are accepted, with
+    rounding where that interests, which is read off the values and in none of the sets."""
 
     probabilities: Probabilities
     judged: tuple[Judged, ...]
     answer: str
     accepted: tuple[str, ...]
+    rounding: Rounding | None = None
+
+    def fitted(self, names: Iterable[str]) -> set[str]:
+        """Those of the names that are in sets."""
+        return set(names) - ({self.rounding.name} if self.rounding else set())
+
+    def probability(self, fitted: Iterable[str]) -> float:
+        """Of a set, and rounding."""
+        beside = () if self.rounding is None else (self.rounding.name,)
+        return self.probabilities.sets.get(tuple(sorted((*fitted, *beside))), 0.0)
 
 
 def score_of(explanation: Explanation, listed: Sequence[str], model_error: float) -> float:
     """Log weight of a set of effects, out of those that are listed."""
-    return _gain(explanation, listed) + float(np.log(sum(_remaining(explanation, model_error))))
+    return _gain(explanation, listed) + float(np.log(sum(_remaining(_left(explanation), model_error))))
 
 
 def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
@@ -109,15 +121,39 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
         if len(search.found) == known:
             break
     weighing = search.case.machine.weighing
-    none_enough = _enough(search.base, weighing.model_error) if weighing.stated else 0.0
+    # What effects too small to interest carry together is measured as each of them is.
+    alike = float(np.sqrt(np.prod(np.max(search.base.shares, axis=1))))
+    none_enough = _enough(alike, weighing.model_error) if weighing.stated else 0.0
     probabilities = _probabilities(sets, listed, none_enough)
+    rounding, beside = rounding_effect(search.case), dict[str, float]()
+    if rounding is not None and (share := _rounded(search, rounding)) > _INTERESTS * weighing.model_error:
+        beside[rounding.name] = share
+        leads = share > max((part.share for part in sets[0].parts), default=0.0)
+        probabilities = probabilities.beside(rounding.name, leads=leads)
+    accepted = _accepted(probabilities, sets, beside)
+    return Verdict(probabilities, sets, probabilities.answer, accepted, rounding if beside else None)
+
+
+def _accepted(
+    probabilities: Probabilities, sets: Sequence[Judged], beside: Mapping[str, float]
+) -> tuple[str, ...]:
+    """The likeliest set that holds the answer, what carries most first; beside: shares of what is in every
+    set and was fitted in none."""
     answer = probabilities.answer
     if answer in ("none", "unknown"):
-        return Verdict(probabilities, sets, answer, ())
+        return ()
     found = max((key for key in probabilities.sets if answer in key), key=lambda key: probabilities.sets[key])
-    main = next(s for s in sets if set(found) <= {p.name for p in s.parts})
-    accepted = tuple(p.name for p in sorted(main.parts, key=lambda p: -p.share) if p.name in found)
-    return Verdict(probabilities, sets, answer, accepted)
+    main = next(s for s in sets if set(found) - set(beside) <= {p.name for p in s.parts})
+    shares = {part.name: part.share for part in main.parts} | dict(beside)
+    return tuple(sorted(found, key=lambda name: -shares[name]))
+
+
+def _rounded(search: Search, rounding: Rounding) -> float:
+    """Share of the motion that rounding is, of the output that shows most of it."""
+    Y, records = search.case.noise.size, (*search.case.estimation, *search.case.held_out)
+    energy = rounding.variances * sum(len(e.output) for e in records)
+    motion = np.concatenate([search.records.levels.motion, search.held_out.levels.motion]).reshape(-1, Y)
+    return float(np.sqrt(np.max(energy / motion.sum(axis=0))))
 
 
 def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
@@ -177,7 +213,7 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    complete = 0.0 if at_edge else _enough(explanation, model_error)
+    complete = 0.0 if at_edge else _enough(_left(explanation), model_error)
     for part in parts.values():
         complete *= 1.0 if part.name in listed else 1 - part.matters
     named = tuple(parts[name] for name in explanation.names if name in listed)
@@ -249,16 +285,20 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
     return abs(float(moved / stated) - 1) / tolerance
 
 
-def _enough(explanation: Explanation, model_error: float) -> float:
+def _left(explanation: Explanation) -> float:
+    """Share of the motion that is left of estimation and held-out records."""
+    return float(np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2)))
+
+
+def _enough(left: float, model_error: float) -> float:
     """Probability that what is left is no more than imperfections."""
-    enough, more = _remaining(explanation, model_error)
+    enough, more = _remaining(left, model_error)
     return enough / (enough + more)
 
 
-def _remaining(explanation: Explanation, model_error: float) -> tuple[float, float]:
-    """Densities of what is left of the motion after a complete answer, and beside an unknown cause."""
-    left = np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2))
-    size = np.log(max(float(left) / model_error, 1e-3))
+def _remaining(left: float, model_error: float) -> tuple[float, float]:
+    """Densities of a share of the motion that is left by a complete answer, and beside an unknown cause."""
+    size = np.log(max(left / model_error, 1e-3))
     z = max(size - np.log(_IMPERFECTIONS), 0.0) / _IMPERFECTIONS_WIDTH
     u = min(size - np.log(_UNKNOWN), 0.0) / _UNKNOWN_WIDTH
     enough = (1 - _PRIOR_UNKNOWN) / _IMPERFECTIONS_WIDTH * np.exp(-0.5 * z**2)

@@ -35,8 +35,8 @@ def grid_step(signals: Sequence[Real], noise: float) -> float:
     values = values[values != 0]
     if values.size == 0 or (values.size < _MANY and sum(map(len, signals)) < _READINGS * values.size):
         return 0.0
-    written = 0.5 * 10.0 ** (np.floor(np.log10(np.abs(values))) + 1 - _DIGITS)
-    coarse = float(np.max(written))
+    # Of the outermost value: a column with an offset resolves those near zero no better.
+    coarse = 0.5 * 10.0 ** (np.floor(np.log10(np.max(np.abs(values)))) + 1 - _DIGITS)
     gaps = np.diff(np.union1d(values, 0.0))
     gaps = gaps[gaps > 4 * coarse]
     if gaps.size == 0 or np.min(gaps) < _COARSER * coarse:
@@ -56,7 +56,7 @@ def grid_step(signals: Sequence[Real], noise: float) -> float:
         reach *= 2
     off = np.abs(values - step * np.round(values / step))
     # The step carries an error of its own, which grows with the count.
-    if np.any(off > 2 * written + 1e-9 * np.abs(values)) or step / np.sqrt(12) < _NOTICEABLE * noise:
+    if np.any(off > 2 * coarse) or step / np.sqrt(12) < _NOTICEABLE * noise:
         return 0.0
     return step
 

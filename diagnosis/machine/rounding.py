@@ -14,11 +14,13 @@ from plant.effects.sensor import Quantisation
 
 @dataclass(frozen=True)
 class Rounding:
-    """effect: with the step of the grid; intervals: of its step; floor: pooled RMS that rounding and noise
-    leave over the noise; energy: mean square of rounding alone, over all outputs and the noise's."""
+    """effect: with the step of the grid; intervals: of its step; variances: (Y,) of rounding alone, in the
+    outputs' units; floor: pooled RMS that rounding and noise leave over the noise; energy: mean square of
+    rounding alone, over all outputs and the noise's."""
 
     effect: Quantisation
     intervals: dict[str, tuple[float, float]]
+    variances: Real
     floor: float
     energy: float
 
@@ -44,10 +46,13 @@ def rounding_effect(case: CaseOfMachine) -> Rounding | None:
     # Values are written with six digits at least: of the outermost one, the step inherits that share.
     widest = max(float(np.max(np.abs(e.output[:, tip]))) for e in case.experiments)
     error = 1e-6 * step + 1e-6 * widest / max(widest / step, 1.0)
-    energy = (step / case.noise[tip]) ** 2 / 12 / case.noise.size
+    variances = np.zeros(case.noise.size)
+    variances[tip] = step**2 / 12
+    energy = np.mean(variances / case.noise**2)
     return Rounding(
         effect=Quantisation(step_m=step),
         intervals={"step_m": (step - error, step + error)},
+        variances=variances,
         floor=float(np.sqrt(1 + energy)),
         energy=float(energy),
     )

@@ -11,6 +11,7 @@ from scipy.stats import norm
 from diagnosis import Case, diagnose
 from diagnosis.machine.quantisation_grid import cell_residual, grid_step
 from tests.diagnosis.recorded import recorded_case
+from workflow.diagnose.case_files import load_case
 
 NOISE = 1e-3
 
@@ -40,6 +41,14 @@ def test_step_of_a_sensor_that_moves_by_a_few_steps_only(reach):
     records = [np.round(reach * step * np.sin(rng.uniform(0, 7, 800)) / step) * step for _ in range(2)]
     assert np.unique(np.concatenate(records)).size == 2 * round(reach) + 1
     assert grid_step(records, NOISE) == pytest.approx(step, rel=1e-6)
+
+
+def test_step_of_a_column_with_an_offset():
+    # Pixels of a camera: what they are at the rest position is no multiple of the step, and seven digits of
+    # them say less of a value near zero than seven digits of it would.
+    tip = 0.0643 * np.round(np.cumsum(np.random.default_rng(4).standard_normal(900)) / 4)
+    pixels = np.array([float(f"{value:.7g}") for value in (tip - 0.391) / 0.0004054])
+    assert grid_step([0.0004054 * pixels + 0.391], NOISE) == pytest.approx(0.0643, rel=1e-5)
 
 
 def test_no_step_where_there_is_none_or_none_that_matters():
@@ -102,4 +111,20 @@ def test_rounded_records_name_quantisation_beside_the_rest(gap_cases, name, rig,
     # Rounding errors are uniform: step^2/12 beside the noise, on one of two outputs.
     noise = found.case.noise[1]
     assert found.noise_floor == pytest.approx(np.sqrt(1 + (step / noise) ** 2 / 24))
+    assert found.gap_after == pytest.approx(found.noise_floor, rel=0.05)
+
+
+@pytest.mark.slow
+def test_rounded_records_of_an_imperfect_machine(gap_cases):
+    case = load_case(gap_cases / "workshop" / "labelled" / "work-05").case
+    step = 0.0654  # three fifths of the tip's motion
+    experiments = []
+    for e in case.experiments:
+        output = np.array(e.output)
+        output[:, 1] = _written(step * np.round(output[:, 1] / step))
+        experiments.append(replace(e, output=output, readings=None))
+    found = diagnose(replace(case, experiments=tuple(experiments)))
+    assert found.combination == ("joint_compliance", "quantisation")
+    # Rounding is no part of the gap that effects can close.
+    assert found.gap_closed > 0.9
     assert found.gap_after == pytest.approx(found.noise_floor, rel=0.05)
