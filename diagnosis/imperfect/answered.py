@@ -104,6 +104,8 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     kind = named.get(found.answer, "effect")
     ambiguous = _ambiguous(found)
     keys = search.records.nominal.keys
+    best = found.judged[0]
+    looks_like = kind == "unknown" and best.explains > 0.5 and not set(best.explanation.names) <= set(listed)
     return Diagnosis(
         case=case,
         verdict=kind,
@@ -127,6 +129,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         residuals_refit=moved,
         residuals_after=after,
         simulations=search.simulations,
+        unlisted=best.explanation.end.effects if looks_like else (),
         shares=shares_of(search, found, accepted, rng),
         competing=_competing(search, found),
     )

@@ -61,12 +61,16 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A set with its listed parts, its score and the probability that it leaves no more than imperfections,
-    nor needs a cause beyond the list for more than these."""
+    """A set with its listed parts and its score.
+
+    explains : probability that it leaves no more than imperfections. complete : and that it needs no cause
+        beyond the list for more than these.
+    """
 
     explanation: Explanation
     parts: tuple[Part, ...]
     score: float
+    explains: float
     complete: float
 
 
@@ -213,11 +217,11 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    complete = 0.0 if at_edge else _enough(_left(explanation), model_error)
+    explains = complete = 0.0 if at_edge else _enough(_left(explanation), model_error)
     for part in parts.values():
         complete *= 1.0 if part.name in listed else 1 - part.matters
     named = tuple(parts[name] for name in explanation.names if name in listed)
-    return Judged(explanation, named, score_of(explanation, listed, model_error), complete)
+    return Judged(explanation, named, score_of(explanation, listed, model_error), explains, complete)
 
 
 def best_without(

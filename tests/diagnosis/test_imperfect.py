@@ -178,15 +178,11 @@ def test_records_of_an_independent_simulator_with_imperfections(gap_cases, name,
         assert low < value < high
 
 
-def test_dry_friction_of_the_background_is_inside_the_interval_of_the_friction_found():
-    # A part of what rubs is no listed effect: what is found is both together.
-    rng = np.random.default_rng(15)
-    rubbing = ({"name": "coulomb_friction", "torque_Nm": 0.1},)
-    truth = Truth(
-        RIG.model_dump(exclude={"tolerances"}),
-        rubbing,
-        Background(dry_friction_Nm=0.015, presliding_rad=1e-3),
-    )
+def _simulated(effect, seed=15):
+    """A case of an independent simulator: one effect beside a little dry friction."""
+    rng = np.random.default_rng(seed)
+    background = Background(dry_friction_Nm=0.015, presliding_rad=1e-3)
+    truth = Truth(RIG.model_dump(exclude={"tolerances"}), (effect,), background)
     records = []
     for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
         voltage = rng.choice([-3.0, 3.0], 40).repeat(15)
@@ -194,12 +190,25 @@ def test_dry_friction_of_the_background_is_inside_the_interval_of_the_friction_f
         read = np.column_stack([clean.hub_angle_rad, clean.tip_m])
         noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
         records.append(Experiment(name, role, voltage, read + noise * rng.standard_normal(read.shape)))
-    found = diagnose(Case("rubs", RIG, tuple(records), 0.05))
+    return Case("simulated", RIG, tuple(records), 0.05)
+
+
+def test_dry_friction_of_the_background_is_inside_the_interval_of_the_friction_found():
+    # A part of what rubs is no listed effect: what is found is both together.
+    found = diagnose(_simulated({"name": "coulomb_friction", "torque_Nm": 0.1}))
     (friction,) = [e for e in found.effects if e.name == "coulomb_friction"]
     assert found.combination == ("coulomb_friction",)
     low, high = friction.intervals["torque_Nm"]
     assert friction.parameters["torque_Nm"] == pytest.approx(0.115, rel=0.02)
     assert low < 0.1 < 0.115 < high < 0.15
+
+
+@pytest.mark.slow
+def test_a_cause_beyond_the_list_that_explains_the_records_is_told():
+    found = diagnose(_simulated({"name": "ground_spring", "stiffness_Nm_rad": 1.0}))
+    assert (found.verdict, found.combination) == ("unknown", ())
+    (spring,) = [effect for effect in found.unlisted if effect.id == "ground_spring"]
+    assert spring.stiffness_Nm_rad == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_time_limit_says_what_was_not_tried(gap_cases):
