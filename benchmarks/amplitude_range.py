@@ -6,9 +6,11 @@ The default arm's hub and tip with dry friction of several levels. Records: rand
 lines without a random quarter, 0.2 to 95 Hz, a period of 5 s recorded twice from rest, two realisations at
 2 V rms and two at 6 V. Truth: best linear approximation, the mean over fresh realisations of the same lines
 in steady state, without noise. What their number leaves open (row "truth", a standard error) is added to the
-ellipses' covariance; "alone": without. One amplitude: the records' pooled rms, 4.47 V. Range: 2 to 6 V,
-tested at five amplitudes in equal steps of the logarithm, of which three were not recorded. Bands of half a
-decade from 0.63 rad/s, at the excited lines; error, radius and ratio as in `benchmarks.without_friction`.
+ellipses' covariance; "alone": without. It is the same for all seeds, so in a band of few lines (three from
+6.3 to 20 rad/s) it moves the shares of all of them at once. One amplitude: the records' pooled rms, 4.47 V.
+Range: 2 to 6 V, tested at five amplitudes in equal steps of the logarithm, of which three were not recorded.
+Bands of half a decade from 0.63 rad/s, at the excited lines; error, radius and ratio as in
+`benchmarks.without_friction`.
 """
 
 from __future__ import annotations

@@ -345,10 +345,9 @@ def _on_poles(
     size = poles.order + response.fir_length
     form = replace(response, poles=poles, mean=np.zeros(size), covariance_factor=np.zeros((size, 1)))
     rows, taps = form.frequency_rows(omega), coefficients[:, own.order :]
-    # Between errors relative to the response, and to what is not known of it, which is a thousandth of that
-    # where friction matters most.
-    every = responses.reshape(-1, omega.size)
-    scale = 1 / np.sqrt(np.std(every, axis=0) * np.abs(np.mean(every, axis=0)))
+    # N is larger at strong lines in size, not in phase, and no stable poles follow that: what they leave has
+    # to be small beside what is not known of the response at an amplitude.
+    scale = 1 / np.std(responses, axis=1).mean(axis=0)
     targets = ((responses - taps @ rows[:, poles.order :].T) * scale).reshape(-1, omega.size).T
     columns = scale[:, None] * rows[:, : poles.order]
     solved = np.linalg.lstsq(real_rows(columns), real_rows(targets), rcond=1e-10)[0]
