@@ -10,6 +10,7 @@ import numpy as np
 
 from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 
 Verdict = Literal["none", "effect", "unknown"]
@@ -187,6 +188,12 @@ class Diagnosis:
             "repaired": self.gap_after,
         }
         return {model: pooled[model] for model in self.models}
+
+    @property
+    def rounding_rms(self) -> float:
+        """What rounding of a sensor alone leaves over noise, whatever the model; 0 where none is seen."""
+        rounding = rounding_effect(self.case)
+        return 0.0 if rounding is None else float(np.sqrt(rounding.energy))
 
     @property
     def gap_by_experiment(self) -> dict[str, dict[Model, float]]:
