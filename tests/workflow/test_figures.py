@@ -24,18 +24,16 @@ from plant import paper_link
 from tests.workflow import report_examples as example
 from workflow.figures import style
 from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees
-from workflow.figures.bode import draw_bode
+from workflow.figures.bode import draw_bode, draw_distortion
 from workflow.figures.closed_loop import draw_closed_loop
-from workflow.figures.distortion import draw_distortion
-from workflow.figures.excitation import draw_excitation
 from workflow.figures.gap_answer import draw_waterfall
 from workflow.figures.gap_records import draw_residual_spectra
 from workflow.figures.nyquist import uncertain_loop
 from workflow.figures.poles import draw_poles
-from workflow.figures.records import draw_records
-from workflow.figures.repeats import draw_repeat_scatter
+from workflow.figures.records import draw_excitation, draw_records
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.subjects import RunView
+from workflow.figures.validation import draw_repeat_scatter
 from workflow.report import rendering
 from workflow.report.inline import relative
 from workflow.tasks.experiment import Limits, plan_experiment

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 import workflow.study.pareto  # noqa: F401 (a drawing outside workflow.figures)
-from workflow.figures.registry import drawings
+from workflow.figures.style import drawings
 from workflow.report import rendering
 from workflow.text.formats import (
     count,

@@ -14,7 +14,7 @@ from control_design.convex.reference_filter import ReferenceFilter
 from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
-from workflow.figures.registry import drawings
+from workflow.figures.style import drawings
 from workflow.report.run_report import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
 from workflow.text.templates import environment, words

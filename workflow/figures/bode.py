@@ -1,8 +1,8 @@
-"""Bode picture of an identified response with the bands of its confidence ellipses."""
+"""Responses over frequency: with the bands of their ellipses, beside noise and nonlinear distortion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from ident.basis.model import GobfModel
+from ident.data.distortion import Distortion
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real, degrees_near, response_band
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
 from workflow.text.formats import share
 
@@ -28,7 +28,7 @@ _DOTS: dict[str, Any] = {
 _NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2))}
 
 
-@drawing("bode")
+@style.drawing("bode")
 def draw_channel(channel: ChannelView, name: str) -> Figure:
     """Identified response of a channel, its nominal model, and what the records say without one."""
     found, spread = channel.found, channel.spread
@@ -131,3 +131,33 @@ def _gain_floor(gain: Real, empirical: Real) -> float:
     smallest = float(gain[gain > 0].min())
     positive = empirical[empirical > 0]
     return min(smallest, float(np.percentile(positive, 2)) if positive.size else smallest) / 3
+
+
+@style.drawing("distortion")
+def draw_distortion(found: Sequence[Distortion], units: tuple[str, str]) -> Figure | None:
+    """Best linear approximation, and what scatters around it at every line, as measured: points above the
+    line of the noise are distortion. units: of input and output. Nothing where no record is periodic."""
+    if not found:
+        return None
+    columns = min(len(found), 3)
+    figure, places = style.small_multiples(len(found), columns, 3.9, 0.6, sharex=True, sharey=True)
+    for axes, levels in zip(places, found, strict=True):
+        omega = levels.omega_rad_s
+        axes.plot(omega, np.abs(levels.gain), **style.MODEL_LINE, label="gain, best linear approximation")
+        if levels.noise_std is not None:
+            noise = levels.noise_std / np.sqrt(levels.periods)
+            axes.plot(omega, noise, **style.MEASURED_LINE | {"lw": 1.6}, label="noise, mean of the periods")
+        for lines, marker, colour, label in (
+            (levels.even, "x", style.LIMIT, "even detection line"),
+            (levels.excited, ".", style.PREDICTED, "between realisations"),
+            (levels.odd, "o", style.ACHIEVED, "odd detection line"),
+        ):
+            if lines is not None:
+                dots: dict[str, Any] = {"ls": "none", "marker": marker, "ms": 3.5, "mew": 0.7}
+                axes.plot(lines.omega_rad_s, np.sqrt(lines.power), color=colour, label=label, **dots)
+        axes.set(xscale="log", yscale="log")
+        axes.set_title(f"{levels.rms:.3g} {style.plain(units[0], 10)} rms".replace("  ", " "))
+        style.hertz_axis(axes)
+        axes.set_xlabel("frequency [rad/s]")
+    places[0].set_ylabel(f"level [{style.ratio_unit(units[1], units[0])}]")
+    return figure

@@ -13,7 +13,6 @@ from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.search_trace import SearchStage
 from workflow.figures import style
 from workflow.figures.bands import Real
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
 
 _DOTS: dict[str, Any] = {"ls": "none", "marker": ".", "ms": 5, "color": "white", "mec": "black", "mew": 0.3}
@@ -28,7 +27,7 @@ _HOLLOW: dict[str, Any] = {
 }
 
 
-@drawing("error-surface")
+@style.drawing("error-surface")
 def draw_error_surface(channel: ChannelView) -> Figure | None:
     """The surface of the slowest lightly damped pair, on a grid around it; nothing without a pair.
 

@@ -1,4 +1,5 @@
-"""The answer in pictures: how probable each cause is, how far the gap shrinks, several cases at once."""
+"""The answer in pictures: how probable each cause is, how far the gap shrinks, several cases at once; and
+what to do with it: the proposed experiment, what the gap means for a loop."""
 
 from __future__ import annotations
 
@@ -9,16 +10,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from diagnosis.answer import Diagnosis
+from diagnosis.next_experiment.next_experiment import NextExperiment
 from plant.effects import in_words
 from workflow.figures import gap_style, style
-from workflow.figures.registry import drawing
+from workflow.figures.bands import Real, outline
 from workflow.text.formats import listing
 
 _MOST_BARS = 8
 _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 
 
-@drawing("gap_probabilities")
+@style.drawing("gap_probabilities")
 def draw_probabilities(found: Diagnosis) -> Figure:
     """Bars of the likeliest causes, the accepted ones in colour; all others are added up in a last bar."""
     ranked = sorted(found.probabilities.items(), key=lambda item: -item[1])
@@ -32,18 +34,11 @@ def draw_probabilities(found: Diagnosis) -> Figure:
         names.append(f"all {len(ranked) - len(shown)} others together")
         percent.append(max(0.0, 100 - sum(percent)))
         colours.append(gap_style.PALE)
-    figure, axes = style.panels(1.0 + 0.34 * len(names))
-    bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
     labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
-    axes.bar_label(bars, labels, padding=4, fontsize=9)
-    axes.invert_yaxis()
-    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel="probability [%]")
-    axes.set_title("Which cause, given the records")
-    axes.grid(visible=False, axis="y")
-    return figure
+    return _bars(names, percent, labels, colours, "Which cause, given the records", "probability [%]")
 
 
-@drawing("gap_waterfall")
+@style.drawing("gap_waterfall")
 def draw_waterfall(found: Diagnosis) -> Figure:
     """Pooled root mean square of (measured - model)/noise: held-out records together, every record alone.
 
@@ -79,22 +74,35 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     return figure
 
 
-@drawing("gap_partial")
+@style.drawing("gap_partial")
 def draw_partial_answers(partial: Sequence[tuple[Sequence[str], float]]) -> Figure:
     """Bars: share of the held-out gap that effects close by themselves."""
     names = [style.plain(listing([in_words(name) for name in effects]), 60) for effects, _ in partial]
     percent = [100 * share for _, share in partial]
+    labels, colours = [f"{p:.3g} %" for p in percent], [gap_style.PALE] * len(names)
+    what = "What effects close by themselves", "of the held-out gap closed [%]"
+    return _bars(names, percent, labels, colours, *what)
+
+
+def _bars(
+    names: Sequence[str],
+    percent: Sequence[float],
+    labels: Sequence[str],
+    colours: Sequence[str],
+    title: str,
+    axis: str,
+) -> Figure:
     figure, axes = style.panels(1.0 + 0.34 * len(names))
-    bars = axes.barh(np.arange(len(names)), percent, color=gap_style.PALE, height=0.62, tick_label=names)
-    axes.bar_label(bars, [f"{p:.3g} %" for p in percent], padding=4, fontsize=9)
+    bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
+    axes.bar_label(bars, labels, padding=4, fontsize=9)
     axes.invert_yaxis()
-    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel="of the held-out gap closed [%]")
-    axes.set_title("What effects close by themselves")
+    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel=axis)
+    axes.set_title(title)
     axes.grid(visible=False, axis="y")
     return figure
 
 
-@drawing("gap_overview")
+@style.drawing("gap_overview")
 def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
     """One line per case, from its JSON answer with `name` and `answer` in words: RMS over noise with the
     nominal parameters, and with the effects added."""
@@ -114,3 +122,48 @@ def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
 
 def _label(model: str) -> dict[str, Any]:
     return {"color": gap_style.MODELS[model]["color"], "label": gap_style.WORDS[model]}
+
+
+@style.drawing("gap_next")
+def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequence[str]) -> Figure:
+    """Voltage, and difference (T, Y) of the two likeliest answers in standard deviations, hub before tip."""
+    time_s = np.arange(proposal.voltage_V.size, dtype=np.float64) * proposal.dt_s
+    figure, (above, below) = style.panels(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
+    above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
+    above.set(ylabel="voltage [V]", title="Proposed experiment")
+    below.axhspan(-2, 2, **{**gap_style.NOISE_BAND, "label": "2 standard deviations"})
+    for signal, (words, _, colour) in zip(difference.T, gap_style.OUTPUTS.values(), strict=False):
+        below.plot(*outline(time_s, signal), color=colour, lw=1.0, label=words)
+    title = f"{style.plain(names[0], 48)} minus {style.plain(names[1], 48)}"
+    below.set_title(title, fontweight="normal", fontsize=9.5)
+    below.set(xlabel="time [s]", ylabel="difference over\nstandard deviation [1]")
+    below.margins(x=0.01)
+    return figure
+
+
+@style.drawing("gap_controller")
+def draw_controller_check(
+    time_s: Real, reference_m: Real, tips_m: Sequence[Real], commands_V: Sequence[Real]
+) -> Figure:
+    """The same step with the design on the nominal rig and on the repaired one, a column each.
+
+    Runs in the order nominal predicted by its own model (dashed), nominal achieved on the repaired machine,
+    repaired predicted, repaired achieved.
+    """
+    looks = (
+        ({**style.PREDICTED_LINE, "ls": (0, (4, 1.5))}, "predicted by its own model"),
+        (style.ACHIEVED_LINE, "achieved on the repaired machine"),
+    )
+    figure, grid = style.panels(4.6, 2, 2, sharex=True, sharey="row", height_ratios=[1.6, 1.0])
+    for column, design in enumerate(("nominal parameters", "repaired rig")):
+        above, below = grid[:, column]
+        above.plot(time_s, 1e3 * reference_m, **style.REFERENCE_LINE, label="asked for")
+        for run, (look, label) in enumerate(looks, 2 * column):
+            above.plot(time_s, 1e3 * tips_m[run], **look, label=label)
+            below.step(time_s, commands_V[run], where="post", **look)
+        above.set_title(f"Design with the {design}")
+        below.set_xlabel("time [s]")
+        above.margins(x=0.01)
+    grid[0, 0].set_ylabel("tip position [mm]")
+    grid[1, 0].set_ylabel("voltage [V]")
+    return figure

@@ -14,14 +14,13 @@ from diagnosis.machine.case import Case
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
-from workflow.figures.registry import drawing
 
 _SEGMENT = 512
 _TRACE_BINS = 250  # a panel is some 400 pixels wide
 _MODES = 3
 
 
-@drawing("gap_measured")
+@style.drawing("gap_measured")
 def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
     """Held-out record with the largest gap, a column per output in its own unit; residuals below."""
     case = found.case
@@ -47,7 +46,7 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
     return figure
 
 
-@drawing("gap_traces")
+@style.drawing("gap_traces")
 def draw_residual_traces(found: Diagnosis) -> Figure:
     """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise.
 
@@ -84,7 +83,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
     return figure
 
 
-@drawing("gap_spectra")
+@style.drawing("gap_spectra")
 def draw_residual_spectra(found: Diagnosis) -> Figure:
     """Spectra of the residuals over noise, all experiments together; white noise of the stated size is 1.
 

@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 from diagnosis.where.findings import SENSORS, BandGap, RegimeBin, Where
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real
-from workflow.figures.registry import drawing
 
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
 _MOST_REGIMES = 6
@@ -48,7 +47,7 @@ def _look(where: Where, sensor: str) -> tuple[str, str]:
     return _LOOKS.get(sensor, (words, colour))
 
 
-@drawing("gap_bands")
+@style.drawing("gap_bands")
 def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure:
     """Size of the gap, noise (or what a model may miss) taken off: by band and experiment, of every sensor.
 
@@ -98,7 +97,7 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
     return figure
 
 
-@drawing("gap_regimes")
+@style.drawing("gap_regimes")
 def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
     """Residual energy over a regime variable where it depends on it, with what chance would give."""
     findings = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
@@ -123,7 +122,7 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
     return figure
 
 
-@drawing("gap_curves")
+@style.drawing("gap_curves")
 def draw_curves(where: Where) -> Figure | None:
     """The gap read as one missing function of a variable, two standard errors either side."""
     curves = [curve for curve in where.curves if curve.found]

@@ -15,7 +15,6 @@ from control_design.plants.ellipses import nearest_distance
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import RunView
 from workflow.text.formats import share
 
@@ -64,7 +63,7 @@ def loop_of(run: RunView) -> UncertainLoop:
     return uncertain_loop(frequency, run.controller.response(frequency.omega_rad_s))
 
 
-@drawing("nyquist")
+@style.drawing("nyquist")
 def draw_nyquist(run: RunView) -> Figure:
     """Whole curve of a run's loop (as far as it fits) and the surroundings of -1."""
     loop, margin = loop_of(run), run.config.specification.modulus_margin

@@ -13,7 +13,6 @@ from ident.search.order_selection import OrderStep
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
 
 # Below this a difference of the criterion is drawn linearly, above logarithmically: a factor exp(5) = 150 in
@@ -21,7 +20,7 @@ from workflow.figures.subjects import ChannelView
 _LINEAR = 10.0
 
 
-@drawing("order")
+@style.drawing("order")
 def draw_order(channel: ChannelView) -> Figure | None:
     """Left: criterion of every structure tried, above the best. Right: pole pairs of fits with 0, 1, 2 ...
 

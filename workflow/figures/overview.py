@@ -9,12 +9,11 @@ from matplotlib.figure import Figure
 from workflow.figures import style
 from workflow.figures.bands import envelope, outline, response_band
 from workflow.figures.nyquist import draw_around_minus_one, loop_of
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import MACHINE, RunView
 from workflow.text.formats import share
 
 
-@drawing("overview")
+@style.drawing("overview")
 def draw_overview(run: RunView) -> Figure:
     """Left: identified gain with its ellipses; middle: the loop around -1; right: the reference step, without
     the disturbance that follows it."""

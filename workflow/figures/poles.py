@@ -11,13 +11,12 @@ from matplotlib.figure import Figure
 from ident.basis.model import GobfModel
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real
-from workflow.figures.registry import drawing
 
 _DAMPINGS = (0.02, 0.1, 0.3, 0.6)
 _HOLLOW: dict[str, Any] = {"ls": "none", "mfc": "none"}
 
 
-@drawing("poles")
+@style.drawing("poles")
 def draw_poles(
     model: GobfModel, name: str = "", closed_loop: Complex | None = None, zeros: Complex | None = None
 ) -> Figure:

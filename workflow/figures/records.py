@@ -1,4 +1,4 @@
-"""The records as measured: input and outputs over time, shaded by what each record is used for."""
+"""Signals as they are: of the records of a run, of any log, of a planned experiment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from ident.data.record import Record
 from workflow.figures import style
 from workflow.figures.bands import Real, liveliest, outline
-from workflow.figures.registry import drawing
+from workflow.tasks.experiment import PlannedExperiment
+from workflow.tasks.log_look import LogLook
 from workflow.tasks.results import RunRecord
 
 _ZOOM_SAMPLES = 400
@@ -22,10 +23,10 @@ _WORDS = {
 }
 
 
-@drawing("records")
+@style.drawing("records")
 def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Sequence[str]) -> Figure:
-    """Rows: the named inputs and outputs. Left: all records one after another. Right: the liveliest part of
-    the first.
+    """Rows: the named inputs and outputs. Left: all records one after another, shaded by what each is used
+    for. Right: the liveliest part of the first.
 
     Raises ValueError when there is no record or a name is not in one of them.
     """
@@ -89,3 +90,75 @@ def _name_records(axes: Axes, shown: Sequence[RunRecord], starts: Real) -> None:
                 fontsize=8.5,
                 color="#444444",
             )
+
+
+# Panels of one figure; a log of more signals is looked at in parts.
+_MOST = 12
+
+
+@style.drawing("log")
+def draw_log(found: LogLook) -> Figure | None:
+    """One panel per column of numbers, the first twelve."""
+    shown = [column for column in found.columns if column.values is not None][:_MOST]
+    if not shown:
+        return None
+    figure, axes = style.panels(1.6 * len(shown), len(shown), 1)
+    known = found.time is not None and not found.time.why
+    step = found.time.period_s if known and found.time is not None else 1.0
+    for panel, column in zip(np.atleast_1d(axes), shown, strict=True):
+        values = column.values
+        assert values is not None
+        panel.plot(step * np.arange(values.size), values, color=style.MEASURED, lw=0.7)
+        panel.set(
+            xlabel="time [s]" if known else "row [1]", ylabel=f"[{column.unit or '?'}]", title=column.name
+        )
+    return figure
+
+
+_TIME_S = 10.0
+
+
+@style.drawing("excitation")
+def draw_excitation(found: PlannedExperiment) -> Figure:
+    """Left: first record at the highest amplitude, and its lines. Right: expected radius and gain, where
+    there is anything to expect."""
+    rms = np.array(found.plan.rms_V)
+    loudest = int(np.argmax(rms))
+    known = found.radii is not None or found.gain is not None
+    figure, axes = style.panels(3.6, 1, 3 if known else 2)
+    voltage = found.voltages_V[loudest, 0]
+    time = np.arange(voltage.size) * found.limits.dt_s
+    shown = time <= _TIME_S
+    axes[0].plot(time[shown], voltage[shown], **style.REFERENCE_STEPS | {"ls": "-", "lw": 0.7})
+    for sign in (1, -1):
+        axes[0].axhline(sign * found.limits.peak_V, **style.LIMIT_LINE, label="voltage limit")
+    lead_in_s = found.plan.lead_in_samples * found.limits.dt_s
+    axes[0].axvspan(0, lead_in_s, color=style.MEASURED, alpha=0.2, lw=0, label="lead-in")
+    cut = "" if shown.all() else f", first {_TIME_S:g} s"
+    axes[0].set(xlabel=f"time [s]{cut}", ylabel="voltage [V]")
+    axes[0].set_title(f"First record at {rms[loudest]:g} V rms")
+    for value, shade in zip(rms, np.linspace(1.0, 0.45, rms.size), strict=True):
+        line_V = np.full(found.lines_Hz.size, value * np.sqrt(2 / found.lines_Hz.size))
+        dots = {"ls": "none", "marker": ".", "ms": 3, "alpha": shade, "color": style.MODEL}
+        axes[1].plot(found.lines_Hz, line_V, **dots, label="excited line")
+    bottom = 0.5 * rms.min() * np.sqrt(2 / found.lines_Hz.size)
+    axes[1].plot(
+        found.detection_Hz,
+        np.full(found.detection_Hz.size, bottom),
+        ls="none",
+        marker="|",
+        ms=6,
+        color=style.ACHIEVED,
+        label="detection line (odd)",
+    )
+    axes[1].set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="amplitude of a line [V]")
+    axes[1].set_title("Lines of every record")
+    if known:
+        if found.gain is not None:
+            axes[2].plot(found.lines_Hz, found.gain, **style.MODEL_LINE, label="expected gain")
+        for value, radius in zip(rms, found.radii or (), strict=False):
+            axes[2].axhline(radius, color=style.UNCERTAIN, lw=1.4, label="expected 95 % radius")
+            axes[2].annotate(f"{value:g} V rms", (found.lines_Hz[0], radius), fontsize=8, va="bottom")
+        axes[2].set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="hub angle / voltage [rad/V]")
+        axes[2].set_title("Response to be expected")
+    return figure

@@ -15,7 +15,6 @@ from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
 from workflow.figures import style
 from workflow.figures.bands import Real
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import RunView
 from workflow.text.formats import share
 
@@ -101,7 +100,7 @@ def curves_of(run: RunView, omega_rad_s: Real | None = None) -> tuple[Sensitivit
     )
 
 
-@drawing("sensitivities")
+@style.drawing("sensitivities")
 def draw_run(run: RunView) -> Figure:
     """Closed-loop gains of a run, its first lightly damped modes marked."""
     modes = enumerate(run.control.light[:4], 1)

@@ -7,11 +7,13 @@ meaning has a line style of its own as well, so a grey print still reads.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
+import pkgutil
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache, wraps
+from functools import cache, wraps
 from typing import Any, Literal, TypeVar, cast
 
 import matplotlib as mpl
@@ -186,7 +188,7 @@ def _shorter(svg: bytes) -> bytes:
     return re.sub(rb'\b(d|x|y)="[^"]*"', lambda match: re.sub(rb"(\.\d\d)\d+", rb"\1", match.group()), svg)
 
 
-@lru_cache(maxsize=1)
+@cache
 def _drawable() -> frozenset[int]:
     return frozenset(get_font(findfont(FontProperties(family="DejaVu Sans"))).get_charmap())
 
@@ -251,6 +253,33 @@ def finished(draw: D) -> D:
         return figure
 
     return cast(D, styled)
+
+
+_DRAWINGS: dict[str, Drawing] = {}
+
+
+def drawing(name: str) -> Callable[[D], D]:
+    """Name of a drawing, by which a template asks for it: `figure("nyquist", run)`; it is `finished`.
+
+    It takes typed results; None means there is nothing to draw.
+    """
+
+    def register(draw: D) -> D:
+        if name in _DRAWINGS:
+            raise ValueError(f"two drawings are called {name!r}")
+        _DRAWINGS[name] = done = finished(draw)
+        return done
+
+    return register
+
+
+@cache
+def drawings() -> Mapping[str, Drawing]:
+    """Every drawing of every module of this package, so that a new one is named in its own file only."""
+    package = importlib.import_module("workflow.figures")
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"workflow.figures.{module.name}")
+    return _DRAWINGS
 
 
 _SECOND_AXIS_PT, _POWER_PT = 27.4, 12.0  # from the panel's edge to above ticks, numbers and words

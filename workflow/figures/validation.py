@@ -1,14 +1,17 @@
-"""Measured output against the model's free run on a record, and what is left."""
+"""A model against records: its free run, tests of what it leaves of them, and the scatter of repeats."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 from matplotlib.figure import Figure
 
-from ident.checks.validation import fit_on_fresh_data
+from ident.checks.validation import ScatterRow, fit_on_fresh_data
 from workflow.figures import style
 from workflow.figures.bands import liveliest, outline
-from workflow.figures.registry import drawing
 from workflow.figures.subjects import ChannelView
+from workflow.text.formats import share
 
 _WORDS = {
     "validation": "validation record",
@@ -19,7 +22,7 @@ _THICK = style.MEASURED_LINE | {"lw": 2.4, "alpha": 0.6}
 _THIN = style.MODEL_LINE | {"lw": 0.9}
 
 
-@drawing("validation")
+@style.drawing("validation")
 def draw_validation(channel: ChannelView) -> Figure:
     """The free run on a record kept back, or on the first fitted one where there is none.
 
@@ -49,4 +52,71 @@ def draw_validation(channel: ChannelView) -> Figure:
     unit = record.output_units[0] if record.output_units else ""
     grid[0, 0].set_ylabel(style.two_lines(record.output_names[0], unit))
     grid[1, 0].set_ylabel(style.two_lines("residual", unit))
+    return figure
+
+
+@style.drawing("residuals")
+def draw_residual_tests(channel: ChannelView) -> Figure | None:
+    """Both correlations with the band of each lag taken alone, lags outside it marked.
+
+    Nothing where the records allow no test.
+    """
+    tests = {test.name: test for test in channel.spread.tests}
+    if not {"whiteness", "independence"} <= tests.keys():
+        return None
+    whiteness, independence = tests["whiteness"], tests["independence"]
+    figure = style.new_figure(3.5)
+    panels = left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.35])
+    dots = {"ls": "none", "ms": 4}
+    for axes, test in zip(panels, (whiteness, independence), strict=True):
+        lags, size = test.lags, test.correlation
+        axes.fill_between(
+            lags, -test.band, test.band, **style.BAND, label=f"{share(test.level)} band of each lag"
+        )
+        axes.vlines(lags, 0, size, color=style.MEASURED, lw=0.9)
+        axes.plot(lags, size, marker=".", color=style.MEASURED, label="inside", **dots)
+        outside = np.abs(size) > test.band
+        if outside.any():
+            axes.plot(lags[outside], size[outside], marker="o", color=style.ACHIEVED, label="outside", **dots)
+        axes.axhline(0, color="#555555", lw=0.8)
+        reach = 1.25 * max(float(np.abs(size).max()), float(test.band.max()), 1e-6)
+        axes.set_ylim(-reach, reach)
+        axes.margins(x=0.02)
+        axes.set_xlabel("lag [samples]")
+    left.set_ylabel("correlation [1]")
+    # "passed" is about all lags together; single lags outside their band are expected now and then.
+    name = style.plain(channel.name, 24)
+    left.set_title(f"Residual, {name}: {'white' if whiteness.passed else 'not white'}")
+    right.set_title(f"With the input: {'independent' if independence.passed else 'not independent'}")
+    return figure
+
+
+@style.drawing("repeats")
+def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
+    """Relative scatter per band, predicted and measured, and their ratio.
+
+    Raises ValueError without a band.
+    """
+    if not rows:
+        raise ValueError("there is no band of repeat scatter to draw")
+    figure, (upper, lower) = style.panels(4.4, 2, 1, sharex=True, height_ratios=[1.5, 1.0])
+    for axes, field, factor, color, label in (
+        (upper, "predicted", 100, style.MODEL, "one repeat, predicted"),
+        (upper, "measured", 100, style.MEASURED, "measured between repeats"),
+        (upper, "between", 100, style.HIGHLIGHT, "between conditions (amplitude, day)"),
+        (lower, "ratio", 1, style.MEASURED, None),
+        (lower, "between_ratio", 1, style.HIGHLIGHT, None),
+    ):
+        for row in rows:
+            value = factor * getattr(row, field)
+            if np.isfinite(value) and value > 0:
+                ends = [row.omega_low_rad_s * 1.02, row.omega_high_rad_s / 1.02]
+                axes.plot(ends, [value, value], color=color, lw=3, solid_capstyle="butt", label=label)
+    upper.set(xscale="log", yscale="log", ylabel="scatter / gain [%]")
+    upper.set_title(f"Repeat scatter: {style.plain(name, 40)}")
+    lower.axhline(1.0, color=style.MODEL, lw=1.2)
+    lower.set(yscale="log", xlabel="frequency [rad/s]", ylabel="measured /\npredicted [1]")
+    low, high = lower.get_ylim()
+    lower.set_ylim(min(0.4, low), max(2.5, high))
+    style.hertz_axis(upper)
     return figure

@@ -16,8 +16,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from workflow.figures.registry import drawings
-from workflow.figures.style import Picture, render
+from workflow.figures.style import Picture, drawings, render
 from workflow.report.inline import inline
 from workflow.text.templates import environment
 

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workflow.figures import style
-from workflow.figures.registry import drawing
 from workflow.study.page import StudyView
 from workflow.study.settings import ParetoPlot
 
@@ -20,7 +19,7 @@ _DOMINATED = _DOT | {"color": "#a8adb4", "mew": 0}
 _FRONT = _DOT | {"color": style.PREDICTED, "marker": "D", "ms": 7, "mew": 0}
 
 
-@drawing("pareto")
+@style.drawing("pareto")
 def draw_pareto(study: StudyView) -> Figure:
     """Certified points filled (those on the front coloured and numbered), others hollow."""
     plots = study.config.pareto
